@@ -205,7 +205,8 @@ class Run:
         )
         # A fresh algorithm gets its start here: from another run, then from prior data. A resumed one has its own state.
         if config.start_from and not setup.resumed:
-            log_notice(log, start_from(config, spec.policy, self.algorithm))
+            self.folder.started_from = start_from(config, spec.policy, self.algorithm)
+            log_notice(log, self.folder.started_from)
         if config.prior:
             if spec.masked and spec.policy.head == "q":
                 raise UsageError(

@@ -137,6 +137,8 @@ class RunFolder:
         """`made`: if the folder is new, the topmost folder that was made for it."""
         self.path, self._made = path, made
         self._workers_elsewhere = False  # as `write_config` was told last
+        self.started_from = ""
+        """As in `RunFormat`."""
         self.writes = Writes()
         """What the run writes into the folder, and the disk may refuse."""
         self.lock: RunLock | None = None
@@ -178,8 +180,9 @@ class RunFolder:
             raise UsageError(f"run {path}: no such folder")
         if not (path / CONFIG_FILE).is_file():
             raise UsageError(f"run {path}: expected a run folder, got one without {CONFIG_FILE}")
-        check_format(path)
-        return RunFolder(path)
+        folder = RunFolder(path)
+        folder.started_from = check_format(path).started_from
+        return folder
 
     @staticmethod
     def open_policy(path: Path) -> RunFolder:
@@ -245,7 +248,7 @@ class RunFolder:
     def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
         self._workers_elsewhere = workers_elsewhere
-        write_format(self.path, workers_elsewhere=workers_elsewhere)
+        write_format(self.path, workers_elsewhere=workers_elsewhere, started_from=self.started_from)
         self._write(CONFIG_FILE, f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"))
 
     def write_policy(

@@ -43,6 +43,8 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     """the version of millrace that wrote it"""
     workers_elsewhere: bool = False
     """Whether the run's workers were started elsewhere. Its setting `workers` then means nothing."""
+    started_from: str = ""
+    """What the run began with in place of random weights, as its start printed it; empty if there was nothing."""
 
 
 DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}
@@ -68,10 +70,15 @@ def versions() -> dict[str, str]:
     return found
 
 
-def write_format(folder: Path, *, workers_elsewhere: bool = False) -> None:
+def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from: str = "") -> None:
     """Write run.json with the current format. Raises `RunError`."""
-    version = versions().get("millrace", "")
-    content = msgspec.json.encode(RunFormat(format=RUN_FORMAT, millrace=version, workers_elsewhere=workers_elsewhere))
+    found = RunFormat(
+        format=RUN_FORMAT,
+        millrace=versions().get("millrace", ""),
+        workers_elsewhere=workers_elsewhere,
+        started_from=started_from,
+    )
+    content = msgspec.json.encode(found)
     write_file(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 import millrace
 from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.run_format import check_format
 from millrace.cli.main import main
 from tests.support.collectors import TOY
 
@@ -223,6 +225,8 @@ def test_a_run_from_another_takes_it_once_and_gives_the_same_bits_for_any_number
     assert policy_of(one) == policy_of(two)
     assert (one.config.start_from, one.config.from_parts) == (str(run.path), "auto")
     one.resume(steps=192, progress=False)
+    taken = rf"starts from {re.escape(str(run.path))} \(CartPole-v1\): policy, statistics, after \d+ env steps"
+    assert re.fullmatch(taken, check_format(one.path).started_from), "a resumed run keeps it"
     shutil.rmtree(run.path)
     two.resume(steps=192, workers=1, progress=False)
     assert policy_of(one) == policy_of(two)
