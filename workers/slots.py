@@ -35,6 +35,7 @@ FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is no
 MODE = 0o666
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
+TOUCH_EVERY_S = 3600.0
 WAIT_S, POLL_S = 30.0, 0.2  # for a slot; the copies of another worker may take long to close
 
 
@@ -150,7 +151,8 @@ def free_all(fd: int) -> None:
 def touch(fd: int) -> None:
     """Mark the file as used: what cleans /tmp deletes what is old, and then new processes would see no slot taken."""
     with suppress(OSError):
-        os.utime(fd)
+        if time.time() - os.fstat(fd).st_mtime > TOUCH_EVERY_S:
+            os.utime(fd)
 
 
 def _unusable(path: Path, why: str) -> UsageError:

@@ -2,8 +2,9 @@
 
 Rule: a worker that left on purpose with exit code 0, was refused (2), found no learner (EXIT_NO_LEARNER) or cannot take part
 in this run (EXIT_UNSUITABLE) is not started again. Any other is restarted with backoff: the pause doubles with each death,
-and is reset once a worker has run for `HEALTHY_S`. A worker is on purpose only if it said so beforehand: the exit codes that
-an environment makes are failures. No worker outlives its supervisor.
+and is reset once calls of the environment have returned, or a worker has run for `HEALTHY_S`. So a simulator that works and
+dies is soon there again; the learner counts its failures. A worker is on purpose only if it said so beforehand: the exit
+codes that an environment makes are failures. No worker outlives its supervisor.
 
 With `stay`, only a refusal is final: each worker that has left a run is followed by a new one, which waits for the next.
 """
@@ -165,7 +166,7 @@ class Supervisor:
         left = end.on_purpose and end.code in (0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE)
         told_early = self._stopping and end.code == -signal.SIGTERM  # to leave, before it could listen to signals
         worker.running, worker.exit_code = None, end.code if left else 0 if told_early else 1
-        if now - worker.started_s > HEALTHY_S or (left and end.code == 0):
+        if end.worked or now - worker.started_s > HEALTHY_S or (left and end.code == 0):
             worker.backoff_s = BACKOFF_FIRST_S
         final = left and (end.code == EXIT_REFUSED or not self._stay)
         if not final and not self._stopping:

@@ -262,6 +262,10 @@ class Membership(Generic[M]):
         why = ""
         if hello.protocol != PROTOCOL_VERSION:
             why = f"protocol: expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
+        elif not worker_name(peer):  # where a newer connection takes a routing id, ZeroMQ takes it from the older one
+            why = (
+                "its connection has no routing id: the worker has connected again and needs nothing, or its client sets none"
+            )
         elif hello.worker.encode() != worker_name(peer):
             why = f"name: expected {name_for_people(peer)!r}, as in its routing id, got {hello.worker[:40]!r}"
         if why:

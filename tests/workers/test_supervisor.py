@@ -70,9 +70,9 @@ class Machine:
         self.started.append((name, FakeRunning(name)))
         return self.started[-1][1]
 
-    def die(self, code: int, after_s: float = 0.0, *, on_purpose: bool = False) -> list[WorkerExit]:
+    def die(self, code: int, after_s: float = 0.0, *, on_purpose: bool = False, worked: bool = False) -> list[WorkerExit]:
         self.now += after_s
-        self.started[-1][1].end = Ending(code, "why", on_purpose, failed=not on_purpose)
+        self.started[-1][1].end = Ending(code, "why", on_purpose, failed=not on_purpose, worked=worked)
         return self.host.poll()
 
     def pause_s(self) -> float:
@@ -132,6 +132,13 @@ def test_the_backoff_of_a_worker_that_was_healthy_is_reset() -> None:
         machine.pause_s()
     machine.die(-9, after_s=HEALTHY_S + 1)
     assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
+
+
+def test_a_worker_whose_environment_worked_is_soon_there_again_however_often_it_dies() -> None:
+    machine = Machine()
+    for _ in range(9):
+        machine.die(-9, after_s=1.0, worked=True)
+        assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
 
 
 @pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER, EXIT_UNSUITABLE])

@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ import pytest
 
 from workers import program
 from workers.supervise import worker_process
-from workers.supervise.activity import ActivityReader
+from workers.supervise.activity import ENV_CALLS, ActivityReader
 from workers.supervise.ending import Ending
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
@@ -93,6 +94,19 @@ def test_a_worker_is_spoken_for_until_its_end_is_told(monkeypatch: pytest.Monkey
         assert worker.activity(time.monotonic()) is not None
     assert worker.ended() == Ending(3, "ended with exit code 3 while it started")
     assert worker.activity(time.monotonic()) is None
+
+
+def test_the_end_says_whether_calls_of_the_environment_had_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", "exit 3"], **how))
+    worked = []
+    for calls in (0, 1):
+        worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+        os.pwrite(worker._page.fd, calls.to_bytes(8, sys.byteorder), 8 * ENV_CALLS)
+        worker.wait(10.0)
+        ending = worker.ended()
+        assert ending is not None
+        worked.append(ending.worked)
+    assert worked == [False, True]
 
 
 def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatch: pytest.MonkeyPatch) -> None:

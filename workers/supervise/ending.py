@@ -17,3 +17,5 @@ class Ending:
     """The worker has said beforehand that it leaves with this code."""
     failed: bool = False
     """Its environment, or the worker, is to blame: it ended neither on purpose nor before it ran environment code."""
+    worked: bool = False
+    """Calls of its environment have returned."""

@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -126,7 +126,8 @@ class WorkerProcess:
             else:
                 free_all(self._slots)
             assert self._exit_code is not None
-            self._end = self._ending(self._exit_code)
+            worked = self._page.read(time.monotonic()).env_calls > 0
+            self._end = replace(self._ending(self._exit_code), worked=worked)
             self._page.close()
         return self._end
 

@@ -238,6 +238,13 @@ def test_a_name_that_is_not_the_routing_id_is_refused() -> None:
     assert learner.coordinator.members == {}
 
 
+def test_what_comes_over_a_connection_that_a_newer_one_has_replaced_is_explained() -> None:
+    """ZeroMQ takes the routing id from the older connection: what it had sent is read from one without a name."""
+    learner = Learner()
+    (refuse,) = of(learner.says(b"\0\0\0\0\1", Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
+    assert refuse.reason.startswith("its connection has no routing id: the worker has connected again and needs nothing, or")
+
+
 def test_another_protocol_is_refused_and_says_what_to_do() -> None:
     learner = Learner()
     outs = learner.says(A, Hello(PROTOCOL_VERSION + 1, "a", "host", 1, 1001, "fake", 1))
