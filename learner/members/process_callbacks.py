@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from learner.members.events import Failed
 from learner.members.membership import Member
 from protocol.alive import WorkerActivity, WorkerExit
 
@@ -23,5 +24,7 @@ class ProcessCallbacks:
     """Gives these processes, and those that replace them, the lowest CPU priority."""
     stepping: Callable[[], list[Member]] = list
     """Returns the workers that step the environment, if the learner's members do not; else none."""
+    failed: list[Failed] = field(default_factory=list)
+    """Failures of those workers, which the learner takes out."""
     expected: int = 0
     """Number of processes that the user asked for. 0: any number."""

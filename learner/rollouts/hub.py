@@ -301,6 +301,8 @@ class Hub:
         """One turn of waiting: listen, then check whether the run can go on."""
         self._listen(timeout_s)
         self._check_interrupt()
+        while self._processes.failed:
+            self._on_event(self._processes.failed.pop(0))
         if self._failure is not None:
             raise self._failure
         self._check_members()

@@ -17,6 +17,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from learner.members.events import Failed
 from learner.members.membership import Member
 from learner.vector_env.arguments import Options, action_arrays, seed_list, take_reset_mask
 from learner.vector_env.batch_arrays import BatchArrays
@@ -470,6 +471,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def watch(self, callback: Callable[[], None]) -> None:
         """Set what is called regularly during each wait. An exception that it raises ends the wait."""
         self._hub.call_while_waiting(callback)
+
+    def call_on_death(self, callback: Callable[[Failed], None]) -> None:
+        """Call this, in the thread that uses this, when a worker's process has ended in its environment."""
+        self._hub.call_on_death(callback)
 
     def answer_for(self, run: Callable[[float], Status]) -> None:
         """Answer `millrace status` for this run, which acts on these copies. `run` takes the time and gives its status."""

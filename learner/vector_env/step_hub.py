@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from learner.members.events import Event, WorkerLeft, WorkerRefused
+from learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
@@ -124,6 +124,7 @@ class StepHub:
         self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
         self._patience_s = PATIENCE_S
         self._while_waiting: Callable[[], None] = lambda: None
+        self._on_death: Callable[[Failed], None] = lambda event: None
         self._status_of_run: Callable[[float], Status] | None = None
         self.stepped: set[int] = set()
         """Lanes whose last step, through shared memory, is done."""
@@ -151,6 +152,10 @@ class StepHub:
     def call_while_waiting(self, callback: Callable[[], None]) -> None:
         """Call this now and then while waiting; what it raises ends the wait."""
         self._while_waiting = callback
+
+    def call_on_death(self, callback: Callable[[Failed], None]) -> None:
+        """Call this when a worker's process has ended in its environment: `make_vec` only tells of the lost copies."""
+        self._on_death = callback
 
     def answer_for(self, run: Callable[[float], Status]) -> None:
         """From now on answer `millrace status` for the run that acts on these copies: its figures, and the workers here."""
@@ -403,6 +408,8 @@ class StepHub:
 
     def _on_event(self, event: Event) -> None:
         """Release the lanes of a worker that has left."""
+        if isinstance(event, WorkerProcessFailed) and not event.spare:
+            self._on_death(event)
         if isinstance(event, WorkerLeft | WorkerRefused):
             for lane in [lane for lane in self._wake_pipes if self._coordinator.owner(lane) is None]:
                 del self._wake_pipes[lane]

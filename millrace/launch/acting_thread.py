@@ -50,7 +50,9 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
         lanes.raise_if_no_workers()
         return thread.poll()
 
-    return ProcessCallbacks(ended, thread.activities, lambda: env.workers, stepping=env.members, expected=expected)
+    processes = ProcessCallbacks(ended, thread.activities, lambda: env.workers, stepping=env.members, expected=expected)
+    env.call_on_death(processes.failed.append)
+    return processes
 
 
 def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:

@@ -222,6 +222,13 @@ def test_one_failure_of_an_environment_is_tolerated(tmp_path: Path) -> None:
     assert_balanced(result["ledger"])
 
 
+def test_workers_that_die_again_and_again_end_the_run(tmp_path: Path) -> None:
+    with pytest.raises(
+        EnvironmentFailed, match=r"its process was killed by SIGKILL.*; failure 3 .*max_env_failures allows 2"
+    ):
+        run(tmp_path, f"{TOY}Dies-v0", max_env_failures=2, workers=1, **SMALL, **IN_LEARNER)
+
+
 @pytest.mark.parametrize(("env", "what"), [("NaNObservation", "observation"), ("NaNReward", "reward")])
 def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str, what: str) -> None:
     with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
