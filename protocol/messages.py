@@ -378,30 +378,30 @@ class Status(Message, frozen=True):
     """The answer to Inquire."""
 
     env: str
-    version: int
-    """how many updates the learner has made; -1 before the first weights"""
-    env_steps: int
-    """env steps used by updates since the run began"""
-    total_steps: int
-    """env steps at which the run ends; 0 for one without an end: a learner of one's own, or a vector environment"""
-    steps_per_s: float
-    """env steps used per second, since this learner started"""
-    return_mean: float | None
-    """mean return of the last 100 episodes, in raw rewards"""
-    lag_mean: float
-    """mean lag of the rollouts of the last update, in versions"""
-    lag_max: int
-    """largest lag of the rollouts of the last update, in versions"""
     workers: tuple[WorkerStatus, ...]
     """in the order in which they joined; of very many, the first"""
-    ledger: dict[str, int]
+    workers_wanted: int = 0
+    """number of workers with which each lane has one of its own, and none is spare; 0 while the environment is described"""
+    version: int = -1
+    """how many updates the learner has made; -1 before the first weights"""
+    env_steps: int = 0
+    """env steps used by updates since the run began"""
+    total_steps: int = 0
+    """env steps at which the run ends; 0 for one without an end: a learner of one's own, or a vector environment"""
+    steps_per_s: float = 0.0
+    """env steps used per second, since this learner started"""
+    return_mean: float | None = None
+    """mean return of the last 100 episodes, in raw rewards"""
+    lag_mean: float = 0.0
+    """mean lag of the rollouts of the last update, in versions"""
+    lag_max: int = 0
+    """largest lag of the rollouts of the last update, in versions"""
+    ledger: dict[str, int] = {}
     """counts of what happened to every ticket, transition and message"""
     workers_left_out: int = 0
     """number of workers that are not in `workers`, because the message would be too long"""
     waiting: str = ""
     """who waits for whom, and for what share of the time, in one line for people; empty if nobody waits long"""
-    workers_wanted: int = 0
-    """number of workers with which each lane has one of its own, and none is spare; 0 while the environment is described"""
 
 
 ToLearner = (

@@ -134,12 +134,14 @@ def open_slots() -> int:
             os.fchmod(fd, MODE)  # for every user, whatever the umask
             return fd
         fd = os.open(path, FLAGS)
-    except OSError as error:
-        raise _unusable(path, os.strerror(error.errno or 0)) from error
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        if stat.S_ISREG(os.fstat(fd).st_mode):
+            return fd
         os.close(fd)
-        raise _unusable(path, "not a regular file")
-    return fd
+        why = "not a regular file"
+    except OSError as error:
+        why = os.strerror(error.errno or 0)
+    line = f"{path}: {why}; it holds the slots of this machine's env copies, so expected a file that every user may write"
+    raise UsageError(f"{line}; set {FILE_VARIABLE} to another path, the same for all processes of this machine")
 
 
 def free_all(fd: int) -> None:
@@ -155,20 +157,12 @@ def touch(fd: int) -> None:
             os.utime(fd)
 
 
-def _unusable(path: Path, why: str) -> UsageError:
-    line = f"{path}: {why}; it holds the slots of this machine's env copies, so expected a file that every user may write"
-    return UsageError(f"{line}; set {FILE_VARIABLE} to another path, the same for all processes of this machine")
-
-
 def _is_locked_by(fd: int, slot: int) -> bool:
     """Lock this slot, unless somebody else holds it."""
-    try:
+    with suppress(BlockingIOError, PermissionError):
         _lock(fd, fcntl.F_WRLCK, slot, 1)
-    except OSError as error:
-        if error.errno in (errno.EAGAIN, errno.EACCES):
-            return False
-        raise
-    return True
+        return True
+    return False
 
 
 def _lock(fd: int, kind: int, start: int, length: int) -> None:

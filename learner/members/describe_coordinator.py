@@ -131,18 +131,7 @@ class DescribeCoordinator:
 
     def status(self, total_steps: int, now: float) -> Status:
         """The answer to `millrace status`. There are no weights yet, and no ledger."""
-        return Status(
-            env=self.spec.env.id,
-            version=-1,
-            env_steps=0,
-            total_steps=total_steps,
-            steps_per_s=0.0,
-            return_mean=None,
-            lag_mean=0.0,
-            lag_max=0,
-            workers=self.membership.status(now),
-            ledger={},
-        )
+        return Status(self.spec.env.id, self.membership.status(now), total_steps=total_steps)
 
     def _goodbye(self, member: Member, reason: str) -> list[Outgoing]:
         if reason == TOLD_TO_STOP or reason.startswith(NO_SLOT) or self.described is not None:

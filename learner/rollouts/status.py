@@ -10,7 +10,9 @@ from protocol.messages import Status
 def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str) -> Status:
     """The status message of a run; `progress` is that of the last update, `waiting` says who waits for whom."""
     return Status(
-        env=coordinator.run.env.id,
+        coordinator.run.env.id,
+        coordinator.membership.status(now),
+        len(coordinator.lanes),
         version=coordinator.version,
         env_steps=progress.env_steps,
         total_steps=progress.total_steps,
@@ -18,8 +20,6 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiti
         return_mean=progress.return_mean,
         lag_mean=progress.lag_mean,
         lag_max=progress.lag_max,
-        workers=coordinator.membership.status(now),
         ledger=coordinator.ledger.counts(),
         waiting=waiting,
-        workers_wanted=len(coordinator.lanes),
     )

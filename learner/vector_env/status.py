@@ -12,17 +12,11 @@ def status(coordinator: OrderCoordinator, now: float) -> Status:
     """The status message of a vector environment of its own. It has no weights, no target and no ledger."""
     members = coordinator.members.values()
     return Status(
-        env=", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs)),
-        version=-1,
+        ", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs)),
+        coordinator.membership.status(now),
+        len(coordinator.lanes),
         env_steps=sum(member.heartbeat.steps for member in members if member.heartbeat is not None),
-        total_steps=0,
         steps_per_s=sum(member.steps_per_s for member in members),
-        return_mean=None,
-        lag_mean=0.0,
-        lag_max=0,
-        workers=coordinator.membership.status(now),
-        ledger={},
-        workers_wanted=len(coordinator.lanes),
     )
 
 
