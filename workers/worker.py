@@ -381,9 +381,7 @@ class Worker:
                     self._describe(run)
             self._loaded = None
         except Exception as error:  # torch and the system raise many types
-            detail = error.detail if isinstance(error, UserFacingError) else ""
-            of_policy = isinstance(error, PolicyFailed)
-            self._do(self._session.fail(_line(error), detail or traceback.format_exc(), None, of_policy=of_policy))
+            self._fail(error)
 
     def _describe(self, spec: DescribeSpec) -> None:
         """Describe the environment. A second thread sends the heartbeats while its code runs."""

@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -126,8 +126,7 @@ class WorkerProcess:
             else:
                 free_all(self._slots)
             assert self._exit_code is not None
-            worked = self._page.read(time.monotonic()).env_calls > 0
-            self._end = replace(self._ending(self._exit_code), worked=worked)
+            self._end = self._ending(self._exit_code)
             self._page.close()
         return self._end
 
@@ -225,30 +224,30 @@ class WorkerProcess:
 
     def _ending(self, code: int) -> Ending:
         """How it ended. `code` is negative if a signal ended it."""
-        page = self._page.read(time.monotonic())
-        output = ""
+        page, output = self._page.read(time.monotonic()), ""
         with suppress(OSError):  # the log may have been deleted
             output = self._log.read_text(errors="replace") if self._log is not None else ""
+        last = "".join(f" ({line})" for line in output.strip().splitlines()[-1:])
+        meanwhile, worked = WHILE[page.doing], page.env_calls > 0
         if self._because:
             stacks = self._page.stacks()
             self._write(stacks)
             where = deepest_frame(stacks)
-            return Ending(code, one_line(self._because + (f", at {where}" if where else "")), failed=page.doing != "closing")
-        if page.exit_code is not None:
-            last = output.strip().splitlines()[-1:] if page.exit_code else []
-            line = f"ended with exit code {page.exit_code}{f' ({last[0]})' if last else ''}"
-            return Ending(page.exit_code, one_line(line), on_purpose=True)
+            line = self._because + (f", at {where}" if where else "")
+        elif page.exit_code is not None:
+            line = f"ended with exit code {page.exit_code}{last if page.exit_code else ''}"
+            return Ending(page.exit_code, one_line(line), on_purpose=True, worked=worked)
+        elif code < 0:
+            line = f"was killed by {_signal_name(-code)}{meanwhile}"
+        elif (hung := where_it_hung(output)) is not None:
+            line = f"was ended: it made no progress, at {hung}"
+        elif self._was_reaped:
+            line = f"ended{meanwhile}; its exit code is not known"
+        else:
+            line = f"ended with exit code {code}{meanwhile}{last if code else ''}"
         # In `close`, an environment has done its work: that its process ends there does not count against the run.
-        failed = page.doing != "closing" and (page.env_calls > 0 or page.doing not in NO_ENVIRONMENT_CODE)
-        if code < 0:
-            return Ending(code, f"was killed by {_signal_name(-code)}{WHILE[page.doing]}", failed=failed)
-        if (hung := where_it_hung(output)) is not None:
-            return Ending(code, one_line(f"was ended: it made no progress, at {hung}"), failed=failed)
-        if self._was_reaped:
-            return Ending(code, f"ended{WHILE[page.doing]}; its exit code is not known", failed=failed)
-        last = output.strip().splitlines()[-1:] if code else []
-        line = f"ended with exit code {code}{WHILE[page.doing]}{f' ({last[0]})' if last else ''}"
-        return Ending(code, one_line(line), failed=failed)
+        failed = page.doing != "closing" and (worked or page.doing not in NO_ENVIRONMENT_CODE)
+        return Ending(code, one_line(line), failed=failed, worked=worked)
 
     def _write(self, stacks: str) -> None:
         """Write to where the worker's stderr goes."""
