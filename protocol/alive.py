@@ -19,6 +19,15 @@ Doing = Literal["starting", "waiting", "describing", "making", "resetting", "ste
 NO_SLOT = "no slot is free"  # the beginning of the reason of a worker that leaves, and comes back when there is room
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
+CALLS: dict[Doing, str] = {
+    "describing": "the construction of its environment",
+    "making": "the construction of its environment or policy",
+    "resetting": "a reset of its environment",
+    "stepping": "a step of its environment",
+    "evaluating": "a step of an evaluation",
+    "closing": "close() of its environment",
+}
+"""The calls of code of the user, for the reasons why a worker ended."""
 
 
 class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
@@ -80,14 +89,9 @@ class CallTimeouts:
 
     def reason(self, doing: Doing) -> str:
         """Why a worker is ended that exceeds its limit. The line names the flag."""
-        if doing == "closing":
-            return f"was ended: close() of its environment took longer than {CLOSE_S:g} s"
-        call, flag = {
-            "describing": ("the construction of its environment", "construct"),
-            "making": ("the construction of its environment or policy", "construct"),
-            "resetting": ("a reset of its environment", "reset"),
-        }.get(doing, ("a step of its environment", "step"))
-        return f"was ended: {call} took longer than {self.limit_s(doing):g} s (--{flag}-timeout-s)"
+        flag = {"describing": "construct", "making": "construct", "resetting": "reset"}.get(doing, "step")
+        named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
+        return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"
 
 
 NO_TIMEOUTS = CallTimeouts(0.0, 0.0, 0.0)

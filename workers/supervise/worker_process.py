@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from protocol.alive import NO_ENVIRONMENT_CODE, CallTimeouts, Doing, WorkerActivity
+from protocol.alive import CALLS, NO_ENVIRONMENT_CODE, CallTimeouts, WorkerActivity
 from protocol.bounds import one_line
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
@@ -41,16 +41,6 @@ KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-WHILE: dict[Doing, str] = {
-    "starting": " while it started",
-    "waiting": "",
-    "describing": " while it described the environment",
-    "making": " while it made its environment or policy",
-    "resetting": " in a reset of its environment",
-    "stepping": " in a step of its environment",
-    "evaluating": " in an evaluation",
-    "closing": " while it closed its environment",
-}
 
 
 @dataclass(frozen=True)
@@ -228,7 +218,8 @@ class WorkerProcess:
         with suppress(OSError):  # the log may have been deleted
             output = self._log.read_text(errors="replace") if self._log is not None else ""
         last = "".join(f" ({line})" for line in output.strip().splitlines()[-1:])
-        meanwhile, worked = WHILE[page.doing], page.env_calls > 0
+        meanwhile = f" in {CALLS[page.doing]}" if page.doing in CALLS else " while it started" * (page.doing == "starting")
+        worked = page.env_calls > 0
         if self._because:
             stacks = self._page.stacks()
             self._write(stacks)

@@ -185,7 +185,7 @@ def test_failures_are_counted_and_the_worker_may_come_back() -> None:
 
 def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
     made = coordinator()
-    why = "ended with exit code 0 while it described the environment"
+    why = "ended with exit code 0 in the construction of its environment"
     join(made, A, 1)
     made.process_ended(WorkerExit("w0", 1, why, failed=True))  # a process of this program
     made.process_ended(WorkerExit("w0", 1, why, failed=True))
@@ -195,7 +195,7 @@ def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 3, why, failed=True),)), 1.0)  # not the member's nonce
     assert made.failure is None
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 2, why, failed=True),)), 1.0)
-    assert "w0 ended with exit code 0 while it described the environment; failure 2 in a row" in str(made.failure)
+    assert "w0 ended with exit code 0 in the construction of its environment; failure 2 in a row" in str(made.failure)
 
 
 def test_heartbeats_are_answered_and_silence_is_the_end() -> None:
