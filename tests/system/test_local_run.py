@@ -21,17 +21,20 @@ import psutil
 import pytest
 
 import millrace
+from learner.config.config import Config
 from learner.config.layers import config_from_toml, resolve
 from learner.report.runs import read_run
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_format import check_format
+from millrace.launch import learner_inference
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support import preloaded
 from tests.support.saved_policies import load_policy
 from tests.system.run_folders import summary
 from workers.envs.toy import Countdown
+from workers.slots import LIMIT_VARIABLE
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much
 
@@ -511,3 +514,22 @@ def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: 
     ended = status()
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr == f"millrace: run {folder}: no process trains it now\n"
+
+
+def test_a_local_run_keeps_within_the_env_copies_of_its_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With little room, fewer workers play evaluations; without room for one, nothing starts."""
+    seen: list[int] = []
+
+    def starts(config: Config, *rest: object) -> Path:
+        seen.append(config.max_env_copies)
+        return Path()
+
+    monkeypatch.setattr(learner_inference, "train", starts)
+    for here, of_run in (("", 0), ("", 9), ("7", 0), ("7", 9), ("7", 6)):
+        monkeypatch.setenv(LIMIT_VARIABLE, here)
+        config = resolve("CartPole-v1", inference="learner", envs=4, lanes=4, eval_copies=2, max_env_copies=of_run)
+        train(config, None, lambda progress: None)
+    assert seen == [0, 9, 7, 7, 6]
+    monkeypatch.setenv(LIMIT_VARIABLE, "5")
+    with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE} 5: expected at least 6, for 4 env copies and 2 that play"):
+        train(config, None, lambda progress: None)
