@@ -263,9 +263,10 @@ def test_values_are_the_same_however_many_columns_are_evaluated_together(monkeyp
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "ppo": {"learning_rate": 3e-3, "learning_rate_schedule": "linear", "batch_size": 128, "n_epochs": 4},
-    "a2c": {"learning_rate": 1e-2, "optimizer": "adam", "normalize_advantage": True},
-    "impala": {"learning_rate": 1e-2, "optimizer": "adam"},
+    "a2c": {"learning_rate": 2e-2, "optimizer": "adam", "vf_coef": 0.25},
+    "impala": {"learning_rate": 2e-2, "optimizer": "adam", "vf_coef": 0.25},
 }
+"""With these, every seed of 0 to 5 gets more than 0.9 with either core, not the tested one alone."""
 
 
 def learned(name: str, core: Core | None, updates: int) -> float:
