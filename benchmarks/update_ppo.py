@@ -1,4 +1,4 @@
-"""A PPO minibatch update in three ways: the usual style, `PPO.step` with a graph, and `PPO.step` as `PPO.update` calls it.
+"""A PPO minibatch update in three ways: the usual style, `PPO.step` with passes in torch, and `PPO.step` as it is.
 
 All do the same work on the same rows (4 observations, 2 actions, actor and critic 4-64-64-·, tanh): take the minibatch out
 of the batch, normalize advantages, clipped surrogate, value loss, entropy, approx_kl, clip fraction, gradient clipped by
@@ -9,13 +9,13 @@ its norm, Adam with eps 1e-5, losses read as numbers. The usual style is modules
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from itertools import cycle
 
 import torch
 from torch import Tensor, nn
 
-from benchmarks.contest import Contest, repeated
-from learner.algorithms.kernels.fused import MAX_ROWS
+from benchmarks.contest import Contest, passes_in_torch, repeated
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
@@ -69,7 +69,7 @@ def usual(rows: Minibatch, width: int) -> Callable[[Tensor], object]:
         entropy_loss = -entropy.mean()
         loss = policy_loss + CONFIG.ent_coef * entropy_loss + CONFIG.vf_coef * value_loss
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(agent.parameters(), CONFIG.max_grad_norm)
         optimizer.step()
         return loss.item(), policy_loss.item(), value_loss.item(), entropy_loss.item(), approx_kl, clip_fraction
@@ -79,14 +79,9 @@ def usual(rows: Minibatch, width: int) -> Callable[[Tensor], object]:
 
 def ours(rows: Minibatch, policy: PolicySpec, graph: bool) -> Callable[[Tensor], object]:
     """An update by `PPO.step` on rows of a batch, by their numbers."""
-    algorithm = PPO(CONFIG, policy, total_steps=1, seed=0)
-    in_numpy = rows.in_numpy()
-
-    def update(index: Tensor) -> object:
-        numpy = not graph and len(index) <= MAX_ROWS  # as `ActorCritic.minibatches` chooses
-        return algorithm.step(in_numpy.select(index.numpy()) if numpy else rows.select(index))
-
-    return update
+    with passes_in_torch() if graph else nullcontext():
+        algorithm = PPO(CONFIG, policy, total_steps=1, seed=0)
+    return lambda index: algorithm.step(rows.select(index))
 
 
 def contest(size: int, target: float | None, width: int = 64) -> Contest:

@@ -8,6 +8,7 @@ step of RMSProp and what they log. SAC and TD3: the shapes of Pendulum, 256 tran
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -20,10 +21,9 @@ from stable_baselines3 import SAC as TheirSAC
 from stable_baselines3 import TD3 as TheirTD3
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.contest import Contest, repeated
+from benchmarks.contest import Contest, passes_in_torch, repeated
 from learner.algorithms.a2c import A2C
 from learner.algorithms.dqn import DQN
-from learner.algorithms.kernels.action_values import AutogradActionValues
 from learner.algorithms.sac import SAC
 from learner.algorithms.td3 import TD3
 from learner.config.hyperparameters import A2CConfig, DQNConfig, SACConfig, TD3Config
@@ -68,12 +68,11 @@ def dqn(width: int, target: float) -> Contest:
     )
 
     def ours(graph: bool) -> Callable[[], float]:
-        made = DQN(config, DQN.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
-        if graph:
-            made._values, made._target_values = AutogradActionValues(made.net), AutogradActionValues(made.target)
+        with passes_in_torch() if graph else nullcontext():
+            made = DQN(config, DQN.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
         for seed in range(20):
             made.replay.add(some_batch(32, seed))
-        return lambda: repeated(lambda: made.step(made.replay.sample(rows)), STEPS)
+        return lambda: repeated(lambda: made.step(made.transitions(made.replay.sample(rows))), STEPS)
 
     theirs = TheirDQN(
         "MlpPolicy",
@@ -119,7 +118,7 @@ def continuous(name: str, width: int, target: float | None) -> Contest:
     theirs.learn(500)
 
     def ours() -> float:
-        return repeated(lambda: made.step(made.replay.sample(rows)), STEPS)
+        return repeated(lambda: made.step(made.transitions(made.replay.sample(rows))), STEPS)
 
     runs = {"peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS, "graph": ours, "ours": ours}
     return Contest(f"{name}, {width} units", rows, "SB3", target, runs)
@@ -131,9 +130,8 @@ def a2c(steps: int, target: float) -> Contest:
     config = A2CConfig(rollout_steps=steps)
 
     def ours(graph: bool) -> Callable[[], float]:
-        made = A2C(config, A2C.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
-        if graph:
-            made._fused = None
+        with passes_in_torch() if graph else nullcontext():
+            made = A2C(config, A2C.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
         return lambda: repeated(lambda: made.update(batch, lambda: None), STEPS)
 
     theirs = TheirA2C("MlpPolicy", make_vec_env("CartPole-v1", COPIES), n_steps=steps, device="cpu")

@@ -1,4 +1,4 @@
-"""An algorithm of one's own, by its loss: PPO's clipped objective, and a penalty on the squared log-ratio.
+"""Losses of one's own: PPO with a penalty on the squared log-ratio, and SAC with the conservative term of CQL.
 
 Either `python -m examples.own_loss`, or `millrace train CartPole-v1 --algo examples.own_loss:ClippedPlus --penalty 0.2`.
 """
@@ -6,34 +6,47 @@ Either `python -m examples.own_loss`, or `millrace train CartPole-v1 --algo exam
 import torch
 
 import millrace
-from millrace.algorithms import ActorCritic, ActorCriticConfig, LossInput
+from millrace.algorithms import PPO, SAC, CriticLoss, LossInput, PPOConfig, SACConfig, Transitions
 
 
-class ClippedPlus(ActorCritic):
-    """PPO's clipped objective, and a penalty on the squared log-ratio."""
+class ClippedPlus(PPO):
+    """PPO, and a penalty on the squared log-ratio."""
 
-    class Config(ActorCriticConfig, frozen=True):
+    class Config(PPOConfig, frozen=True):
         """Settings of ClippedPlus."""
 
-        clip_range: float = 0.2
-        """ε of the clipped objective."""
         penalty: float = 0.1
         """Weight of the mean squared log-ratio of new to old action probability."""
 
     config: Config
 
-    def loss(self, rows: LossInput) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The loss of a minibatch, and numbers to log. Advantages and targets are made; every row is valid."""
-        log_ratio = rows.log_prob_now - rows.log_prob
-        ratio, epsilon = log_ratio.exp(), self.config.clip_range
-        policy = -torch.minimum(ratio * rows.advantage, ratio.clamp(1 - epsilon, 1 + epsilon) * rows.advantage).mean()
-        value, penalty = (rows.value - rows.target).square().mean(), log_ratio.square().mean()
-        loss = (
-            policy + self.config.penalty * penalty + self.config.vf_coef * value - self.config.ent_coef * rows.entropy.mean()
-        )
-        return loss, {"policy_loss": policy, "value_loss": value, "penalty": penalty}
+    def loss(self, rows: LossInput) -> tuple[torch.Tensor, dict[str, torch.Tensor | float]]:
+        """PPO's loss and one more term."""
+        loss, numbers = super().loss(rows)
+        penalty = (rows.log_prob_now - rows.log_prob).square().mean()
+        return loss + self.config.penalty * penalty, {**numbers, "penalty": penalty}
+
+
+class Conservative(SAC):
+    """SAC, and a penalty on the values of actions that are not in the data: L + Σ E[Q(s, ã) − Q(s, a)],  ã ~ π(s)."""
+
+    class Config(SACConfig, frozen=True):
+        """Settings of Conservative."""
+
+        conservative: float = 1.0
+        """Weight of the conservative term (Kumar et al. 2020, equation 2)."""
+
+    config: Config
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """SAC's loss and one more term, for which the critics are called again."""
+        found = super().critic_loss(rows)
+        with torch.no_grad():
+            action, _ = self.sample(rows.x)
+        excess = (self.net.values(rows.x, action) - self.net.values(rows.x, rows.action)).mean(1).sum()
+        loss = found.loss + self.config.conservative * excess
+        return found._replace(loss=loss, numbers={**found.numbers, "excess": excess})
 
 
 if __name__ == "__main__":
-    run = millrace.train("CartPole-v1", algo=ClippedPlus, penalty=0.2, learning_rate=1e-3, steps=100_000)
-    print(run)
+    print(millrace.train("CartPole-v1", algo=ClippedPlus, penalty=0.2, learning_rate=1e-3, steps=100_000))

@@ -1,8 +1,8 @@
 """PPO in PyTorch over `millrace.RolloutService`: `python examples/ppo_torch.py`.
 
 The workers act with the policy `MLP(300, 300)`. Everything else is here: the critic, the advantages, the loss, the
-optimizer. With these settings the weights equal those of `millrace train --algo ppo`, bit for bit: with layers above 256
-units the built-in PPO, too, learns by autograd.
+optimizer. With these settings the weights equal those of `millrace train --algo ppo`, bit for bit: layers above 256 units
+pass in PyTorch there, too.
 """
 
 from __future__ import annotations
@@ -109,16 +109,14 @@ def learn(
     for _ in range(settings.n_epochs):
         shuffled = torch.from_numpy(index[torch.randperm(len(index), generator=generator).numpy()])
         for some in shuffled.tensor_split(-(-len(index) // settings.batch_size)):
+            std, mean = torch.std_mean(advantage[some])
+            scaled = (advantage[some] - mean) / (std + 1e-8)
+            ratio = (agent.log_prob(obs[some], action[some]) - log_prob[some]).exp()
+            clipped = ratio.clamp(1 - settings.clip_range, 1 + settings.clip_range)
+            policy_loss = -torch.minimum(ratio * scaled, clipped * scaled).mean()
+            value_loss = (agent.value(obs[some]) - target[some]).square().mean()
             agent.grad.zero_()
-            centered = advantage[some] - advantage[some].sum() / len(some)
-            scaled = centered / ((centered @ centered / (len(some) - 1)) ** 0.5 + 1e-8)
-            log_prob_now, value = agent.log_prob(obs[some], action[some]), agent.value(obs[some])
-            with torch.no_grad():  # the derivatives of PPO's loss by the two outputs of the network
-                ratio = (log_prob_now - log_prob[some]).exp()
-                plain, clipped = ratio * scaled, ratio.clamp(1 - settings.clip_range, 1 + settings.clip_range) * scaled
-                by_log_prob = plain * (plain <= clipped) / -len(some)
-                by_value = (value - target[some]) * (2 / len(some)) * settings.vf_coef
-            torch.autograd.backward((log_prob_now, value), (by_log_prob, by_value))
+            (policy_loss + settings.vf_coef * value_loss).backward()  # type: ignore[no-untyped-call]
             norm = agent.grad.norm().item()
             if norm > settings.max_grad_norm:
                 agent.grad.mul_(settings.max_grad_norm / norm)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from learner.algorithms import Algorithm
-from learner.algorithms.updates import check_weights
+from learner.algorithms.algorithm import check_weights
 from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
 from learner.evaluations import Evaluations

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from learner.algorithms import Algorithm
-from learner.algorithms.updates import numbers
+from learner.algorithms.algorithm import numbers
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_recorder import RunRecorder

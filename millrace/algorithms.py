@@ -22,9 +22,10 @@ wrong with a class of either level. A run takes it as `millrace train CartPole-v
 
 The algorithm itself:
 
-- `Algorithm`, the base of all; `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`,
-  `Impala` and `REINFORCE`; `OffPolicy`, the base of those with a replay buffer, of which are `DQN`, `SAC` and `TD3`. The
-  last two share `Continuous`: actions in a bounded Box, an exact replay ratio.
+- `Algorithm`, the base of all; `GradientDescent`, the base of ours: optimizers, schedules, statistics, `Metrics`, the state;
+  `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`, `Impala` and `REINFORCE`;
+  `OffPolicy`, the base of those with a replay buffer, of which are `DQN`, `SAC` and `TD3`. The last two share `Continuous`:
+  actions in a bounded Box, an exact replay ratio.
 - `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`, the bases of `Config`; `PPOConfig` and so
   on. Every setting has a default value and a type, perhaps with bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The text
   under it is its help.
@@ -44,8 +45,9 @@ Tools:
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
   `policy_log_prob` or `squashed_sample` of their outputs.
-- `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, and `Transitions`, the
-  arrays of a sample. `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
+- `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Transitions`, the
+  tensors of a sample, and `CriticLoss`, what a loss says of them.
+- `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
 - `torch_seed` of a `Purpose`: the seed of a random stream that is independent of all others of a run.
@@ -59,20 +61,20 @@ from learner.algorithms.actor_critic import ActorCritic, Estimates
 from learner.algorithms.algorithm import Algorithm, Start
 from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.continuous import Continuous, Transitions
 from learner.algorithms.dqn import DQN
+from learner.algorithms.gradient_descent import GradientDescent, Metrics, check_finite, scheduled
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import LossInput, Observations
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
+from learner.algorithms.replay.continuous import Continuous
 from learner.algorithms.replay.mixed_replay import MixedReplay
-from learner.algorithms.replay.off_policy import OffPolicy
+from learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
 from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from learner.algorithms.returns import EpisodeEnds, gae, vtrace
 from learner.algorithms.sac import SAC
 from learner.algorithms.td3 import TD3
-from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import (
     A2CConfig,
     ActorCriticConfig,
@@ -115,16 +117,19 @@ __all__ = [
     "Clones",
     "Continuous",
     "ContinuousConfig",
+    "CriticLoss",
     "DQNConfig",
     "Demonstrations",
     "EpisodeEnds",
     "Estimates",
     "Fixed",
     "Free",
+    "GradientDescent",
     "Impala",
     "ImpalaConfig",
     "Leaf",
     "LossInput",
+    "Metrics",
     "MixedReplay",
     "ObservationNormalizer",
     "Observations",

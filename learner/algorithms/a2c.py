@@ -10,7 +10,16 @@ from learner.config.hyperparameters import A2CConfig
 
 
 class A2C(ActorCritic):
-    """The policy gradient with GAE, in one step per batch. The base does all of it."""
+    """The policy gradient with GAE, in one step per batch."""
 
     Config = A2CConfig
     config: A2CConfig
+
+    @property
+    def n_epochs(self) -> int:
+        """See `ActorCritic`."""
+        return 1
+
+    def minibatch_count(self, rows: int) -> int:
+        """See `ActorCritic`."""
+        return 1

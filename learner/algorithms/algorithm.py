@@ -1,10 +1,14 @@
-"""The base of every algorithm: what the training loop of `learner.train` calls. No torch is needed for this file."""
+"""The base of every algorithm: what the training loop of `learner.train` calls, and checks of what it returns.
+
+A user's own algorithm may return anything. What cannot be used is said in one line that names the class. No torch is needed
+for this file.
+"""
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -12,6 +16,7 @@ import numpy as np
 from learner.config.hyperparameters import AlgorithmConfig
 from protocol.arrays import Floats
 from protocol.errors import UsageError
+from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -149,3 +154,39 @@ class Algorithm(ABC):
     def roll_back(self) -> None:
         """Return to the state that was remembered last, from any state in between: an update was not made whole."""
         self.load_state_dict(copy.deepcopy(self._remembered))
+
+
+def numbers(metrics: Any, who: str) -> dict[str, float]:
+    """The metrics of an update as floats, by name: also numpy's and torch's scalars become floats.
+
+    `who`: the class of the algorithm. Raises `UsageError` for anything but a dict of numbers by name.
+    """
+    if not isinstance(metrics, Mapping):
+        raise UsageError(f"{who}.update: expected a dict of metrics, got {type(metrics).__name__}; return {{}} for none")
+    found = {}
+    for name, number in metrics.items():
+        try:
+            found[name] = float("text" if isinstance(number, str | bytes) or not isinstance(name, str) else number)
+        except (TypeError, ValueError, OverflowError, RuntimeError):  # torch raises RuntimeError
+            got = f"{type(number).__name__} for {name!r}"
+            raise UsageError(f"{who}.update: metrics: expected a name and a number, got {got}") from None
+    return found
+
+
+def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
+    """What is wrong with the form of an algorithm's weights: a line for each array that is not as the policy needs it."""
+    if not isinstance(weights, tuple) or len(weights) != 2:
+        yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
+        return
+    sizes = {"parameters": acting_size(policy), "buffers": buffer_size(policy)}
+    for (name, size), array in zip(sizes.items(), weights, strict=True):
+        if not isinstance(array, np.ndarray):
+            yield f"weights: {name}: expected a numpy array, got {type(array).__name__}"
+        elif array.dtype != np.float32 or array.shape != (size,):
+            yield f"weights: {name}: expected float32[{size}], got {array.dtype}{list(array.shape)}"
+
+
+def check_weights(weights: Any, policy: PolicySpec, who: str) -> None:
+    """Raise `UsageError` for weights that no worker could act with. `who`: the class of the algorithm."""
+    if why := next(wrong_weights(weights, policy), None):
+        raise UsageError(f"{who}.{why}; millrace.testing.check_algorithm finds such mistakes before a run")

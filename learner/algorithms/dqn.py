@@ -8,36 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from learner.algorithms.kernels import loss_gradients
-from learner.algorithms.kernels.action_values import action_values
+from learner.algorithms import losses
+from learner.algorithms.gradient_descent import Metrics, clip_norm
+from learner.algorithms.kernels.networks import q_network
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
-from learner.algorithms.replay.mixed_replay import MixedReplay
-from learner.algorithms.replay.off_policy import OffPolicy
-from learner.algorithms.replay.replay_buffer import Sample
-from learner.algorithms.updates import check_finite
+from learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Floats
 from protocol.errors import UsageError
+from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import QNetwork
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
-
-class StepMetrics(NamedTuple):
-    """The metrics of one gradient step, measured before it changed the weights."""
-
-    loss: float
-    q_mean: float  # mean over the actions that were taken
-    grad_norm: float  # before clipping
-
-
-ADVICE = "a lower learning_rate, or normalize_observations"
-LOSSES = {"huber": loss_gradients.huber_loss, "squared": loss_gradients.squared_loss}
+LOSSES = {"huber": losses.huber_loss, "squared": losses.squared_loss}
 
 
 def exploration_rate(config: DQNConfig, env_steps: int) -> float:
@@ -49,9 +38,8 @@ def exploration_rate(config: DQNConfig, env_steps: int) -> float:
 class DQN(OffPolicy):
     """The Q-network, the target network, their optimizer, and the replay buffer with the prior data."""
 
-    replay: MixedReplay
-
     Config = DQNConfig
+    net: QNetwork
 
     @staticmethod
     def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
@@ -71,14 +59,12 @@ class DQN(OffPolicy):
 
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        self.net = QNetwork(policy, device, seed=seed)
-        self.target = QNetwork(policy, device, seed=seed)
-        self._values, self._target_values = (action_values(net, config.batch_size) for net in (self.net, self.target))
+        self.net, self.target = (q_network(policy, device, seed) for _ in range(2))
         avoid_compiler_import()
         optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW
-        self._optimizer = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
+        made = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
-        self.optimizers = {"optimizer": self._optimizer}
+        self.optimizers = {"optimizer": made}
 
     def steps_due(self) -> int:
         """The same number of gradient steps in each update, once learning has started."""
@@ -89,44 +75,42 @@ class DQN(OffPolicy):
         metrics = super().update(batch, pulse)
         return {"rollout/exploration_rate": exploration_rate(self.config, self.env_steps)} | metrics
 
-    @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
-    def step(self, sample: Sample) -> StepMetrics:
-        """One gradient step on a minibatch; then the target network and the priorities are updated."""
-        values, target = self._values, self.targets(sample)
-        chosen = values.chosen(*self.inputs(sample.leaves), values.to_array(sample.action))
-        error = chosen - target
-        loss, by_chosen = LOSSES[self.config.loss](error, values.to_array(sample.weight))
-        values.backward(by_chosen)
-        measured = StepMetrics(*values.numbers_and_norm(loss, chosen.sum() / len(chosen)))
-        check_finite(measured._asdict(), self.version, ADVICE)
-        self._clip_gradient(measured.grad_norm)
-        take_step(self._optimizer)
-        self.gradient_steps += 1
-        self._update_target()
-        self.replay.update_priorities(sample.slots, error if isinstance(error, np.ndarray) else error.cpu().numpy())
-        return measured
-
-    def targets(self, sample: Sample) -> Any:
-        """The targets [B] of the action values:  Σ γⁱ r + γᵏ Q′(s′, a′). γᵏ is 0 if the task has terminated.
+    @torch.no_grad()
+    def targets(self, rows: Transitions) -> Tensor:
+        """The targets [B] of the action values: y = Σ γⁱ r + γᵏ Q′(s′, a′).
 
         a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016). Q′ is the target network. With action
         masks, a′ is the best of the actions that are allowed in s′.
         """
-        inputs, values, mask = self.inputs(sample.next_leaves), self._target_values, sample.next_mask
-        if self.config.double:
-            with torch.no_grad():
-                value = values.chosen(*inputs, self._values.best_actions(*inputs, mask))
-        else:
-            value = values.best_values(*inputs, mask)
-        return values.to_array(sample.reward) + values.to_array(sample.discount) * value
+        values = self.target.params(rows.next_x, rows.next_images)
+        chooses = self.net.params(rows.next_x, rows.next_images) if self.config.double else values
+        if rows.next_mask is not None:
+            chooses = chooses.masked_fill(~rows.next_mask, FORBIDDEN)
+        return rows.reward + rows.discount * values.gather(1, chooses.argmax(1, keepdim=True))[:, 0]
+
+    def loss(self, rows: Transitions) -> CriticLoss:
+        """E[w ℓ(Q(s, a) − y)], where ℓ is the Huber loss or the square."""
+        values = self.net.params(rows.x, rows.images).gather(1, rows.action[:, None])[:, 0]
+        error = values - self.targets(rows)
+        return CriticLoss(LOSSES[self.config.loss](error, rows.weight), error, {"q_mean": values.mean()})
+
+    def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
+        """One gradient step on a minibatch; then the target network is updated."""
+        found = self.loss(rows)
+        metrics = self.differentiate(found.loss, self.net.flat, {**found.numbers, "loss": found.loss})
+        self._clip_gradient(metrics["grad_norm"])
+        take_step(self.optimizers["optimizer"])
+        self.gradient_steps += 1
+        self._update_target()
+        return metrics, found.error
 
     def _clip_gradient(self, norm: float) -> None:
         config, gradient = self.config, self.net.flat_grad
         if config.max_grad_value is not None:
             gradient.clamp_(-config.max_grad_value, config.max_grad_value)
             norm = gradient.norm().item() if config.max_grad_norm is not None else norm
-        if config.max_grad_norm is not None and norm > config.max_grad_norm:
-            gradient.mul_(config.max_grad_norm / norm)
+        if config.max_grad_norm is not None:
+            clip_norm(self.net.flat, norm, config.max_grad_norm)
 
     def _update_target(self) -> None:
         """Update the target network after a gradient step."""

@@ -22,7 +22,10 @@ class Impala(ActorCritic):
     Config = ImpalaConfig
     config: ImpalaConfig
     estimates_each_epoch = True
-    shuffles_single_minibatch = True  # kept so that older runs can be repeated bit for bit
+
+    def standardizes_advantages(self) -> bool:
+        """See `ActorCritic`."""
+        return False
 
     def minibatch_count(self, rows: int) -> int:
         """See `ActorCritic`."""

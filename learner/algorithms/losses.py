@@ -1,71 +1,32 @@
-"""The losses, for autograd, and metrics about them. Pure: tensors [B] in, tensors of no dimension out.
+"""The losses, in plain torch, and metrics about them. Pure: tensors [B] in, tensors of no dimension out.
 
 B is the number of rows of a minibatch. All of them are valid: rows are masked where minibatches are selected.
-`kernels.loss_gradients` has the same losses with gradients derived by hand. It also uses `ratio`, `standardized`,
-`approx_kl` and `clip_fraction`, so these functions take numpy arrays too.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from protocol.arrays import Floats
 
-TensorOrArray = TypeVar("TensorOrArray", Tensor, npt.NDArray[Any])
 
-
-def library(array: object) -> Any:
-    """Numpy for a numpy array, else torch."""
-    return np if isinstance(array, np.ndarray) else torch
-
-
-def mean(array: TensorOrArray) -> Any:
-    """The mean of [B]. numpy's own `mean` is several times slower on short arrays."""
-    return array.sum() / len(array)
-
-
-# -------------------------------------------------------------------- of tensors and numpy arrays
-
-
-def ratio(log_prob_now: TensorOrArray, log_prob: TensorOrArray) -> tuple[TensorOrArray, TensorOrArray]:
-    """Log ρ and ρ = π(a) / π_old(a), [B] each."""
-    log_ratio = log_prob_now - log_prob
-    return log_ratio, library(log_ratio).exp(log_ratio)
-
-
-def standardized(advantage: TensorOrArray) -> TensorOrArray:
+def standardized(advantage: Tensor) -> Tensor:
     """Advantages [B] with mean 0 and standard deviation 1. A single row has no standard deviation and stays as it is."""
     if len(advantage) < 2:
         return advantage
-    centered = advantage - mean(advantage)
-    std = ((centered @ centered) / (len(centered) - 1)) ** 0.5
-    found: TensorOrArray = centered / (std + 1e-8)
-    return found
-
-
-def approx_kl(log_ratio: TensorOrArray, ratio: TensorOrArray) -> TensorOrArray:
-    """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
-    found: TensorOrArray = mean(ratio - 1 - log_ratio)
-    return found
-
-
-def clip_fraction(ratio: TensorOrArray, clip_range: float) -> TensorOrArray:
-    """The fraction of rows whose ratio is outside [1−ε, 1+ε]."""
-    found: TensorOrArray = library(ratio).count_nonzero(abs(ratio - 1) > clip_range) / len(ratio)
-    return found
+    std, mean = torch.std_mean(advantage)
+    return (advantage - mean) / (std + 1e-8)
 
 
 # -------------------------------------------------------------------- losses
 
 
-def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
+def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
     """PPO's policy loss (Schulman et al. 2017, eq. 7): L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)],  ρ = π(a) / π_old(a)."""
+    ratio = log_ratio.exp()
     return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip_range, 1 + clip_range) * advantage).mean()
 
 
@@ -105,7 +66,18 @@ def squared_loss(error: Tensor, weight: Tensor) -> Tensor:
     return (weight * error.square()).mean()
 
 
-# -------------------------------------------------------------------- numpy
+# -------------------------------------------------------------------- metrics
+
+
+def approx_kl(log_ratio: Tensor) -> Tensor:
+    """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
+    log_ratio = log_ratio.detach()
+    return (log_ratio.expm1() - log_ratio).mean()
+
+
+def clip_fraction(log_ratio: Tensor, clip_range: float) -> Tensor:
+    """The fraction of rows whose ratio is outside [1−ε, 1+ε]."""
+    return (log_ratio.detach().expm1().abs() > clip_range).float().mean()
 
 
 def explained_variance(value: Floats, target: Floats) -> float:
@@ -118,5 +90,5 @@ def explained_variance(value: Floats, target: Floats) -> float:
 
 
 def _variance(array: Floats) -> float:
-    centered = array - mean(array)
+    centered = array - array.sum() / len(array)
     return float(centered @ centered) / len(array)

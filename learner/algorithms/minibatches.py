@@ -1,20 +1,27 @@
 """Rows of a batch in the form of the network's input, and the selection of minibatches from them.
 
+Rule: rows that are not valid never enter a minibatch, and in an epoch each of the others enters one.
+
 A batch has T rows for each of ΣN env copies (columns). Row numbers count the rows as one flat sequence of T · ΣN rows in
 time order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from protocol.arrays import Array
+from protocol.arrays import Array, Bools, Floats
 from protocol.policy.networks import RecurrentInput
+from protocol.rollout import Batch
 
 Index = Tensor | slice
+
+CHUNK_ROWS = 1024  # observations that are evaluated together where no gradient is needed: this bounds memory
 
 
 class NetworkInput(NamedTuple):
@@ -40,75 +47,131 @@ class Observations(NamedTuple):
             recurrent = RecurrentInput(recurrent.initial_state[columns], recurrent.keep_state[:steps, columns])
         return NetworkInput(self.features[rows], tuple(image[rows] for image in self.images), recurrent)
 
+    @torch.no_grad()
+    def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
+        """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
+
+        `function` returns one number for each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
+        """
+        found = torch.empty(steps * self.raw_features.shape[1], device=self.features.device)
+        for columns, rows in self._chunks(steps):
+            found[rows] = function(self.network_input(steps, columns, rows), rows)
+            pulse()
+        return np.asarray(found.cpu().numpy()).reshape(steps, -1)
+
+    def _chunks(self, steps: int) -> Iterator[tuple[Index, Index]]:
+        """The columns and rows of each chunk, which has about CHUNK_ROWS rows.
+
+        A chunk holds consecutive rows; with a recurrent core it holds whole columns.
+        """
+        columns = self.raw_features.shape[1]
+        if self.recurrent is None:
+            for at in range(0, steps * columns, CHUNK_ROWS):
+                yield slice(None), slice(at, min(at + CHUNK_ROWS, steps * columns))
+            return
+        for some in torch.split(torch.arange(columns, device=self.features.device), max(1, CHUNK_ROWS // steps)):
+            yield some, rows_of_columns(steps, columns, some)
+
 
 class Minibatch(NamedTuple):
-    """B rows of a batch: tensors, or numpy arrays if the network is evaluated in numpy (`kernels.fused`)."""
+    """B rows of a batch."""
 
-    features: Any  # [B, D] float32, normalized
-    images: tuple[Any, ...]  # [B, *leaf] uint8 each
-    action: Any  # [B, *action] int64, or float32 not clipped
-    log_prob: Any  # [B] float32, of the action under the policy that acted
-    advantage: Any  # [B] float32, not standardized
-    target: Any  # [B] float32, what the value is fitted to
+    features: Tensor  # [B, D] float32, normalized
+    images: tuple[Tensor, ...]  # [B, *leaf] uint8 each
+    action: Tensor  # [B, *action] int64, or float32 not clipped
+    log_prob: Tensor  # [B] float32, of the action under the policy that acted
+    advantage: Tensor  # [B] float32, not standardized
+    target: Tensor  # [B] float32, what the value is fitted to
     recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and it selects B of them
-    mask: Any = None  # [B, choices] bool, which actions are allowed; None unless the run uses action masks
+    mask: Tensor | None = None  # [B, choices] bool, which actions are allowed; None unless the run uses action masks
 
-    def in_numpy(self) -> Minibatch:
-        """The same memory as numpy arrays. Only for policies without images and without a core."""
-        features, _, action, log_prob, advantage, target, _, mask = self
-        arrays = (features.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
-        return Minibatch(*arrays, mask=None if mask is None else mask.numpy())
+    @staticmethod
+    def of(batch: Batch, observations: Observations, advantage: Floats, target: Floats) -> Minibatch:
+        """All T · ΣN rows of a batch, also those that are not valid. `advantage` and `target` are [T, ΣN]."""
+        inputs = observations.network_input(len(batch.valid), slice(None), slice(batch.valid.size))
+        device = inputs.features.device
+        return Minibatch(
+            inputs.features,
+            inputs.images,
+            flat_tensor(batch.action, device),
+            flat_tensor(batch.log_prob, device),
+            flat_tensor(advantage, device),
+            flat_tensor(target, device),
+            inputs.recurrent,
+            None if batch.mask is None else flat_tensor(batch.mask[:-1], device),
+        )
 
-    def select(self, rows: Any, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
+    def select(self, rows: Tensor, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
         """A copy of some rows. `input_rows`: the rows of the network's input, if a core needs more rows than these."""
         input_rows = rows if input_rows is None else input_rows
         return Minibatch(
-            self.features[input_rows],
+            self.features.index_select(0, input_rows),
             tuple(image[input_rows] for image in self.images),
-            self.action[rows],
-            self.log_prob[rows],
-            self.advantage[rows],
-            self.target[rows],
+            self.action.index_select(0, rows),
+            self.log_prob.index_select(0, rows),
+            self.advantage.index_select(0, rows),
+            self.target.index_select(0, rows),
             recurrent,
             None if self.mask is None else self.mask[rows],
         )
 
-    def select_columns(self, columns: Tensor, mask: Tensor) -> Minibatch:
-        """A minibatch of those rows of the given columns where `mask` [T, ΣN] is True, in time order.
+    def select_columns(self, columns: Tensor, used: Tensor) -> Minibatch:
+        """A minibatch of those rows of the given columns where `used` [T, ΣN] is True, in time order.
 
         The recurrent core still runs over all rows of the columns.
         """
         assert self.recurrent is not None
         state, keep_state, _ = self.recurrent
         rows = rows_of_columns(len(keep_state), keep_state.shape[1], columns)
-        selected = mask.flatten()[rows]
+        selected = used.flatten()[rows]
         recurrent = RecurrentInput(state[columns], keep_state[:, columns], torch.nonzero(selected)[:, 0])
         return self.select(rows[selected], rows, recurrent)
+
+    def shuffled(self, used: Bools, count: int, generator: torch.Generator | None) -> Iterator[Minibatch]:
+        """The rows where `used` [T, ΣN] is True, shuffled into `count` minibatches of nearly equal size; each occurs once.
+
+        With a core, whole columns stay together, because the core learns from rows that follow each other. Then there are at
+        most as many minibatches as columns. Without a generator, the rows stay in order.
+        """
+        device = self.features.device
+        # With a core, the columns that have a row: one without would make an empty minibatch.
+        index = torch.from_numpy(np.flatnonzero(used if self.recurrent is None else used.any(0)))
+        if generator is not None:
+            index = index[torch.randperm(len(index), generator=generator)]
+        if not len(index):
+            return
+        of_columns = None if self.recurrent is None else torch.from_numpy(used).to(device)
+        for chosen in index.to(device).tensor_split(min(count, len(index))):
+            yield self.select(chosen) if of_columns is None else self.select_columns(chosen, of_columns)
 
 
 class LossInput(NamedTuple):
     """Input of a loss: B rows of a minibatch, and the network's present outputs for them. Every row is valid.
 
-    Tensors for `ActorCritic.loss`; for `ActorCritic.loss_gradients` tensors or numpy arrays. All are float32, except actions
-    that are choices. Gradients flow through the last three.
+    All are float32, except actions that are choices. Gradients flow through the last three.
     """
 
-    action: Any
+    action: Tensor
     """[B, *action] what was done: int64 counted from 0, or float32 that is not clipped to the action space (Box)"""
-    log_prob: Any
+    log_prob: Tensor
     """[B] log-probability of the action under the policy that acted"""
-    advantage: Any
+    advantage: Tensor
     """[B] how much better the action was than expected; mean 0 and standard deviation 1 if `normalize_advantage` is set"""
-    raw_advantage: Any
+    raw_advantage: Tensor
     """[B] the advantage as it was estimated"""
-    target: Any
+    target: Tensor
     """[B] what the value is fitted to"""
-    log_prob_now: Any
+    log_prob_now: Tensor
     """[B] log-probability of the action under the present policy"""
-    entropy: Any
+    entropy: Tensor
     """[B] entropy of the present policy"""
-    value: Any
+    value: Tensor
     """[B] the critic's present value of the observation"""
+
+
+def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
+    """[T, N, …] as [T · N, …] on a device."""
+    return torch.from_numpy(array.reshape(array.shape[0] * array.shape[1], *array.shape[2:])).to(device)
 
 
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:

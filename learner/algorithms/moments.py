@@ -84,7 +84,7 @@ class Moments:
             self._rewards = gamma, RewardScaler(gamma)
         if gamma != self._rewards[0]:
             raise UsageError(f"moments: gamma: expected {self._rewards[0]} as in the batches before, got {gamma}")
-        return self._rewards[1].scale(batch)
+        return self._rewards[1].count_and_scale(batch)
 
     def _features(self, batch: Batch) -> Array:
         obs: Any = batch.obs

@@ -144,7 +144,7 @@ class RewardScaler:
         self._moments = RunningMoments()
         self._returns: dict[int, Doubles] = {}  # lane -> [copies]
 
-    def scale(self, batch: Batch) -> Floats:
+    def count_and_scale(self, batch: Batch) -> Floats:
         """Count the batch, then return its scaled rewards [T, ΣN], clipped to ±10."""
         self.count(batch)
         return self.scaled(batch.reward)

@@ -1,6 +1,7 @@
 """PPO (Schulman et al. 2017). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock; seeded.
 
 An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows.
+The update is `ActorCritic.update`; here are its loss, its schedules and its early stop.
 """
 
 from __future__ import annotations
@@ -13,11 +14,9 @@ import numpy as np
 from torch import Tensor
 
 from learner.algorithms import losses
-from learner.algorithms.actor_critic import ActorCritic, Estimates, Metrics
-from learner.algorithms.kernels import loss_gradients
-from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
+from learner.algorithms.actor_critic import ActorCritic, Estimates
+from learner.algorithms.gradient_descent import Metrics, scheduled
 from learner.algorithms.minibatches import LossInput, Observations
-from learner.algorithms.updates import scheduled
 from learner.config.hyperparameters import PPOConfig
 from protocol.errors import UsageError
 from protocol.rollout import Batch
@@ -53,10 +52,13 @@ class PPO(ActorCritic):
         return metrics["approx_kl"] > self._kl_limit
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
-        """L = clipped surrogate + vf_coef · value loss, clipped if `clip_range_vf` is set, − ent_coef E[H(π)]."""
+        """L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)] + vf_coef · E[(V − G)²] − ent_coef · E[H(π)],  ρ = π(a) / π_old(a).
+
+        Schulman et al. 2017, equations 7 and 9. The value loss is clipped if `clip_range_vf` is set.
+        """
         config = self.config
-        log_ratio, ratio = losses.ratio(rows.log_prob_now, rows.log_prob)
-        policy_loss = losses.clipped_surrogate(ratio, rows.advantage, self.clip_range)
+        log_ratio = rows.log_prob_now - rows.log_prob
+        policy_loss = losses.clipped_surrogate(log_ratio, rows.advantage, self.clip_range)
         if config.clip_range_vf is None:
             value_loss = losses.value_loss(rows.value, rows.target)
         else:
@@ -67,20 +69,9 @@ class PPO(ActorCritic):
             "policy_gradient_loss": policy_loss,
             "value_loss": value_loss,
             "entropy_loss": entropy_loss,
-            "approx_kl": losses.approx_kl(log_ratio, ratio),
-            "clip_fraction": losses.clip_fraction(ratio, self.clip_range),
+            "approx_kl": losses.approx_kl(log_ratio),
+            "clip_fraction": losses.clip_fraction(log_ratio, self.clip_range),
         }
-
-    def loss_gradients(self, rows: LossInput) -> tuple[Numbers, OutputGradients]:
-        """See `ActorCritic`."""
-        config = self.config
-        return loss_gradients.ppo(
-            rows,
-            clip_range=self.clip_range,
-            clip_range_vf=config.clip_range_vf,
-            ent_coef=config.ent_coef,
-            vf_coef=config.vf_coef,
-        )
 
     def metrics(self, epochs: Sequence[Sequence[Metrics]], estimates: Sequence[Estimates]) -> Metrics:
         """Those of `ActorCritic`, the last loss, the KL divergence of the last epoch, the clip range and the epochs so far.
@@ -88,29 +79,22 @@ class PPO(ActorCritic):
         A subclass with a loss of its own logs what it likes: what it does not log is not among them.
         """
         found = super().metrics(epochs, estimates)
-        found |= {"train/loss": self._total(epochs[-1][-1]), "train/n_updates": float(self.epochs)}
+        found |= {"train/loss": epochs[-1][-1]["loss"], "train/n_updates": float(self.epochs)}
         found |= {"train/clip_range": self.clip_range}
         if divergences := [step["approx_kl"] for step in epochs[-1] if "approx_kl" in step]:
             found["train/approx_kl"] = float(np.mean(divergences))
         return found
-
-    def _total(self, step: Metrics) -> float:
-        """The loss of a gradient step. Autograd measured it; the derivation by hand measured only its parts."""
-        if "loss" in step:
-            return step["loss"]
-        weighted = self.config.ent_coef * step["entropy_loss"] + self.config.vf_coef * step["value_loss"]
-        return step["policy_gradient_loss"] + weighted
 
     def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
         """See `ActorCritic`."""
         super().count_update(batch, observations, epochs)
         self.epochs += epochs
 
-    def state_dict(self) -> dict[str, Any]:
-        """See `ActorCritic`."""
-        return super().state_dict() | {"epochs": self.epochs}
+    def other_state(self) -> dict[str, Any]:
+        """See `GradientDescent`."""
+        return super().other_state() | {"epochs": self.epochs}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `ActorCritic`."""
-        super().load_state_dict(state)
+    def load_other_state(self, state: dict[str, Any]) -> None:
+        """See `GradientDescent`."""
+        super().load_other_state(state)
         self.epochs = state["epochs"]

@@ -25,6 +25,15 @@ class REINFORCE(ActorCritic):
     whole_episodes = True
 
     @property
+    def n_epochs(self) -> int:
+        """See `ActorCritic`."""
+        return 1
+
+    def minibatch_count(self, rows: int) -> int:
+        """See `ActorCritic`."""
+        return 1
+
+    @property
     def vf_coef(self) -> float:
         """The weight of the value loss: 0 without a baseline."""
         return self.config.vf_coef if self.config.baseline else 0.0

@@ -1,41 +1,22 @@
 """SAC (Haarnoja et al. 2018): a squashed Gaussian, two critics, automatic temperature. `Continuous` has what TD3 shares.
 
-target         y = Σ γⁱ r + γᵏ (min Q′(s′, a′) − α log π(a′|s′)),  a′ ~ π(s′);  γᵏ is 0 if the task has terminated
-critics        ½ Σ mean (Q(s, a) − y)²
-actor          mean (α log π(ã|s) − min Q(s, ã)),  ã ~ π(s)
-temperature    −log α · mean (log π(ã|s) + target entropy)
+A gradient step is one of the critics, then one of the actor, then one of the temperature; then the target critics move. The
+update is `OffPolicy.update`, which calls `step` for each gradient step that is due.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
-from learner.algorithms.continuous import Continuous, Transitions
-from learner.algorithms.kernels.bounded_actions import SquashedSample, smaller, which_is_smaller
-from learner.algorithms.kernels.optimizer_step import take_step
-from learner.algorithms.replay.replay_buffer import Sample
-from learner.algorithms.updates import check_finite
+from learner.algorithms.gradient_descent import Metrics
+from learner.algorithms.kernels.networks import leaf_of
+from learner.algorithms.replay.continuous import Continuous
+from learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from learner.config.hyperparameters import SACConfig
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-ADVICE = "a lower learning_rate, or normalize_observations"
-
-
-class StepMetrics(NamedTuple):
-    """The metrics of one gradient step, measured before it changed the weights."""
-
-    critic_loss: float
-    actor_loss: float
-    ent_coef: float
-    ent_coef_loss: float
-    q_mean: float  # mean of both critics over the actions that were taken
-    entropy: float
 
 
 class SAC(Continuous):
@@ -49,6 +30,7 @@ class SAC(Continuous):
         return SAC.bounded_policy_spec(config, observation, action, head="squashed")
 
     def __init__(self, config: SACConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
+        # Before the optimizers are made, which take it from `parts`.
         self.log_temperature = torch.full((1,), math.log(1.0 if config.ent_coef is None else config.ent_coef), device=device)
         self.log_temperature.grad = torch.zeros_like(self.log_temperature)
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
@@ -58,52 +40,54 @@ class SAC(Continuous):
 
     def parts(self) -> dict[str, Tensor]:
         """See `Continuous.parts`; a fixed temperature needs no optimizer."""
-        temperature = {"temperature_optimizer": self.log_temperature} if self.config.ent_coef is None else {}
+        temperature = {"ent_coef_optimizer": self.log_temperature} if self.config.ent_coef is None else {}
         return super().parts() | temperature
 
-    @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
-    def step(self, sample: Sample) -> StepMetrics:
+    @property
+    def temperature(self) -> float:
+        """α: `ent_coef` in the settings and the metrics, as in Stable-Baselines3."""
+        return math.exp(self.log_temperature.item())
+
+    def sample(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions ã ~ π(s) [B, D′] for features [B, D], and log π(ã|s) [B]."""
+        return self.net.sample(x, self.noise(len(x)))
+
+    @torch.no_grad()
+    def targets(self, rows: Transitions) -> Tensor:
+        """The targets [B] of both critics: y = Σ γⁱ r + γᵏ (min Q′(s′, a′) − α log π(a′|s′)),  a′ ~ π(s′)."""
+        action, log_prob = self.sample(rows.next_x)
+        value = self.target.values(rows.next_x, action).amin(0)
+        return rows.reward + rows.discount * (value - self.temperature * log_prob)
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """½ Σ E[w (Q(s, a) − y)²] over both critics."""
+        values = self.net.values(rows.x, rows.action)  # [2, B]
+        error = values - self.targets(rows)
+        loss = 0.5 * (rows.weight * error.square()).mean(1).sum()
+        return CriticLoss(loss, error.detach().abs().mean(0), {"q_mean": values.mean()})
+
+    def actor_loss(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """E[α log π(ã|s) − min Q(s, ã)],  ã ~ π(s), for features [B, D]. Also returns log π(ã|s) [B]."""
+        action, log_prob = self.sample(x)
+        value = self.net.values(x, action, constant=True).amin(0)  # a gradient for the actor alone
+        return (self.temperature * log_prob - value).mean(), log_prob.detach()
+
+    def temperature_loss(self, log_temperature: Tensor, log_prob: Tensor) -> Tensor:
+        """−E[log α (log π(ã|s) + target entropy)]."""
+        return -(log_temperature * (log_prob + self.target_entropy)).mean()
+
+    def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
         """One gradient step of the critics, the actor and the temperature; then the target critics move."""
-        rows, count = Transitions(self, sample), len(sample.slots)
-        alpha = math.exp(self.log_temperature.item())
-        next_noise, noise = self.noise(2, *rows.action.shape)
+        critic = self.critic_loss(rows)
+        measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)
 
-        values = self.passes.values(rows.x, rows.action)
-        error = values - self.targets(rows, next_noise, alpha)
-        weighted = rows.weight * error
-        self.passes.critics_backward(weighted / count)
-        critic_loss, q_mean = 0.5 * float((weighted * error).sum()) / count, float(values.sum()) / (2 * count)
-        found = {"critic_loss": critic_loss, "critic_grad_norm": vector_norm(self.net.critics.grad).item()}
-        check_finite(found, self.version, ADVICE)
-        take_step(self.optimizers["critic_optimizer"])
+        loss, log_prob = self.actor_loss(rows.x)
+        measured |= self.descend("actor", loss, {"entropy": -log_prob.mean()})
 
-        sampled = SquashedSample(self.passes.params(rows.x), noise)
-        values = self.passes.values_by_action(rows.x, sampled.action, 2)
-        by_action = self.passes.action_gradient(which_is_smaller(values) / -count)
-        self.passes.actor_backward(sampled.backward(by_action, alpha / count))
-        log_prob = float(sampled.log_prob.sum()) / count
-        actor_loss = alpha * log_prob - float(smaller(values).sum()) / count
-        found = {"actor_loss": actor_loss, "actor_grad_norm": vector_norm(self.net.actor.grad).item()}
-        check_finite(found, self.version, ADVICE)
-        take_step(self.optimizers["actor_optimizer"])
-
-        by_log_temperature = -(log_prob + self.target_entropy)
-        ent_coef_loss = self.log_temperature.item() * by_log_temperature
         if self.config.ent_coef is None:
-            self.log_temperature.grad.fill_(by_log_temperature)  # type: ignore[union-attr]
-            take_step(self.optimizers["temperature_optimizer"])
-        else:
-            ent_coef_loss = np.nan
+            loss = self.temperature_loss(leaf_of(self.log_temperature), log_prob)
+            measured |= self.descend("ent_coef", loss, {})
 
         self.target.critics.lerp_(self.net.critics, self.config.tau)
         self.gradient_steps += 1
-        if self.replay.prioritized:
-            self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
-        return StepMetrics(critic_loss, actor_loss, alpha, ent_coef_loss, q_mean, -log_prob)
-
-    def targets(self, rows: Transitions, noise: Any, alpha: float) -> Any:
-        """The targets [B] of both critics; `noise` [B, D′] samples the next action."""
-        with torch.no_grad():
-            sampled = SquashedSample(self.passes.params(rows.next_x), noise)
-            value = smaller(self.target_passes.values(rows.next_x, sampled.action))
-            return rows.reward + rows.discount * (value - alpha * sampled.log_prob)
+        return measured, critic.error

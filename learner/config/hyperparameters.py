@@ -54,6 +54,8 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Learning rate of the optimizer."""
     learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
+    optimizer: Fixed[Optimizer] = "adam"
+    """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
     ent_coef: Free[NotNegative] = 0.0
     """Weight of the entropy bonus in the loss."""
     vf_coef: Free[NotNegative] = 0.5
@@ -162,8 +164,6 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10. Otherwise the loss of
     the baseline dominates the gradient.
     """
-    optimizer: Fixed[Optimizer] = "adam"
-    """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
     baseline: Free[bool] = True
     """Subtract the value that the critic predicts from the return."""
     normalize_returns: Free[bool] = True

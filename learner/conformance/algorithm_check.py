@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.updates import wrong_weights
+from learner.algorithms.algorithm import wrong_weights
 from learner.config.algorithm_names import name_of, settings_record
 from learner.config.hyperparameters import AlgorithmConfig
 from learner.conformance.same_bits import first_difference
@@ -174,6 +174,11 @@ def weights_are_copies(subject: Subject) -> Iterator[str]:
         algorithm.update(batch, _no_pulse)
     if first_difference(given, kept) is not None:
         yield "weights: expected a copy, got an array that the next update changes"
+    kept = _weights(algorithm)
+    for array in algorithm.weights():
+        array.fill(7)
+    if first_difference(algorithm.weights(), kept) is not None:
+        yield "weights: expected a copy, got an array of the algorithm's own"
 
 
 def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:

@@ -71,17 +71,27 @@ def identity_batch(acting: Acting, steps: int, generator: np.random.Generator) -
 
 
 def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Batch:
-    """The same batch with other finite values on rows that are not valid. Observations stay: the row before uses them."""
+    """The same batch with other finite values on rows that are not valid. An observation is that of the row before, too.
+
+    So it stays, except after a termination, from which nothing bootstraps.
+    """
     other = generator.permutation(batch.action.reshape(-1, *batch.action.shape[2:])).reshape(batch.action.shape)
     if batch.action.dtype == np.int64:
         other = (batch.action + 1) % CHOICES
-    at = batch.valid.reshape(*batch.valid.shape, *[1] * (batch.action.ndim - 2))
+    after_termination = np.zeros((len(batch.valid) + 1, batch.valid.shape[1]), bool)
+    after_termination[1:-1] = ~batch.valid[1:] & batch.terminated[:-1]
     return msgspec.structs.replace(
         batch,
-        action=np.where(at, batch.action, other),
+        obs=tuple(np.where(_for_each(after_termination, leaf), leaf.dtype.type(100), leaf) for leaf in batch.obs),
+        action=np.where(_for_each(batch.valid, batch.action), batch.action, other),
         log_prob=np.where(batch.valid, batch.log_prob, np.float32(-7)),
         reward=np.where(batch.valid, batch.reward, np.float32(-1000)),
     )
+
+
+def _for_each(rows: Bools, array: Array) -> Bools:
+    """What is said of rows [T, N], as it is broadcast to an array [T, N, …]."""
+    return rows.reshape(*rows.shape, *[1] * (array.ndim - 2))
 
 
 def with_rewards(batch: Batch, reward: float) -> Batch:

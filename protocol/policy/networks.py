@@ -8,7 +8,8 @@ copies the first part of one tensor. Features come from `protocol.policy.feature
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +27,8 @@ from protocol.policy.layout import (
     total_size,
 )
 from protocol.policy.malloc import keep_freed_memory
+from protocol.policy.masks import FORBIDDEN
+from protocol.policy.torch_distributions import log_prob_and_entropy, squashed_sample
 from protocol.random_streams import Purpose, torch_seed
 from protocol.specs import PolicySpec
 
@@ -36,6 +39,12 @@ class RecurrentInput(NamedTuple):
     initial_state: Tensor  # [C, S] float32, before the first step
     keep_state: Tensor  # [T, C] float32: 0 where an episode begins and the state is reset, else 1
     output_rows: Tensor | None = None  # [B] int64, the rows of T · C to return; None: all
+
+
+def refuse_second_derivatives() -> None:
+    """Raise `RuntimeError` in a backward pass with `create_graph`, whose result would lack what depends on hidden layers."""
+    if torch.is_grad_enabled():
+        raise RuntimeError("millrace's networks have no second derivatives; call backward without create_graph")
 
 
 class MLP(torch.autograd.Function):
@@ -60,6 +69,7 @@ class MLP(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of x (if wanted) and of each layer's weight and bias."""
+        refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
         inputs, weights = ctx.saved_tensors[:half], ctx.saved_tensors[half:]
@@ -79,35 +89,39 @@ class StackedMLP(torch.autograd.Function):
     """K networks of one form on the same input, as one node: `MLP` with batched matrix products, [B, D] -> [K, B, O]."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, relu: bool, *layers: Tensor) -> Tensor:
-        """`layers` alternates weight [K, out, in] and bias [K, out]; the last pair is the head."""
-        x = x.expand(len(layers[0]), *x.shape)
+    def forward(ctx: Any, x: Tensor, relu: bool, flat: Tensor, layers_of: Callable[[Tensor], list[Tensor]]) -> Tensor:
+        """`layers_of`: the layers as views of a tensor like `flat`, weight [K, out, in] and bias [K, out] in turns."""
+        *hidden, weight, bias = layers = layers_of(flat)
+        x = x.expand(len(weight), *x.shape)
         inputs = [x]
-        *hidden, weight, bias = layers
         for w, b in zip(hidden[::2], hidden[1::2], strict=True):
             x = torch.baddbmm(b.unsqueeze(1), x, w.mT)
             inputs.append(x.relu_() if relu else x.tanh_())
-        ctx.relu, ctx.trains = relu, weight.requires_grad
+        ctx.relu, ctx.layers_of, ctx.size = relu, layers_of, len(flat)
         ctx.save_for_backward(*inputs, *layers[::2])
         return torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of x (if wanted), and of each layer's weight and bias unless they are constants."""
+        """Gradients of x and of `flat`, of those that are wanted."""
+        refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
         inputs, weights = ctx.saved_tensors[:half], ctx.saved_tensors[half:]
-        found: list[Tensor | None] = []
+        _, _, trains, _ = ctx.needs_input_grad
+        by_flat = g.new_zeros(ctx.size) if trains else None
+        by_layers = [] if by_flat is None else ctx.layers_of(by_flat)
         for i in range(half - 1, -1, -1):
-            found += [g.sum(1), g.mT @ inputs[i]] if ctx.trains else [None, None]
+            if trains:
+                by_layers[2 * i].copy_(g.mT @ inputs[i])
+                by_layers[2 * i + 1].copy_(g.sum(1))
             if i:
                 g = g @ weights[i]
                 if ctx.relu:
                     g = torch.ops.aten.threshold_backward(g, inputs[i], 0)
                 else:
                     g = torch.ops.aten.tanh_backward(g, inputs[i])
-        found += [None, (g @ weights[0]).sum(0) if ctx.needs_input_grad[0] else None]
-        return tuple(reversed(found))
+        return (g @ weights[0]).sum(0) if ctx.needs_input_grad[0] else None, None, by_flat, None
 
 
 class Convolutions(NamedTuple):
@@ -148,7 +162,7 @@ class FlatNetwork:
         acting, critic = parameter_layout(spec)
         self.spec = spec
         self.fields = (*acting, *critic)
-        self.acting_size = total_size(acting)
+        self.acting_size, self.acting_fields = total_size(acting), len(acting)
         self.flat = _initial(self.fields, seed).to(device)  # [P] float32: give this to the optimizer
         self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
         self.flat.grad = self.flat_grad
@@ -277,6 +291,24 @@ class ActorCriticNetwork(FlatNetwork):
         """Value [B] alone."""
         return self.mlp(self._common(x, images, recurrent), self._critic)[:, 0]
 
+    def evaluate(
+        self,
+        x: Tensor,
+        images: Sequence[Tensor],
+        recurrent: RecurrentInput | None,
+        action: Tensor,
+        mask: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Log π(action), the entropy of π, and V, [B] each. `mask` [B, choices]: which actions are allowed.
+
+        The probability and the gradient of an action that is not allowed are exactly 0. For the other arguments, see
+        `forward`.
+        """
+        params, value = self.forward(x, images, recurrent)
+        if mask is not None:
+            params = params.masked_fill(~mask, FORBIDDEN)
+        return *log_prob_and_entropy(self.spec.action, params, action), value
+
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
         """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
         h = self.inputs(x, images)
@@ -299,8 +331,12 @@ class QNetwork(FlatNetwork):
         if not self.spec.dueling:
             return self.mlp(h, self._without_dueling)
         h = self.hidden(h, self._hidden)
-        advantage, value = self.mlp(h, self.layers(["q.out"])), self.mlp(h, self.layers(["q.value"]))
-        return value + advantage - advantage.mean(-1, keepdim=True)
+        return self.action_values(self.mlp(h, self.layers(["q.out"])), self.mlp(h, self.layers(["q.value"])))
+
+    @staticmethod
+    def action_values(advantage: Tensor, value: Tensor | None = None) -> Tensor:
+        """The action values [B, n] of the network's outputs; with the dueling architecture Q = V + A − mean A."""
+        return advantage if value is None else value + advantage - advantage.mean(-1, keepdim=True)
 
 
 class ActorAndCritics(FlatNetwork):
@@ -316,31 +352,19 @@ class ActorAndCritics(FlatNetwork):
         """[A] and [C] float32, which share memory with `flat`"""
         self.actor.grad, self.critics.grad = (self.flat_grad[end] for end in ends)
         self._actor = self.layers([*hidden_names(spec), "actor.out"])
-        self._critics = [layer.detach().requires_grad_() for layer in self._stacked_views(self.flat)]
-        self._constant_critics = [layer.detach() for layer in self._critics]
-        self._critic_gradients = self._stacked_views(self.flat_grad)
+        self._critics = self.critics.detach().requires_grad_()
+        self._critics.grad = self.critics.grad
 
-    def _stacked_views(self, flat: Tensor) -> list[Tensor]:
-        """Weight [2, out, in] and bias [2, out] of each layer of both critics, as views of a tensor like `flat`."""
-        both = flat[self.acting_size :].view(len(CRITICS), -1)
+    def _stacked(self, critics: int, flat: Tensor) -> list[Tensor]:
+        """Weight [critics, out, in] and bias [critics, out] of each layer of the critics, as views of `flat` [C]."""
+        each = flat.view(len(CRITICS), -1)[:critics]
         views, at = [], 0
         for field in self.fields:
             if field.name.startswith(f"{CRITICS[0]}."):
                 end = at + math.prod(field.shape)
-                views.append(both[:, at:end].view(len(both), *field.shape))
+                views.append(each[:, at:end].view(critics, *field.shape))
                 at = end
         return views
-
-    def differentiate_critics(self, output: Tensor, by_output: Tensor | None = None) -> None:
-        """Write the gradient of a loss into `critics.grad`, in place of what it held.
-
-        `output` is the loss, or what the loss depends on; then `by_output` is the loss's gradient by it.
-        """
-        _write_gradient(output, by_output, self._critics, self._critic_gradients)
-
-    def differentiate_actor(self, output: Tensor, by_output: Tensor | None = None) -> None:
-        """Write the gradient of a loss into `actor.grad`; see `differentiate_critics`."""
-        _write_gradient(output, by_output, self._actor, [layer.grad for layer in self._actor])
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """The actor's output for features [B, D] float32, before the tangent: [B, D′] (deterministic) or [B, 2 D′].
@@ -353,22 +377,18 @@ class ActorAndCritics(FlatNetwork):
         mean, log_std = out.chunk(2, -1)
         return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
 
+    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, D′] of a squashed Gaussian and their log-densities [B], for features [B, D] and noise [B, D′]."""
+        return squashed_sample(self.params(x), noise)
+
     def values(self, x: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
         """The values [critics, B] of both critics, or of the first, for features [B, D] and actions [B, D′] in [-1, 1].
 
         `constant`: the critics get no gradient; the actions do. Use it for the loss of the actor.
         """
-        layers = [layer[:critics] for layer in self._constant_critics] if constant else self._critics
-        out: Tensor = StackedMLP.apply(torch.cat((x, action), -1), self._relu, *layers)  # type: ignore[no-untyped-call]
+        flat, layers = self.critics if constant else self._critics, partial(self._stacked, critics)
+        out: Tensor = StackedMLP.apply(torch.cat((x, action), -1), self._relu, flat, layers)  # type: ignore[no-untyped-call]
         return out[..., 0]
-
-
-def _write_gradient(
-    output: Tensor, by_output: Tensor | None, layers: Sequence[Tensor], gradients: Sequence[Tensor | None]
-) -> None:
-    for found, gradient in zip(torch.autograd.grad(output, layers, by_output), gradients, strict=True):
-        assert gradient is not None
-        gradient.copy_(found)
 
 
 def network_of(

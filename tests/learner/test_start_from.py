@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.continuous import Continuous
+from learner.algorithms.replay.continuous import Continuous
 from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.resumption import unless_finished

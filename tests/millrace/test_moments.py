@@ -49,7 +49,7 @@ def test_they_are_the_trainers_own() -> None:
             service.moments.update(batch)
             normalizer.update(batch.obs[:-1], batch.valid)
             assert np.array_equal(service.moments.buffers(), normalizer.buffers())
-            assert np.array_equal(service.moments.scaled_rewards(batch, 0.9), scaler.scale(batch))
+            assert np.array_equal(service.moments.scaled_rewards(batch, 0.9), scaler.count_and_scale(batch))
             service.publish(service.policy.initial())
         with pytest.raises(millrace.UsageError, match=r"gamma: expected 0\.9 as in the batches before, got 0\.8"):
             service.moments.scaled_rewards(batch, 0.8)

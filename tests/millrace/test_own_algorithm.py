@@ -15,7 +15,7 @@ import torch
 from safetensors.numpy import load_file
 
 import millrace
-from examples.own_loss import ClippedPlus
+from examples.own_loss import ClippedPlus, Conservative
 from learner.algorithms import algorithm_class
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import RunFolder
@@ -49,9 +49,10 @@ def env_steps(run: Path) -> int:
     return summary.env_steps
 
 
-def test_the_example_is_short_and_right() -> None:
-    assert len(Path(sys.modules["examples.own_loss"].__file__ or "").read_text().splitlines()) <= 40
+def test_the_examples_are_short_and_right() -> None:
+    assert len(Path(sys.modules["examples.own_loss"].__file__ or "").read_text().splitlines()) <= 55
     check_algorithm(ClippedPlus, net=(16,), learning_rate=3e-3, n_epochs=2)
+    check_algorithm(Conservative, net=(16,), rollout_steps=8, learning_rate=3e-3, updates_per_step=0.1)
 
 
 def test_a_run_by_class_is_the_run_by_name_and_can_be_resumed(tmp_path: Path) -> None:

@@ -67,17 +67,18 @@ def batch(algorithm: Acting, seed: int, fresh: bool = False, steps: int = T) -> 
         valid[t] = ~ends[t - 1]
         ends[t] &= valid[t]
     state = generator.uniform(-0.5, 0.5, (N, spec.state_size)).astype(np.float32)
+    over = distribution(spec)
     if spec.needs_torch:
         obs.append(generator.integers(0, 256, (steps + 1, N, 8, 8, 1), dtype=np.uint8))
-        params = np.zeros((steps, N, 4), np.float32)
+        params = np.zeros((steps, N, over.params_size), np.float32)
     else:
         params = remembering(algorithm, obs[0][:-1], valid, state)
-    over = distribution(spec)
-    action = over.sample(params, over.noise(generator, (steps, N)))
+    noise = over.noise(generator, (steps, N))
+    action = over.sample(params, noise)
     return Batch(
         obs=tuple(obs),
         action=action,
-        log_prob=over.log_prob(params, action),
+        log_prob=over.log_prob(params, action, noise),
         reward=generator.normal(1, 2, (steps, N)).astype(np.float32),
         terminated=ends & kind,
         truncated=ends & ~kind,

@@ -76,14 +76,17 @@ def gradient_tolerance(algorithm: ActorCritic, minibatch: Minibatch, errors: Err
     most as large as the largest advantage. The errors of advantages and targets may be alike in all rows, for instance
     those of a rounded discount: then the square of their sum is up to B times the sum of their squares.
     """
-    minibatch = minibatch if isinstance(minibatch.features, np.ndarray) else minibatch.in_numpy()
     rows = algorithm.evaluate(minibatch)
-    count, largest = len(rows.value), float(np.abs(rows.advantage).max())
-    by_log_prob, _, by_value = by_outputs = algorithm.loss_gradients(rows)[1]
+    count, largest = len(rows.value), float(rows.advantage.abs().max())
+    leaves = [output.detach().requires_grad_() for output in (rows.log_prob_now, rows.entropy, rows.value)]
+    loss, _ = algorithm.loss(LossInput(*rows[:5], *leaves))
+    by_outputs = [each.numpy() for each in torch.autograd.grad(loss, leaves, materialize_grads=True)]
+    by_log_prob, _, by_value = by_outputs
     of_advantage = errors.advantage
     if algorithm.standardizes_advantages():
         of_advantage *= (2 + largest) / float(rows.raw_advantage.std())
-    arrays = algorithm.net.flat.numpy(), minibatch.features, minibatch.action
+    x, action = minibatch.features.numpy(), minibatch.action.numpy()
+    arrays = algorithm.net.flat.numpy(), x, action
     rounded = log_prob_variance(algorithm.policy, *arrays) + 2 * (count + ELEMENTWISE) * UNIT**2 * largest**2
     slope = 2 * algorithm.vf_coef / count
     return actor_critic_tolerance(
@@ -91,7 +94,7 @@ def gradient_tolerance(algorithm: ActorCritic, minibatch: Minibatch, errors: Err
         *arrays,
         by_outputs,
         (np.abs(by_log_prob) + (by_log_prob != 0) / count) ** 2 * rounded + of_advantage**2 / count,
-        by_value_variance(algorithm.net, minibatch.features, by_value, slope) + slope**2 * count * errors.target**2,
+        by_value_variance(algorithm.net, x, by_value, slope) + slope**2 * count * errors.target**2,
     ).gradient
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 
+from learner.algorithms.minibatches import LossInput
 from learner.algorithms.ppo import PPO
 from learner.callbacks.callbacks import Callbacks
 from learner.config.layers import resolve
@@ -103,19 +104,20 @@ def test_a_watch_that_raises_at_the_very_end(tmp_path: Path) -> None:
     assert summary(folder_of(tmp_path / "runs"))["stop_reason"] == "all steps done"
 
 
-def breaks(monkeypatch: pytest.MonkeyPatch, update: int, minibatch: int, how: Callable[[dict[str, float]], None]) -> None:
-    """Have `how` act on the metrics of this minibatch of this update, before its step."""
-    gradient, done = PPO._gradient, [0]
+def breaks(monkeypatch: pytest.MonkeyPatch, update: int, minibatch: int, how: Callable[[dict[str, Any]], None]) -> None:
+    """Have `how` act on the numbers that the loss of this minibatch of this update logs."""
+    loss, done = PPO.loss, [0]
 
-    def broken(self: PPO, rows: Any) -> dict[str, float]:
-        metrics = gradient(self, rows)
+    def broken(self: PPO, rows: LossInput) -> Any:
+        found, numbers = loss(self, rows)
+        logged = dict(numbers)
         if self.version == update:
             done[0] += 1
             if done[0] == minibatch:
-                how(metrics)
-        return metrics
+                how(logged)
+        return found, logged
 
-    monkeypatch.setattr(PPO, "_gradient", broken)
+    monkeypatch.setattr(PPO, "loss", broken)
 
 
 @pytest.mark.parametrize("how", ["loss", "user code", "Ctrl-C"])
@@ -123,7 +125,7 @@ def test_an_update_that_fails_in_the_middle_is_taken_back(tmp_path: Path, monkey
     with pytest.raises(UsersError):
         run(tmp_path / "whole", raises_at(3, UsersError()), seed=4)
 
-    def act(metrics: dict[str, float]) -> None:
+    def act(metrics: dict[str, Any]) -> None:
         match how:
             case "loss":
                 metrics["value_loss"] = float("nan")

@@ -184,19 +184,19 @@ def interrupted_in_an_update(
 
     Returns its folder, and the seconds from the signal to the end, by the same clock.
     """
-    gradient, clock = PPO._gradient, [1000.0]
+    differentiate, clock = PPO.differentiate, [1000.0]
     monkeypatch.setattr(learner.interrupts, "monotonic", lambda: clock[0])
     began: list[float] = []
 
-    def slow(self: PPO, rows: Any) -> dict[str, float]:
+    def slow(self: PPO, *given: Any) -> dict[str, float]:
         if self.version == 3:
             if not began:
                 began.append(clock[0])
                 signal.raise_signal(signal.SIGTERM)
             clock[0] += minibatch_s
-        return gradient(self, rows)
+        return differentiate(self, *given)
 
-    monkeypatch.setattr(PPO, "_gradient", slow)
+    monkeypatch.setattr(PPO, "differentiate", slow)
     with pytest.raises(Interrupted):
         run(tmp_path / "runs", **VARIANTS["ppo"], **settings)
     monkeypatch.undo()

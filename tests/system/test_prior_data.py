@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.dqn import DQN
 from learner.algorithms.ppo import PPO
-from learner.algorithms.replay.replay_buffer import Sample
+from learner.algorithms.replay.off_policy import Transitions
 from learner.config.layers import resolve
 from learner.recording.prior_dataset import PriorDataset
 from learner.run_folder.metrics_log import read_rows
@@ -138,10 +138,10 @@ def test_gradient_steps_before_the_first_rollouts_can_be_interrupted_and_go_on(
     whole = run(tmp_path, "whole", **settings)
     step = DQN.step
 
-    def interrupted_step(self: DQN, sample: Sample) -> Sequence[float]:
+    def interrupted_step(self: DQN, rows: Transitions) -> tuple[dict[str, float], Tensor]:
         if self.gradient_steps == 20:
             signal.raise_signal(signal.SIGTERM)
-        return step(self, sample)
+        return step(self, rows)
 
     with monkeypatch.context() as patched, pytest.raises(Interrupted) as stopped:
         patched.setattr(DQN, "step", interrupted_step)

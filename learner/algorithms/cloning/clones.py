@@ -12,36 +12,29 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.optim import Optimizer
 
-from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.cloning.demonstrations import Demonstrations
+from learner.algorithms.gradient_descent import GradientDescent
 from learner.algorithms.kernels.optimizer_step import take_step
-from learner.algorithms.updates import check_finite
-from protocol.arrays import Floats
 from protocol.policy.distributions import distribution
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Batch
-from protocol.specs import PolicySpec
 
 BATCH_SIZE = 64  # rows of a minibatch, if the settings have no batch_size
 LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; here it would take more epochs
 
 
-class Clones(Algorithm):
+class Clones(GradientDescent):
     """An algorithm with a policy that can be cloned."""
 
-    config: Any
-    policy: PolicySpec
-    optimizer: Optimizer
-    """That of the flat tensor of parameters to which `cloning_loss` gives a gradient."""
-    version: int
     seed: int
+    cloned_by: ClassVar[str] = "optimizer"
+    """The optimizer of the flat tensor of parameters to which `cloning_loss` gives a gradient."""
     clone_steps = 0
     """Gradient steps of cloning so far."""
 
@@ -49,25 +42,20 @@ class Clones(Algorithm):
     def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
         """The loss, a tensor of no dimension, and the params [B, P] of the action distribution."""
 
-    def scaled(self, reward: Floats) -> Floats:
-        """Rewards as the critic learns them."""
-        return reward
-
     def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
         """See `Algorithm`: the loss over all steps, and how near the most probable actions are."""
         rows = Demonstrations.of(episodes, self.scaled, self.config.gamma)
         size = len(rows.at)
         count = math.ceil(size / getattr(self.config, "batch_size", BATCH_SIZE))
-        (flat,) = self.optimizer.param_groups[0]["params"]
+        optimizer = self.optimizers[self.cloned_by]
+        (flat,) = optimizer.param_groups[0]["params"]
         for epoch in range(self.clone_steps // count, self.config.clone_epochs):
             order = generator(self.seed, Purpose.CLONING, epoch).permutation(size)
             for some in np.array_split(order, count)[self.clone_steps % count :]:
                 loss, _ = self.cloning_loss(rows.select(some))
-                flat.grad.zero_()
-                loss.backward()  # type: ignore[no-untyped-call]
-                check_finite({"clone/loss": loss.item(), "grad_norm": flat.grad.norm().item()}, self.version, "other data")
-                self.optimizer.param_groups[0]["lr"] = LEARNING_RATE
-                take_step(self.optimizer)
+                self.differentiate(loss, flat, {"clone/loss": loss})
+                optimizer.param_groups[0]["lr"] = LEARNING_RATE
+                take_step(optimizer)
                 self.clone_steps += 1
                 pulse()
         with torch.no_grad():
@@ -82,3 +70,12 @@ class Clones(Algorithm):
         error = abs(distribution(self.policy).mode(params.cpu().numpy()) - rows.action).reshape(len(rows.at), -1)
         wrong = error.mean(1) if self.policy.action.kind == "box" else error.any(1)
         return loss.item() * len(rows.at), float(wrong.sum())
+
+    def other_state(self) -> dict[str, Any]:
+        """See `GradientDescent`."""
+        return super().other_state() | {"clone_steps": self.clone_steps}
+
+    def load_other_state(self, state: dict[str, Any]) -> None:
+        """See `GradientDescent`."""
+        super().load_other_state(state)
+        self.clone_steps = state["clone_steps"]

@@ -1,1 +1,1 @@
-"""Gradients derived by hand and steps of the optimizer, for small networks: fast, and without an autograd graph."""
+"""What makes updates of small networks fast: a pass or a term of a loss is one node, a step of the optimizer one call."""

@@ -1,7 +1,11 @@
-"""MLPs without autograd: forward and backward pass of several networks at once, in arrays that all minibatches reuse.
+"""MLPs as one node of autograd's graph, with the forward and the backward pass in numpy.
 
 Rule: outputs and gradients are those of the formulas below, except for rounding. How rows are divided into chunks depends
 only on their number, so the same minibatch gives the same bits.
+
+With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator, not on
+arithmetic. Here a pass is a few dozen calls on arrays that are used again. A call owns its arrays until its backward pass,
+so one loss may contain several calls. There is no second backward pass, and no derivative of the gradient.
 
 Arrays are [S, n, B]: S networks, and one column for each of B rows, so that inner loops are long. Each chunk of rows passes
 through all layers forward, or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ, ∂L/∂b = Σ g,
@@ -13,13 +17,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.lib.stride_tricks import as_strided
+from torch import Tensor
 
 from protocol.arrays import Array
+from protocol.policy.layout import Field, named_views
 
 Call = Callable[[], object]
 
@@ -46,86 +52,218 @@ class Linear(NamedTuple):
 
 
 class Head(NamedTuple):
-    """A linear output layer on one of the networks."""
+    """A linear output layer, and the number of the network that it is on."""
 
     layer: Linear
     network: int
 
 
-class FusedMLP:
-    """MLPs of the same shape that take the same features, with linear heads."""
+class Trunks(NamedTuple):
+    """Networks of the same shape on the same input, and their outputs, by the names of their layers."""
 
-    def __init__(self, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool) -> None:
-        self._hidden, self._heads, self._relu = hidden, heads, relu
-        self._workspace = _Workspace(heads[0].layer.weight)
+    hidden: Sequence[Sequence[str]]
+    """the hidden layers of each network"""
+    outputs: Sequence[tuple[str, int]]
+    """each linear output layer, and the number of the network that it is on"""
+
+
+class Top(Protocol):
+    """What a call makes of the outputs of the networks, and its derivative."""
+
+    def forward(self, outputs: Sequence[Array], *given: Any) -> tuple[Array, ...]:
+        """The outputs [out, B] and what the call was given -> its results. The next call overwrites the outputs."""
+        ...
+
+    def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
+        """The gradient [out, B] by each output of the last call, from that by its results."""
+        ...
+
+
+class Outputs:
+    """The outputs themselves, [B, out] each."""
+
+    def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
+        """See `Top`."""
+        return tuple(output.copy().T for output in outputs)
+
+    def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
+        """See `Top`."""
+        return [by_result.T for by_result in by_results]
+
+
+class Values:
+    """The outputs of networks with one output each, [networks, B]."""
+
+    def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
+        """See `Top`."""
+        return (np.concatenate(outputs),)
+
+    def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
+        """See `Top`."""
+        (by_values,) = by_results
+        return [by_values[i : i + 1] for i in range(len(by_values))]
+
+
+MakeTop = Callable[[Mapping[str, Array], Mapping[str, Array]], Top]
+"""From the parameters and their gradients, by name; the top writes the gradients of those that it uses itself."""
+
+
+class SmallMLP:
+    """MLPs of the same shape that take the same features, with linear output layers and a top."""
+
+    def __init__(
+        self,
+        parameters: Tensor,
+        fields: Sequence[Field],
+        trunks: Trunks,
+        relu: bool,
+        top: MakeTop = lambda values, gradients: Outputs(),
+    ) -> None:
+        """`parameters`: a leaf [P], with these fields."""
+        self._parameters, self._constants = parameters, parameters.detach()
+        self._fields, self._trunks, self._relu, self._top = fields, trunks, relu, top
+        self._free: list[_Workspace] = []
+
+    def __call__(self, x: Tensor, *given: Tensor | None, constant: bool = False) -> tuple[Tensor, ...]:
+        """Features [B, D], and what the top is given -> the results of the top.
+
+        `constant`: the parameters get no gradient; x does.
+        """
+        if torch.is_grad_enabled() and (x.requires_grad or not constant):
+            parameters = self._constants if constant else self._parameters
+            found: tuple[Tensor, ...] = _Pass.apply(self, x, parameters, *given)  # type: ignore[no-untyped-call]
+            return found
+        workspace = self.take()
+        found = workspace.forward(x, given)
+        self.give_back(workspace)
+        return found
+
+    def take(self) -> _Workspace:
+        """Arrays that no call uses."""
+        if self._free:
+            return self._free.pop()
+        return _Workspace(self._constants, self._fields, self._trunks, self._relu, self._top)
+
+    def give_back(self, workspace: _Workspace) -> None:
+        """The next call may overwrite these arrays."""
+        self._free.append(workspace)
+
+
+class _Pass(torch.autograd.Function):
+    """A call of `SmallMLP`."""
+
+    @staticmethod
+    def forward(ctx: Any, mlp: SmallMLP, x: Tensor, parameters: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
+        ctx.mlp, ctx.kept = mlp, mlp.take()
+        ctx.save_for_backward(parameters)  # so that torch raises if a step changes them before the backward pass
+        found: tuple[Tensor, ...] = ctx.kept.forward(x, given)
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *by_results: Tensor) -> tuple[Tensor | None, ...]:
+        _ = ctx.saved_tensors
+        workspace: _Workspace = taken_once(ctx)
+        _, wants_x, wants_parameters, *given = ctx.needs_input_grad
+        found = workspace.backward(by_results, wants_x, wants_parameters)
+        ctx.mlp.give_back(workspace)
+        return None, *found, *[None] * len(given)
+
+
+def taken_once(ctx: Any) -> Any:
+    """What the forward pass kept in `ctx.kept`. Raises `RuntimeError`, in one line, for a second or double backward pass."""
+    if torch.is_grad_enabled():
+        raise RuntimeError(
+            "millrace differentiates small networks and distributions in numpy, which has no second derivatives; call "
+            "backward without create_graph"
+        )
+    kept, ctx.kept = ctx.kept, None
+    if kept is None:
+        raise RuntimeError(
+            "backward was called twice through the same outputs of a network, which keeps what it needs for one backward "
+            "pass; add the losses up and call backward once, or call the network again"
+        )
+    return kept
+
+
+class _Workspace:
+    """The arrays of one call at a time, and the plans for minibatches of the sizes that came before.
+
+    Plans of all sizes share their arrays: each takes the same ones in the same order.
+    """
+
+    def __init__(self, parameters: Tensor, fields: Sequence[Field], trunks: Trunks, relu: bool, make_top: MakeTop) -> None:
+        self._gradient = torch.zeros_like(parameters)
+        values, grads = (named_views(flat.numpy(), fields) for flat in (parameters, self._gradient))
+        self._hidden = [Linear.stacked(names, values, grads) for names in zip(*trunks.hidden, strict=True)]
+        self._heads = [Head(Linear.stacked([name], values, grads), network) for name, network in trunks.outputs]
+        self._relu, self._top = relu, make_top(values, grads)
         self._plans: dict[int, _MinibatchPlan] = {}
+        self._arrays: list[Array] = []
+        self._taken = 0
 
-    def forward(self, x: Array) -> list[Array]:
-        """Features [B, D] -> the output [out, B] of each head. The next forward pass overwrites them."""
+    @np.errstate(all="ignore")  # as torch; what is not finite is found and named before a step
+    def forward(self, x: Tensor, given: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+        """The results of the top for features [B, D], in memory of their own."""
         plan = self._plans.get(len(x))
         if plan is None:
             if len(self._plans) == MAX_PLANS:
                 self._plans.clear()
-            self._workspace.restart()
-            plan = self._plans[len(x)] = _MinibatchPlan(len(x), self._hidden, self._heads, self._relu, self._workspace)
+            self._taken = 0
+            plan = self._plans[len(x)] = _MinibatchPlan(len(x), self._hidden, self._heads, self._relu, self)
         self._plan = plan
+        rows = x.detach().numpy()
         for chunk in plan.chunks:
-            chunk.x[0] = x[chunk.rows].T
+            chunk.x[0] = rows[chunk.rows].T
             for call in chunk.forward:
                 call()
-        return [output[0] for output in plan.head_outputs]
+        outputs = [output[0] for output in plan.head_outputs]
+        found = self._top.forward(outputs, *(None if each is None else each.numpy() for each in given))
+        return tuple(map(torch.from_numpy, found))
 
-    def backward(self, gradients: Sequence[Array]) -> None:
-        """Write the gradients of all layers. Arguments: ∂L/∂output [out, B] for each output of the last forward pass."""
-        for gradient, place in zip(gradients, self._plan.head_gradients, strict=True):
-            place[0] = gradient
+    @np.errstate(all="ignore")
+    def backward(
+        self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """The gradients by x and by all parameters, of those that are wanted, from that by each result."""
+        by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
+        by_x = self.by_input(by_heads) if wants_x else None
+        return by_x, self.by_parameters(by_heads) if wants_parameters else None
+
+    def by_parameters(self, by_heads: Sequence[Array]) -> Tensor:
+        """The gradient [P] by all parameters, from ∂L/∂output [out, B] of each head of the last forward pass."""
+        self._place(by_heads)
         for chunk in self._plan.chunks:
             for call in chunk.back_from_heads + chunk.back_through_hidden:
                 call()
         for call in self._plan.gather:
             call()
+        return self._gradient.clone()
 
-    def input_gradient(self, gradients: Sequence[Array]) -> Array:
-        """∂L/∂x [D, B], without the gradients of the layers. Arguments as for `backward`; there must be a hidden layer.
-
-        The next call overwrites it.
-        """
-        for gradient, place in zip(gradients, self._plan.head_gradients, strict=True):
-            place[0] = gradient
+    def by_input(self, by_heads: Sequence[Array]) -> Tensor:
+        """∂L/∂x [B, D]; there must be a hidden layer. Arguments as for `by_parameters`."""
+        self._place(by_heads)
         for chunk in self._plan.chunks:
             for call in chunk.heads_to_input + chunk.hidden_to_input:
                 call()
             np.add.reduce(chunk.dx, 0, out=self._plan.input_gradient[:, chunk.rows])
-        return self._plan.input_gradient
+        return torch.from_numpy(self._plan.input_gradient.copy()).T
 
-
-class _Workspace:
-    """Arrays that the plans of all sizes share, because one pass runs at a time.
-
-    Each plan takes the same arrays in the same order.
-    """
-
-    def __init__(self, like: Array) -> None:
-        self._like = like
-        self._arrays: list[Array] = []
-        self._taken = 0
-
-    def restart(self) -> None:
-        """Start with the first array again."""
-        self._taken = 0
+    def _place(self, by_heads: Sequence[Array]) -> None:
+        for by_head, place in zip(by_heads, self._plan.head_gradients, strict=True):
+            place[0] = by_head
 
     def take(self, *shape: int) -> Array:
         """The next array, C-ordered, not initialized."""
         size, number = math.prod(shape), self._taken
         self._taken += 1
         if number == len(self._arrays):
-            self._arrays.append(np.empty(0, self._like.dtype))
+            self._arrays.append(np.empty(0, self._gradient.numpy().dtype))
         if self._arrays[number].size < size:
             # torch allocates the array, because torch aligns all arrays in the same way. With another alignment, torch's
             # products could give other bits. The size is a power of two, so that a slightly larger minibatch needs no new
             # array.
             room = 1 << (size - 1).bit_length()
-            self._arrays[number] = torch.zeros(room, dtype=torch.from_numpy(self._like).dtype).numpy()
+            self._arrays[number] = torch.zeros(room, dtype=self._gradient.dtype).numpy()
         return self._arrays[number][:size].reshape(shape)
 
     def outputs(self, layer: Linear, rows: int) -> Array:

@@ -39,7 +39,7 @@ def test_on_rows_of_the_newest_weights_its_gradient_is_a2cs(spec: PolicySpec, la
     other, others_twin = (A2C(config, spec, total_steps=10_000, seed=0) for _ in range(2))
     rows = batch(one, 0)
     found, expected = estimated(twin, rows), estimated(others_twin, rows)
-    returns = Rows(A2C(config, spec, total_steps=1, seed=0).rewards(rows), expected.values, *EpisodeEnds.of(rows))
+    returns = Rows(rows.reward, expected.values, *EpisodeEnds.of(rows))
     of_log_prob = log_prob_error(one, rows)
     of_target, of_advantage = vtrace_tolerances(on_policy(returns), GAMMA, lam, log_ratio_error=of_log_prob)
     assert_within(found.target[rows.valid], expected.target[rows.valid], 2 * of_target[rows.valid])  # both are rounded
@@ -51,13 +51,13 @@ def test_on_rows_of_the_newest_weights_its_gradient_is_a2cs(spec: PolicySpec, la
 
 def estimated(algorithm: ActorCritic, rows: Batch) -> Estimates:
     """The estimates of the first update."""
-    return algorithm.estimate(rows, algorithm.observations(rows), algorithm.rewards(rows), no_pulse)
+    return algorithm.estimate(rows, algorithm.observations(rows), rows.reward, no_pulse)
 
 
 def largest_differences(found: Estimates, advantage: Array, target: Array) -> Errors:
     """Of the rows to learn from. A test asserts first that the differences are rounding."""
     pairs = (found.advantage, advantage), (found.target, target)
-    return Errors(*(float(np.abs(one - other)[found.mask].max()) for one, other in pairs))
+    return Errors(*(float(np.abs(one - other)[found.used].max()) for one, other in pairs))
 
 
 def log_prob_error(algorithm: Impala, rows: Batch) -> float:

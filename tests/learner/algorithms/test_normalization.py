@@ -194,7 +194,7 @@ def test_returns_go_on_from_rollout_to_rollout_of_a_lane_and_its_copies() -> Non
     scaler = RewardScaler(GAMMA)
     for at in (0, 4, 8):
         rows = slice(at, at + 4)
-        scaled = scaler.scale(batch(reward[rows], [0, 0, 1, 1], [at == 0] * 4, ended[rows], valid[at]))
+        scaled = scaler.count_and_scale(batch(reward[rows], [0, 0, 1, 1], [at == 0] * 4, ended[rows], valid[at]))
     np.testing.assert_allclose(scaled, reward[8:] / slow_std(columns_of(life)), rtol=1e-5)
 
 
@@ -202,15 +202,15 @@ def test_a_lane_may_stand_twice_in_a_batch_in_its_own_order() -> None:
     life = lives(8, 4)
     wide = [np.concatenate([a[:4, :2], a[4:, :2], a[:4, 2:], a[4:, 2:]], 1) for a in life]
     scaler = RewardScaler(GAMMA)
-    scaled = scaler.scale(batch(wide[0], [0] * 4 + [1] * 4, [True, True, False, False] * 2, wide[1], wide[2][0]))
+    scaled = scaler.count_and_scale(batch(wide[0], [0] * 4 + [1] * 4, [True, True, False, False] * 2, wide[1], wide[2][0]))
     np.testing.assert_allclose(scaled, wide[0] / slow_std(columns_of(life)), rtol=1e-5)
 
 
 def test_a_fresh_lane_starts_from_zero() -> None:
     first, second = lives(6, 2), lives(5, 2)
     scaler = RewardScaler(GAMMA)
-    scaler.scale(batch(first[0], [0, 0], [True, True], first[1], first[2][0]))
-    scaled = scaler.scale(batch(second[0], [0, 0], [True, True], second[1], second[2][0]))
+    scaler.count_and_scale(batch(first[0], [0, 0], [True, True], first[1], first[2][0]))
+    scaled = scaler.count_and_scale(batch(second[0], [0, 0], [True, True], second[1], second[2][0]))
     np.testing.assert_allclose(scaled, second[0] / slow_std(columns_of(first) + columns_of(second)), rtol=1e-5)
 
 
@@ -218,7 +218,7 @@ def test_the_reward_of_a_row_that_is_not_valid_changes_nothing() -> None:
     reward, ended, valid = lives(12, 2)
     assert not valid.all()
     other = np.where(valid, reward, np.float32(1e6))
-    scaled = [RewardScaler(GAMMA).scale(batch(r, [0, 0], [True, True], ended)) for r in (reward, other)]
+    scaled = [RewardScaler(GAMMA).count_and_scale(batch(r, [0, 0], [True, True], ended)) for r in (reward, other)]
     np.testing.assert_array_equal(scaled[0][valid], scaled[1][valid])
 
 
@@ -226,14 +226,14 @@ def test_a_scaled_reward_is_clipped() -> None:
     reward = np.zeros((2_000, 2))
     reward[50] = 1e6, -1e6
     scaler = RewardScaler(GAMMA)
-    scaled = scaler.scale(batch(reward, [0, 0], [True, True]))
+    scaled = scaler.count_and_scale(batch(reward, [0, 0], [True, True]))
     assert 1e6 / scaler.std > 15
     assert sorted(set(scaled.ravel().tolist())) == [-10, 0, 10]
 
 
 def test_what_never_varied_is_divided_by_one() -> None:
     constant = batch(np.full((1, 3), 0.3), [0, 0, 0], [True] * 3, copies=3)
-    np.testing.assert_array_equal(RewardScaler(GAMMA).scale(constant), constant.reward)
+    np.testing.assert_array_equal(RewardScaler(GAMMA).count_and_scale(constant), constant.reward)
     moments = RunningMoments((2,))
     for _ in range(10):
         moments.update(np.stack([np.full(7, 123.456), np.arange(7) * 1e-9], -1))
@@ -269,10 +269,10 @@ def test_a_float64_feature_has_its_own_spread_however_small_beside_its_mean() ->
 def test_the_state_goes_through_a_file(steps: int) -> None:
     reward, ended, valid = lives(8, 2)
     scaler, again = RewardScaler(GAMMA), RewardScaler(GAMMA)
-    scaler.scale(batch(reward[:4], [0, 0], [True, True], ended[:4], valid[0]))
+    scaler.count_and_scale(batch(reward[:4], [0, 0], [True, True], ended[:4], valid[0]))
     again.load_state_dict(through_a_file(scaler.state_dict()))
     following = batch(reward[4 : 4 + steps], [0, 0], [False, False], ended[4 : 4 + steps], valid[4])
-    np.testing.assert_array_equal(again.scale(following), scaler.scale(following))
+    np.testing.assert_array_equal(again.count_and_scale(following), scaler.count_and_scale(following))
 
     x = np.random.default_rng(0).normal(size=(2, 3, 6)).astype(np.float32)
     normalizer, restored = ObservationNormalizer(SPEC), ObservationNormalizer(SPEC)

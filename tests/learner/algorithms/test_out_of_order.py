@@ -72,7 +72,7 @@ def test_the_reward_scale_continues_only_returns_that_follow(split: tuple[int, .
     rollouts = collected(run)
     scaler, expected = RewardScaler(GAMMA), RunningMoments()
     for batch in batches(rollouts, split):
-        scaler.scale(batch)
+        scaler.count_and_scale(batch)
     for chain in CHAINS:
         now = np.zeros(run.copies)
         for n in chain:
@@ -89,5 +89,5 @@ def test_the_reward_scale_continues_only_returns_that_follow(split: tuple[int, .
     assert float(moments["squares"]) == pytest.approx(float(expected.state_dict()["squares"]), rel=1e-6)
     unmarked = RewardScaler(GAMMA)
     for n in ORDER:
-        unmarked.scale(stack_rollouts([rollouts[n]]))
+        unmarked.count_and_scale(stack_rollouts([rollouts[n]]))
     assert unmarked.state_dict()["moments"]["mean"] != moments["mean"], "the marks change nothing, so this shows nothing"

@@ -83,10 +83,10 @@ def test_it_learns_from_the_known_returns_alone(
     metrics = algorithm.update(rows, no_pulse)
     ((minibatch, only),) = evaluated
     np.testing.assert_array_equal(minibatch.features, [rows.obs[0][t, n] for t, n, _ in expected])
-    assert_within(only.advantage, advantage, tolerance)
+    assert_within(only.advantage.numpy(), advantage, tolerance)
     if baseline:
         returns = np.array([g for _, _, g in expected])
-        assert_within(only.target, returns, of_return + UNIT * (np.abs(returns) + of_return))  # it is rounded
+        assert_within(only.target.numpy(), returns, of_return + UNIT * (np.abs(returns) + of_return))  # it is rounded
     assert metrics["train/rows_used"] == len(expected)
     assert metrics["train/rows_dropped"] == rows.valid.sum() - len(expected)
 

@@ -19,7 +19,7 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "resume.md"
-OTHER_OPTIMIZER = {"a2c": "adam", "impala": "adam", "reinforce": "rmsprop", "dqn": "adamw"}
+OTHER_OPTIMIZER = {"ppo": "rmsprop", "a2c": "adam", "impala": "adam", "reinforce": "rmsprop", "dqn": "adamw"}
 RECORDS: list[type[msgspec.Struct]] = [Config, *HYPERPARAMETERS.values()]
 
 

@@ -55,7 +55,7 @@ class Sound(ActorCritic):
 
 class UsesRowsThatAreNotValid(Sound):
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        return super().estimate(batch, observations, reward, pulse)._replace(mask=np.ones_like(batch.valid))
+        return super().estimate(batch, observations, reward, pulse)._replace(used=np.ones_like(batch.valid))
 
 
 class ForgetsItsCoefficient(Sound):
@@ -94,9 +94,9 @@ class DrawsGlobalNumbers(Sound):
 
 
 class ChangesTheBatch(Sound):
-    def rewards(self, batch: Batch) -> Floats:
+    def observations(self, batch: Batch) -> Observations:
         np.divide(batch.reward, 10, out=batch.reward)
-        return batch.reward
+        return super().observations(batch)
 
 
 class ForgetsTheOptimizer(Sound):
@@ -104,7 +104,7 @@ class ForgetsTheOptimizer(Sound):
         return {name: value for name, value in super().state_dict().items() if name != "optimizer"}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        super().load_state_dict(state | {"optimizer": self.optimizer.state_dict()})
+        super().load_state_dict(state | {"optimizer": self.optimizers["optimizer"].state_dict()})
 
 
 class RollsBackHalf(Sound):
@@ -115,6 +115,18 @@ class RollsBackHalf(Sound):
 class GivesTheLiveWeights(Sound):
     def weights(self) -> tuple[Floats, Floats]:
         return self.net.flat[: self.net.acting_size].numpy(), super().weights()[1]
+
+
+class GivesItsOwnStatistics(Sound):
+    def weights(self) -> tuple[Floats, Floats]:
+        return super().weights()[0], self.statistics
+
+
+class MeasuresObservationsAfterATermination(Sound):
+    def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
+        super().count_update(batch, observations, epochs)
+        self.normalizer.update(observations.raw_features[:-1], np.ones_like(batch.valid))
+        self.statistics = self.normalizer.buffers()
 
 
 class GivesOtherTypes(Sound):
@@ -133,7 +145,7 @@ class ForgetsThePlaceInItsSchedule(Sound):
 
     def set_schedules(self) -> None:
         self.updates += 1
-        self.optimizer.param_groups[0]["lr"] = 0.01 / self.updates
+        self.optimizers["optimizer"].param_groups[0]["lr"] = 0.01 / self.updates
 
 
 class DoesNotPulse(Sound):
@@ -212,12 +224,14 @@ MISTAKES: list[tuple[type, str]] = [
     (ForgetsTheOptimizer, "state_dict: after a load the next update gives other "),
     (RollsBackHalf, "roll_back: after an update, expected the state that was remembered, got another state_dict()['"),
     (GivesTheLiveWeights, "weights: expected a copy, got an array that the next update changes"),
+    (GivesItsOwnStatistics, "weights: expected a copy, got an array of the algorithm's own"),
+    (MeasuresObservationsAfterATermination, "update: rows that are not valid change the metrics['train/ratio']"),
     (GivesOtherTypes, "weights: parameters: expected float32[148], got float64[148]"),
     (GivesTheCriticToo, "weights: parameters: expected float32[148], got float32[245]"),
     (ForgetsThePlaceInItsSchedule, "state_dict: after a load the next update gives other "),
     (DoesNotPulse, "update: expected calls of pulse between gradient steps, got none in 24 updates"),
     (SwallowsWhatPulseRaises, "update: expected that it lets pass what pulse raises, got none"),
-    (GivesTensors, "update: metric train/loss: expected a name and a float, got Tensor"),
+    (GivesTensors, "update: metric train/ratio: expected a name and a float, got Tensor"),
     (GivesItsLiveState, "state_dict['parameters']: expected a copy, got something that the next update changes"),
     (SavesAnArray, "state_dict['more']['array']: expected tensors, numbers, text, and lists and dicts of these"),
     (KeepsTheStateItLoads, "load_state_dict: expected that it copies the state, got one whose next update changes"),
@@ -229,7 +243,7 @@ MISTAKES: list[tuple[type, str]] = [
 @pytest.mark.parametrize(("planted", "says"), MISTAKES, ids=lambda value: getattr(value, "__name__", ""))
 def test_a_planted_mistake_is_found(planted: type, says: str) -> None:
     with pytest.raises(AlgorithmMistakes) as caught:
-        check_algorithm(planted, learns=False, **SMALL)
+        check_algorithm(planted, learns=False, normalize_observations=True, **SMALL)
     assert any(says in line for line in caught.value.mistakes), caught.value.mistakes
     assert str(caught.value).splitlines() == [f"{planted.__name__}: {line}" for line in caught.value.mistakes]
     assert isinstance(caught.value, AssertionError)
@@ -258,7 +272,7 @@ def test_a_sound_algorithm_passes_and_nothing_global_changes() -> None:
 
 @pytest.mark.parametrize("settings", [{"core": "gru"}, {"normalize_rewards": True, "normalize_observations": True}])
 def test_it_passes_with_other_settings(settings: dict[str, Any]) -> None:
-    check_algorithm(Sound, learns=False, **SMALL, **settings)
+    check_algorithm(Sound, learns=False, **SMALL | {"rollout_steps": 8} | settings)
 
 
 class OtherLoss(PPO):
@@ -277,12 +291,18 @@ def test_a_subclass_of_ppo_need_not_log_what_ppo_logs() -> None:
     assert says in str(caught.value)
 
 
-@pytest.mark.timeout(600)  # on a busy machine
+LEARNS_SOON: dict[str, dict[str, Any]] = {
+    **{name: {"rollout_steps": 16, "learning_rate": 0.02} for name in ("a2c", "impala", "reinforce")},
+    "ppo": {"rollout_steps": 16, "learning_rate": 0.01, "n_epochs": 4, "batch_size": 128},
+    "dqn": {"rollout_steps": 16, "learning_rate": 3e-3, "learning_starts": 0, "gradient_steps": 8, "epsilon_steps": 2000},
+    **{name: {"rollout_steps": 8, "learning_rate": 3e-3, "updates_per_step": 0.1} for name in ("sac", "td3")},
+}
+
+
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_algorithms_of_ours_pass(name: str) -> None:
-    continuous = name in ("sac", "td3")  # with their own sizes they compute for a minute
-    small: dict[str, Any] = {"net": (16,), "batch_size": 64, "updates_per_step": 0.25} if continuous else {}
-    check_algorithm(algorithm_class(name), **small)
+    """With one kind of policy. All others: `test_every_algorithm`."""
+    check_algorithm(algorithm_class(name), net=(16,), **LEARNS_SOON[name])
 
 
 class Whole(Algorithm):

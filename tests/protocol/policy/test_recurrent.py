@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from learner.algorithms import algorithm_class
-from learner.algorithms.actor_critic import Estimates
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
@@ -214,8 +213,8 @@ def test_a_minibatch_is_whole_columns_and_every_valid_row_is_in_one(parts: int) 
     rows = batch(ppo, 0)
     count = np.arange(rows.valid.size, dtype=np.float32).reshape(rows.valid.shape)
     rows = msgspec.structs.replace(rows, state=np.repeat(np.arange(6, dtype=np.float32)[:, None], 8, 1))
-    given = ppo.rows(rows, ppo.observations(rows), Estimates(count, count, count, rows.valid, {}))
-    found = list(ppo.minibatches(given, rows.valid, parts))
+    given = Minibatch.of(rows, ppo.observations(rows), count, count)
+    found = list(given.shuffled(rows.valid, parts, ppo.generator))
     assert len(found) == min(parts, 6)
     assert sorted(torch.cat([each.target for each in found]).tolist()) == count[rows.valid].tolist()
     for each in found:
@@ -254,7 +253,7 @@ def test_values_are_the_same_however_many_columns_are_evaluated_together(monkeyp
     rows = batch(ppo, 0)
     observations = ppo.observations(rows)
     whole = ppo.values(observations, no_pulse)
-    monkeypatch.setattr("learner.algorithms.actor_critic.CHUNK_ROWS", 45)
+    monkeypatch.setattr("learner.algorithms.minibatches.CHUNK_ROWS", 45)
     assert observations.recurrent is not None
     exact, x, recurrent_input = in_float64(ppo.net), observations.features.double(), doubles(observations.recurrent)
     (expected,) = sampled(lambda: [exact.value(x, (), recurrent_input).view(whole.shape)])

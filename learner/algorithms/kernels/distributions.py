@@ -1,23 +1,80 @@
-"""Log-probabilities and entropies of actions, and their gradients derived by hand, in numpy.
+"""What a small network makes of an actor's output: log-probabilities and entropies of actions, or actions, in numpy.
 
-Rule: results equal those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, except for
-rounding. Parameters are [P, B], a column for each of B rows; actions are [B, k]. `forward` keeps what `backward` needs.
+Rule: results and gradients equal those of `protocol.policy.torch_distributions` and autograd, except for rounding. They save
+0.1 ms of a minibatch of 64 rows: autograd needs a dozen nodes. Arrays are [P, B], a column for each of B rows. `forward`
+keeps what `backward` needs.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 
-from protocol.arrays import Array
+from protocol.arrays import Array, Bools
 from protocol.policy.distributions import LOG_SQRT_2PI
+from protocol.policy.layout import LOG_STD_BOUNDS
+from protocol.policy.masks import FORBIDDEN
 from protocol.specs import ActionSpec
 
+LOG_2 = math.log(2)
 
-class ActionGradients(Protocol):
-    """A distribution over actions with the gradients of its log-probability and entropy."""
+
+class Evaluation:
+    """Of an actor and a critic: log π(action), the entropy of π, V, [B] each."""
+
+    def __init__(self, distribution: Distribution) -> None:
+        self._distribution = distribution
+
+    def forward(self, outputs: Sequence[Array], action: Array, mask: Bools | None) -> tuple[Array, ...]:
+        """Given: actions [B, *action], and [B, choices] which of them are allowed.
+
+        A logit that the mask forbids has probability 0, so the factor p makes its gradient 0 in `Distribution.backward`.
+        """
+        params, value = outputs
+        if mask is not None:
+            np.copyto(params, np.float32(FORBIDDEN), where=~mask.T)
+        return *self._distribution.forward(params, action.reshape(len(action), -1)), value[0].copy()
+
+    def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
+        """See `Top`."""
+        by_log_prob, by_entropy, by_value = by_results
+        return self._distribution.backward(by_log_prob, by_entropy), by_value[None]
+
+
+class SquashedSample:
+    """Of an actor: actions a = tanh u [B, D] of u = mean + std · noise, and their log-densities [B].
+
+    log π(a) = Σ −½ noise² − log std − log √2π − log(1 − a²), where log(1 − a²) = 2 (log 2 − |u| − log(1 + exp(−2|u|)))
+    ∂a/∂u = 1 − a²;  ∂log π(a)/∂u = 2 a;  ∂u/∂log std = std · noise
+    """
+
+    def forward(self, outputs: Sequence[Array], noise: Array) -> tuple[Array, ...]:
+        """Given: normal noise [B, D]."""
+        (params,) = outputs
+        mean, log_std = np.split(params, 2)
+        low, high = LOG_STD_BOUNDS
+        self._inside = (log_std >= low) & (log_std <= high)
+        log_std = np.clip(log_std, low, high)
+        self._spread = np.exp(log_std) * noise.T
+        latent = mean + self._spread
+        height = abs(latent)
+        self._action = np.tanh(latent)
+        slope = 2 * (LOG_2 - height - np.log1p(np.exp(-2 * height)))
+        log_prob = np.add.reduce(-0.5 * noise.T * noise.T - log_std - LOG_SQRT_2PI - slope, 0)
+        return self._action.copy().T, log_prob
+
+    def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
+        """See `Top`."""
+        by_action, by_log_prob = by_results
+        by_latent = by_action.T * (1 - self._action * self._action) + 2 * by_log_prob * self._action
+        return [np.concatenate((by_latent, (by_latent * self._spread - by_log_prob) * self._inside))]
+
+
+class Distribution(Protocol):
+    """A distribution over actions, with the gradients of its log-probability and entropy."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         """Parameters [P, B] and actions [B, k] -> log π(action) [B], entropy [B]."""
@@ -41,7 +98,7 @@ class _Categorical:
         self._entropy = -np.add.reduce(p * log_p, 0)
         rows = params.shape[1]
         self._chosen = action[:, 0] * rows + np.arange(rows)  # index of log π(a) in [P · B]
-        return log_p.take(self._chosen), self._entropy
+        return log_p.take(self._chosen), self._entropy.copy()
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
         g: Array = self._log_p + self._entropy
@@ -89,8 +146,8 @@ class _Bernoulli:
 class _Gaussian:
     """z = (a − μ) / σ: ∂log π/∂μ = z / σ;  ∂log π/∂log σ = z² − 1;  ∂H/∂log σ = 1. log σ does not depend on the state."""
 
-    def __init__(self, log_std: Array, log_std_grad: Array) -> None:
-        self._log_std, self._log_std_grad = log_std, log_std_grad
+    def __init__(self, log_std: Array, by_log_std: Array) -> None:
+        self._log_std, self._by_log_std = log_std, by_log_std
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         self._inverse = np.exp(-self._log_std)[:, None]
@@ -102,16 +159,14 @@ class _Gaussian:
         return log_prob, entropy
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
-        np.matmul(self._squared - 1, by_log_prob, out=self._log_std_grad)
-        self._log_std_grad += by_entropy.sum()
-        self._z *= self._inverse
-        self._z *= by_log_prob
-        found: Array = self._z
+        np.matmul(self._squared - 1, by_log_prob, out=self._by_log_std)
+        self._by_log_std += by_entropy.sum()
+        found: Array = self._z * self._inverse * by_log_prob
         return found
 
 
-def action_gradients(spec: ActionSpec, log_std: Array | None, log_std_grad: Array | None) -> ActionGradients:
-    """The distribution of this action space. `log_std`, `log_std_grad`: [k], for Box actions only."""
+def distribution(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> Distribution:
+    """The distribution of this action space. `log_std`, `by_log_std`: [k], for Box actions only; the latter is written."""
     match spec.kind:
         case "discrete":
             return _Categorical()
@@ -121,6 +176,5 @@ def action_gradients(spec: ActionSpec, log_std: Array | None, log_std_grad: Arra
             return _Bernoulli()
         case "box":
             assert log_std is not None
-            assert log_std_grad is not None
-            return _Gaussian(log_std, log_std_grad)
-    raise ValueError(spec.kind)
+            assert by_log_std is not None
+            return _Gaussian(log_std, by_log_std)

@@ -7,23 +7,24 @@ size of the rollouts and the number and speed of the workers. Where these settin
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from learner.algorithms.algorithm import Start
 from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.kernels.actor_and_critics import passes_of
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
-from learner.algorithms.replay.off_policy import OffPolicy
+from learner.algorithms.gradient_descent import Metrics
+from learner.algorithms.kernels.networks import actor_and_critics
+from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.replay.off_policy import OffPolicy, Transitions
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import ContinuousConfig
+from protocol.arrays import Floats
 from protocol.errors import UsageError
 from protocol.policy.networks import ActorAndCritics
 from protocol.policy.torch_distributions import policy_log_prob
@@ -32,24 +33,12 @@ from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
-class Transitions:
-    """The arrays of B transitions, of the kind that the passes of the algorithm's networks use. Actions are in [-1, 1]."""
-
-    def __init__(self, algorithm: Continuous, sample: Sample) -> None:
-        array = algorithm.passes.to_array
-        self.x, self.next_x = (array(algorithm.inputs(leaves)[0]) for leaves in (sample.leaves, sample.next_leaves))
-        """[B, D] features of the observations, and of those k steps later"""
-        self.action = array(sample.action.reshape(len(sample.action), -1))
-        """[B, D′]"""
-        self.reward, self.discount, self.weight = map(array, (sample.reward, sample.discount, sample.weight))
-        """[B] each: Σ γⁱ r; γᵏ, or 0 if the task has terminated; weight of the loss"""
-
-
 class Continuous(Clones, OffPolicy):
     """An off-policy algorithm for a bounded Box: the networks, their targets, their optimizers and the source of noise."""
 
     Config = ContinuousConfig
-    config: Any
+    net: ActorAndCritics
+    cloned_by = "actor_optimizer"
 
     @classmethod
     def bounded_policy_spec(
@@ -86,22 +75,20 @@ class Continuous(Clones, OffPolicy):
         self, config: ContinuousConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        self.net = ActorAndCritics(policy, device, seed=seed)
-        self.target = ActorAndCritics(policy, device, seed=seed)
-        self.passes, self.target_passes = (passes_of(net, config.batch_size) for net in (self.net, self.target))
+        self.seed = seed
+        self.net, self.target = (actor_and_critics(policy, device, seed) for _ in range(2))
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
         self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         self.optimizers = {name: adam(part, config) for name, part in self.parts().items()}
-        self.optimizer, self.seed = self.optimizers["actor_optimizer"], seed
 
     def parts(self) -> dict[str, Tensor]:
         """The flat tensors that an optimizer each changes, by the optimizer's name."""
         return {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
 
-    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
+    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> Metrics:
         """See `Clones`: the actor alone. It acts from the first env step."""
         found = super().clone(episodes, pulse)
         self.target.actor.copy_(self.net.actor)
@@ -110,10 +97,8 @@ class Continuous(Clones, OffPolicy):
 
     def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
         """See `Clones`."""
-        x, _ = self.inputs(rows.obs(rows.at))
-        observed, action = (torch.from_numpy(array).to(self.net.flat.device) for array in (x, rows.action))
-        params = self.net.params(observed)
-        return -policy_log_prob(self.policy, params, action).mean(), params
+        params = self.net.params(*self.inputs(rows.obs(rows.at)))
+        return -policy_log_prob(self.policy, params, self.tensor(rows.action)).mean(), params
 
     def steps_due(self) -> int:
         """The gradient steps that the replay ratio demands now."""
@@ -121,11 +106,23 @@ class Continuous(Clones, OffPolicy):
         steps = math.floor(ratio * max(0, self.env_steps - self._counted["env_steps"]))
         return max(0, int(self._counted["made"]) + steps - (self.gradient_steps - self.prior_gradient_steps))
 
-    def noise(self, *shape: int) -> Any:
-        """Normal noise [*shape], of the kind of array that the passes use."""
-        return self.passes.to_array(torch.randn(*shape, generator=self._generator).numpy())
+    def noise(self, rows: int) -> Tensor:
+        """Normal noise [B, D′]."""
+        return torch.randn(rows, math.prod(self.policy.action.shape), generator=self._generator).to(self.net.flat)
 
-    def weights(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    def transitions(self, sample: Sample) -> Transitions:
+        """See `OffPolicy`; an action is a row of numbers."""
+        rows = super().transitions(sample)
+        return rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
+
+    def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> Metrics:
+        """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss. Gradients are not clipped."""
+        found = self.differentiate(loss, self.parts()[f"{name}_optimizer"], {**numbers, f"{name}_loss": loss})
+        take_step(self.optimizers[f"{name}_optimizer"])
+        del found["grad_norm"]
+        return found
+
+    def weights(self) -> tuple[Floats, Floats]:
         """Copies of the actor's parameters [P], and of the buffers: observation statistics, and what exploration needs."""
         warm_up = float(self.env_steps < self.config.learning_starts and not self._acts_at_once)
         exploration = np.array([*self.exploration(), warm_up], np.float32)
@@ -135,22 +132,22 @@ class Continuous(Clones, OffPolicy):
         """What the buffers of the policy hold between the statistics and the number that says whether it warms up."""
         return []
 
-    def numbers(self) -> dict[str, Any]:
-        """See `OffPolicy.numbers`."""
+    def other_state(self) -> dict[str, Any]:
+        """See `GradientDescent`."""
         counted = self._counted | {"learning_starts": self._learning_starts}
         more = {"counted": counted, "noise": self._generator.get_state(), "acts_at_once": self._acts_at_once}
-        return super().numbers() | more | {"clone_steps": self.clone_steps}
+        return super().other_state() | more
 
     def start_from(self, start: Start) -> None:
         """See `Algorithm.start_from`. The policy acts from the first env step."""
         super().start_from(start)
         self._acts_at_once = True
 
-    def load_numbers(self, state: dict[str, Any]) -> None:
-        """See `OffPolicy.load_numbers`."""
-        super().load_numbers(state)
+    def load_other_state(self, state: dict[str, Any]) -> None:
+        """See `GradientDescent`."""
+        super().load_other_state(state)
         self._generator.set_state(state["noise"].clone())
-        self._acts_at_once, self.clone_steps = state["acts_at_once"], state["clone_steps"]
+        self._acts_at_once = state["acts_at_once"]
         counted, config = dict(state["counted"]), self.config
         self._learning_starts = counted.pop("learning_starts")
         self._counted = counted

@@ -1,0 +1,206 @@
+"""The base of the algorithms that step flat tensors down the gradients of their losses: what an update needs, and the state.
+
+Rule: the loss that an algorithm writes in torch is the one that is differentiated. A step is taken only after its loss and
+its gradient were found finite; `roll_back` takes back what an update did before it raised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from msgspec.structs import replace
+from torch import Tensor
+from torch.optim import Optimizer
+
+from learner.algorithms.algorithm import Algorithm, Start
+from learner.algorithms.kernels.optimizer_step import load_state, state_of
+from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from protocol.arrays import Array, Floats
+from protocol.errors import RunError, UsageError
+from protocol.policy.features import features
+from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+
+Metrics = dict[str, float]
+
+ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards"
+
+
+class GradientDescent(Algorithm):
+    """Flat tensors, an optimizer for each that learns, schedules, and running statistics of observations and returns.
+
+    A subclass puts everything that a step changes into `tensors` and `optimizers`, and what else the next update depends on
+    into `other_state`.
+    """
+
+    tensors: dict[str, Tensor]
+    """The tensors that steps change in place, by their names in the saved state."""
+    net: ActorCriticNetwork | QNetwork | ActorAndCritics
+    optimizers: dict[str, Optimizer]
+    """The optimizers, each of one flat tensor that has a gradient, by their names in the saved state."""
+
+    def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int) -> None:
+        self.config = config
+        self.policy = policy
+        self.env_steps = 0  # valid rows used so far; schedules depend on it
+        self.version = 0  # updates made
+        self._total_steps = total_steps
+        # What exploration needs also stands in the policy's buffers, so the normalizer gets the policy with another head.
+        self.normalizer = ObservationNormalizer(replace(policy, head="actor_critic"))
+        self.statistics: Floats = self.normalizer.buffers()  # float32 means and standard deviations, as published
+        self.rewards = RewardScaler(config.gamma)
+        self._remembered: dict[str, Any] = {}
+
+    # ---------------------------------------------------------------- an update
+
+    def remaining(self) -> float:
+        """The fraction of the run that remains: 1 in the first update, above 0 in the last."""
+        return max(0.0, 1 - self.env_steps / self._total_steps)
+
+    def set_schedules(self) -> None:
+        """Set what depends on how much of the run remains. Called at the start of each update."""
+        for optimizer in self.optimizers.values():
+            optimizer.param_groups[0]["lr"] = self.learning_rate
+
+    @property
+    def learning_rate(self) -> float:
+        """The learning rate that the settings and the schedule say."""
+        return scheduled(self.config.learning_rate, self.config.learning_rate_schedule, self.remaining())
+
+    def inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Features [B, D] as the networks take them, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
+        _, x, images = self.normalizer.inputs(leaves, self.statistics)
+        return self.tensor(x).to(self.net.flat.dtype), tuple(map(self.tensor, images))
+
+    def tensor(self, array: Array) -> Tensor:
+        """On the device of the weights."""
+        return torch.from_numpy(array).to(self.net.flat.device)
+
+    def count(self, batch: Batch) -> None:
+        """Count a batch for the statistics. Those of observations take effect when `statistics` is set."""
+        if self.config.normalize_rewards:
+            self.rewards.count(batch)
+        self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+
+    def scaled(self, reward: Floats) -> Floats:
+        """Rewards as the critic learns them."""
+        return self.rewards.scaled(reward) if self.config.normalize_rewards else reward
+
+    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+        """Count the rows of a dataset for all statistics."""
+        for batch in batches:
+            self.count(batch)
+        self.statistics = self.normalizer.buffers()
+
+    def differentiate(self, loss: Tensor, flat: Tensor, numbers: Mapping[str, Tensor | float]) -> Metrics:
+        """Write the gradient of a loss into `flat.grad`, the memory of the gradients of all parameters that `flat` holds.
+
+        Returns the numbers, and `grad_norm`, as floats.
+
+        Raises `RunError` if one of them is not finite, and `UsageError` for what is no number.
+        """
+        gradient = flat.grad
+        assert gradient is not None
+        gradient.zero_()
+        loss.backward()  # type: ignore[no-untyped-call]
+        read = [self._logged(name, number, loss) for name, number in numbers.items()]
+        found = torch.stack((*read, gradient.norm())).tolist()  # one transfer from a GPU
+        metrics = dict(zip((*numbers, "grad_norm"), found, strict=True))
+        check_finite(metrics, self.version, ADVICE)
+        return metrics
+
+    def _logged(self, name: str, number: Any, like: Tensor) -> Tensor:
+        """A number that a loss logs, as a tensor of no dimension. Raises `UsageError` for anything else."""
+        if isinstance(number, Tensor) and not number.dim():
+            return number.detach()
+        got = type(number).__name__
+        try:
+            found = torch.as_tensor(number, dtype=like.dtype, device=like.device)
+            if found.numel() == 1:
+                return found.detach().reshape(())
+            got = f"{got} {list(found.shape)}; log its mean"
+        except (TypeError, ValueError, RuntimeError):
+            pass
+        raise UsageError(f"{type(self).__name__}.loss: {name}: expected one number to log, got {got}")
+
+    @staticmethod
+    def means(measured: Iterable[Mapping[str, float]]) -> Metrics:
+        """The mean of each metric over the measurements that have it, with the prefix "train/"."""
+        by_name: dict[str, list[float]] = {}
+        for each in measured:
+            for name, number in each.items():
+                by_name.setdefault(name, []).append(number)
+        return {f"train/{name}": sum(found) / len(found) for name, found in by_name.items()}
+
+    # ---------------------------------------------------------------- the state
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite, also those that do not act, and the observation statistics."""
+        return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
+
+    def other_state(self) -> dict[str, Any]:
+        """What the next update depends on besides tensors, optimizers and statistics: plain data, copied."""
+        return {"env_steps": self.env_steps, "version": self.version}
+
+    def load_other_state(self, state: dict[str, Any]) -> None:
+        """Continue from `other_state`."""
+        self.env_steps, self.version = state["env_steps"], state["version"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
+        return (
+            {name: tensor.clone() for name, tensor in self.tensors.items()}
+            | {name: state_of(optimizer) for name, optimizer in self.optimizers.items()}
+            | {"observations": self.normalizer.state_dict(), "rewards": self.rewards.state_dict()}
+            | self.other_state()
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+        for name, tensor in self.tensors.items():
+            tensor.copy_(state[name])
+        for name, optimizer in self.optimizers.items():
+            load_state(optimizer, state[name])
+        self.normalizer.load_state_dict(state["observations"])
+        self.statistics = self.normalizer.buffers()
+        self.rewards.load_state_dict(state["rewards"])
+        self.load_other_state(state)
+
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm.start_from`. Target networks start as the networks; a replay buffer is empty."""
+        own = GradientDescent.state_dict(self)
+        GradientDescent.load_state_dict(self, start.into(own, self.tensors, self.optimizers))
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`."""
+        self._remembered = self.state_dict()
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        self.load_state_dict(self._remembered)
+
+
+def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None:
+    """Raise `RunError`, which names the first metric that is not finite, if there is one. Call it before the step."""
+    for name, number in metrics.items():
+        if not math.isfinite(number):
+            raise RunError(
+                f"learner: update {update}: {name}: expected finite, got {number}; this step was not taken; try {advice}"
+            )
+
+
+def scheduled(first: float, schedule: str, remaining: float) -> float:
+    """The value of a setting when this fraction of the run remains: `linear` falls to 0, `constant` does not change."""
+    return first * (remaining if schedule == "linear" else 1)
+
+
+def clip_norm(flat: Tensor, norm: float, largest: float) -> None:
+    """Scale the gradient of a flat tensor, whose norm this is, to at most the largest norm."""
+    if norm > largest:
+        assert flat.grad is not None
+        flat.grad.mul_(largest / norm)

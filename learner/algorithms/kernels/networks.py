@@ -1,0 +1,131 @@
+"""The networks as the learner trains them: a small one on the CPU passes in numpy, as one node of autograd's graph.
+
+Rule: which way a network passes depends on its shape and its device alone. Both ways give the same numbers, except for
+rounding, so a loss need not know which one it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from learner.algorithms.kernels.distributions import Evaluation, SquashedSample, distribution
+from learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
+from protocol.arrays import Array
+from protocol.policy.features import feature_size
+from protocol.policy.layout import CRITICS, hidden_names
+from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput
+from protocol.specs import PolicySpec
+
+MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
+
+
+def is_small(spec: PolicySpec, device: str) -> bool:
+    """Whether this is only an MLP without large layers, on the CPU."""
+    if device != "cpu" or spec.needs_torch or spec.core is not None:
+        return False
+    return max((feature_size(spec), *spec.net)) <= MAX_UNITS
+
+
+def actor_critic_network(spec: PolicySpec, device: str, seed: int) -> ActorCriticNetwork:
+    """The network of an actor and a critic."""
+    return (SmallActorCritic if is_small(spec, device) else ActorCriticNetwork)(spec, device, seed=seed)
+
+
+def q_network(spec: PolicySpec, device: str, seed: int) -> QNetwork:
+    """The network of action values."""
+    return (SmallQNetwork if is_small(spec, device) else QNetwork)(spec, device, seed=seed)
+
+
+def actor_and_critics(spec: PolicySpec, device: str, seed: int) -> ActorAndCritics:
+    """The networks of an actor and two critics."""
+    small = is_small(spec, device) and len(spec.net) > 0  # the derivative by the action passes a hidden layer
+    return (SmallActorAndCritics if small else ActorAndCritics)(spec, device, seed=seed)
+
+
+class SmallActorCritic(ActorCriticNetwork):
+    """A small actor and critic: one pass for both, and for the distribution on top."""
+
+    def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
+        super().__init__(spec, device, seed=seed)
+        leaf, relu, actor = leaf_of(self.flat), spec.activation == "relu", hidden_names(spec)
+        trunks = [actor] if spec.shared_net else [actor, hidden_names(spec, "critic")]
+
+        def evaluation(values: Mapping[str, Array], gradients: Mapping[str, Array]) -> Evaluation:
+            return Evaluation(distribution(spec.action, values.get("actor.log_std"), gradients.get("actor.log_std")))
+
+        critic, value = ("critic.out", len(trunks) - 1), ("critic.out", 0)
+        self._both = SmallMLP(leaf, self.fields, Trunks(trunks, [("actor.out", 0), critic]), relu, evaluation)
+        self._critic_alone = SmallMLP(leaf, self.fields, Trunks(trunks[-1:], [value]), relu, lambda *_: Values())
+
+    def evaluate(
+        self,
+        x: Tensor,
+        images: Sequence[Tensor],
+        recurrent: RecurrentInput | None,
+        action: Tensor,
+        mask: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """See `ActorCriticNetwork`."""
+        log_prob, entropy, value = self._both(x, action, mask)
+        return log_prob, entropy, value
+
+    def value(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
+        """See `ActorCriticNetwork`."""
+        return self._critic_alone(x)[0][0]
+
+
+class SmallQNetwork(QNetwork):
+    """The action values of a small network."""
+
+    def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
+        super().__init__(spec, device, seed=seed)
+        names = ("q.out", "q.value") if spec.dueling else ("q.out",)
+        trunks = Trunks([hidden_names(spec)], [(name, 0) for name in names])
+        self._small = SmallMLP(leaf_of(self.flat), self.fields, trunks, spec.activation == "relu")
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """See `QNetwork`."""
+        return self.action_values(*self._small(x))
+
+
+class SmallActorAndCritics(ActorAndCritics):
+    """A small actor and small critics, which have at least one hidden layer."""
+
+    def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
+        super().__init__(spec, device, seed=seed)
+        relu, acting = spec.activation == "relu", self.fields[: self.acting_fields]
+        actor, leaf = Trunks([hidden_names(spec)], [("actor.out", 0)]), leaf_of(self.actor)
+        self._sample = SmallMLP(leaf, acting, actor, relu, lambda *_: SquashedSample())
+        self._output = SmallMLP(leaf, acting, actor, relu)
+        leaf, fields = leaf_of(self.critics), self.fields[self.acting_fields :]
+
+        def critics(names: Sequence[str]) -> SmallMLP:
+            outputs = [(f"{name}.out", i) for i, name in enumerate(names)]
+            return SmallMLP(
+                leaf, fields, Trunks([hidden_names(spec, name) for name in names], outputs), relu, lambda *_: Values()
+            )
+
+        self._values = {count: critics(CRITICS[:count]) for count in range(1, len(CRITICS) + 1)}
+
+    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """See `ActorAndCritics`."""
+        action, log_prob = self._sample(x, noise)
+        return action, log_prob
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """See `ActorAndCritics`."""
+        return self._output(x)[0] if self.spec.head == "deterministic" else super().params(x, images)
+
+    def values(self, x: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
+        """See `ActorAndCritics`."""
+        return self._values[critics](torch.cat((x, action), -1), constant=constant)[0]
+
+
+def leaf_of(flat: Tensor) -> Tensor:
+    """The same memory, also that of the gradient, as a leaf of autograd's graph. `flat` itself is changed in place."""
+    leaf = flat.detach().requires_grad_()
+    leaf.grad = flat.grad
+    return leaf
