@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
@@ -47,15 +48,7 @@ class DQN(OffPolicy):
         if action.kind != "discrete":
             shape = list(action.shape)
             raise UsageError(f"dqn: expected an action space Discrete(n), got {action.kind}{shape}; take --algo ppo for it")
-        return PolicySpec(
-            observation,
-            action,
-            net=config.net,
-            activation=config.activation,
-            normalize_observations=config.normalize_observations,
-            head="q",
-            dueling=config.dueling,
-        )
+        return replace(OffPolicy.policy_spec(config, observation, action), head="q", dueling=config.dueling)
 
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)

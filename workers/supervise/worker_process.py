@@ -218,7 +218,9 @@ class WorkerProcess:
         with suppress(OSError):  # the log may have been deleted
             output = self._log.read_text(errors="replace") if self._log is not None else ""
         last = "".join(f" ({line})" for line in output.strip().splitlines()[-1:])
-        meanwhile = f" in {CALLS[page.doing]}" if page.doing in CALLS else " while it started" * (page.doing == "starting")
+        meanwhile = f" in {CALLS[page.doing]}" if page.doing in CALLS else ""
+        if page.doing == "starting":
+            meanwhile = " while it started"
         worked = page.env_calls > 0
         if self._because:
             stacks = self._page.stacks()

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms.algorithm import Start
@@ -62,14 +63,7 @@ class Continuous(Clones, OffPolicy):
             raise UsageError(f"{name}: expected no images, got {list(images[0].shape)}{where}; take --algo ppo for them")
         if config.encoder is not None:
             raise UsageError(f"{name}: expected no encoder, got {config.encoder}; take --algo ppo for it")
-        return PolicySpec(
-            observation,
-            action,
-            net=config.net,
-            activation=config.activation,
-            normalize_observations=config.normalize_observations,
-            **head,
-        )
+        return replace(OffPolicy.policy_spec(config, observation, action), **head)
 
     def __init__(
         self, config: ContinuousConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"

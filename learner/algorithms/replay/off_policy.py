@@ -51,7 +51,7 @@ class CriticLoss(NamedTuple):
     loss: Tensor
     """a tensor of no dimension"""
     error: Tensor
-    """[B] sizes of TD errors, of either sign, by which prioritized replay draws"""
+    """[B] TD errors, or their sizes: prioritized replay draws by the sizes"""
     numbers: Mapping[str, Tensor | float]
     """to log, by name"""
 
