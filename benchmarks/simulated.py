@@ -1,4 +1,4 @@
-"""Workers without environments: real sockets, real conversations (`workers.session`), one canned rollout for every ticket.
+"""Workers without environments: real sockets, the real `workers.conversation`, one canned rollout for every ticket.
 
 Many live in one process, so that a thousand fit on a machine. They answer as fast as they can.
 """
@@ -23,7 +23,7 @@ from protocol.messages import ToLearner
 from protocol.rollout import Rollout
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_worker, encode
-from workers.session import Effect, Identity, Leave, Send, Session, Task
+from workers.conversation.session import Effect, Identity, Leave, Send, Session, Task
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 STEPS, COPIES = 32, 8  # T, N: 9 KB

@@ -11,6 +11,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,20 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "run_folder": set[str](),
     "recording": {"run_folder", "rollouts", "policy_player"},
     "report": {"config", "run_folder"},
+}
+WORKERS = {  # the same for each folder and file of the workers; the files that are not named stand above all of these
+    "activity": set[str](),
+    "exit_codes": set[str](),
+    "slots": set[str](),
+    "watchdog": set[str](),
+    "conversation": {"exit_codes"},
+    "supervise": {"activity", "exit_codes", "slots", "watchdog"},
+    "env_copy": {"activity", "slots"},
+    "envs": {"env_copy"},
+    "copies": {"activity", "env_copy", "envs"},
+    "collect": {"activity", "conversation", "copies", "env_copy"},
+    "evaluate": {"activity", "collect", "copies"},
+    "step": {"activity", "copies"},
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}
@@ -151,16 +166,18 @@ def test_no_files_import_each_other_in_a_circle() -> None:
     assert not circles({source: files_imported(source, files) for source in files.values()})
 
 
-@pytest.mark.parametrize("folder", LEARNER)
-def test_a_folder_of_the_learner_imports_only_what_it_may(folder: str) -> None:
-    assert sources(f"learner/{folder}")
-    for source in sources(f"learner/{folder}"):
-        places = {name.split(".")[1] for name in modules_imported(source) if name.startswith("learner.")}
-        assert places <= LEARNER[folder] | {folder}, source
+@pytest.mark.parametrize(("package", "place"), [*product(["learner"], LEARNER), *product(["workers"], WORKERS)])
+def test_a_room_imports_only_what_it_may(package: str, place: str) -> None:
+    allowed = {"learner": LEARNER, "workers": WORKERS}[package][place] | {place}
+    files = sources(f"{package}/{place}") or [f"{package}/{place}.py"]
+    for source in files:
+        places = {name.split(".")[1] for name in modules_imported(source) if name.startswith(f"{package}.")}
+        assert places <= allowed, source
 
 
-def test_the_learner_has_no_room_without_a_rule() -> None:
-    assert {path.parent.name for path in (ROOT / "learner").glob("*/__init__.py")} == set(LEARNER)
+@pytest.mark.parametrize(("package", "rule"), [("learner", LEARNER), ("workers", WORKERS)])
+def test_no_room_is_without_a_rule(package: str, rule: Mapping[str, set[str]]) -> None:
+    assert {path.parent.name for path in (ROOT / package).glob("*/__init__.py")} <= set(rule)
 
 
 def test_torch_stays_with_the_learner() -> None:

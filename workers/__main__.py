@@ -21,10 +21,10 @@ from protocol.bounds import MAX_NAME, one_line
 from protocol.errors import UsageError, UserFacingError, check_at_least
 from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys.keys import Token
-from workers.connection_rules import REJOIN_TIMEOUT_S, checked_token
+from workers.conversation.connection_rules import REJOIN_TIMEOUT_S, checked_token
 from workers.supervise.learner_notice import AliveSender
+from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervisor import Supervisor, core_flags, timeout_flags
 
 log = logging.getLogger("millrace.worker")
 

@@ -21,8 +21,8 @@ from protocol.envs.vectorized import make_native, vector_alternative
 from protocol.errors import EnvironmentFailed, UsageError, first_line
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec
+from workers.activity import DESCRIBING, activity
 from workers.env_copy import close_copy, make_copy
-from workers.supervise.activity import DESCRIBING, activity
 
 
 @contextmanager

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 
 from protocol.envs.env_copy import EnvCopy, being_made
 from protocol.errors import UsageError
+from workers.activity import CLOSING, activity
 from workers.slots import slots
-from workers.supervise.activity import CLOSING, activity
 
 _slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
 Made = TypeVar("Made")

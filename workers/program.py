@@ -24,14 +24,14 @@ from protocol.errors import UserFacingError
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.worker_link import WorkerLink
-from workers.connection_rules import wait_limits_s
+from workers.activity import Activity, activity, share_activity
+from workers.conversation.connection_rules import wait_limits_s
+from workers.conversation.session import NO_LEARNER, Session
+from workers.exit_codes import EXIT_NO_LEARNER
 from workers.security import allowed_code
-from workers.session import NO_LEARNER, Session
 from workers.slots import share_slots
-from workers.supervise.activity import Activity, activity, share_activity
 from workers.supervise.process_group import kill, live_members
 from workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
-from workers.supervisor import EXIT_NO_LEARNER
 from workers.watchdog import Watchdog
 from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 

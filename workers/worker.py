@@ -31,12 +31,10 @@ from protocol.wire.codec import encode
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.weight_dtypes import to_float32
 from protocol.wire.worker_link import WorkerLink
+from workers.activity import MAKING, WAITING, activity
 from workers.collect.collector import Collector
-from workers.describe import describing
-from workers.env_errors import LaneFailed
-from workers.evaluate.evaluator import Evaluator
-from workers.heartbeat_thread import HeartbeatThread
-from workers.session import (
+from workers.conversation.heartbeat_thread import HeartbeatThread
+from workers.conversation.session import (
     CloseLanes,
     Effect,
     EvaluationTask,
@@ -48,11 +46,13 @@ from workers.session import (
     Statistics,
     Task,
 )
+from workers.conversation.states import State
+from workers.copies.env_errors import LaneFailed
+from workers.describe import describing
+from workers.evaluate.evaluator import Evaluator
+from workers.exit_codes import EXIT_UNSUITABLE
 from workers.slots import NoSlot, slots
-from workers.states import State
 from workers.step.stepper import Stepper
-from workers.supervise.activity import MAKING, WAITING, activity
-from workers.supervisor import EXIT_UNSUITABLE
 
 log = logging.getLogger("millrace.worker")
 

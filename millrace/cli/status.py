@@ -25,7 +25,7 @@ from protocol.keys.keys import Token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
-from workers.connection_rules import checked_token
+from workers.conversation.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {

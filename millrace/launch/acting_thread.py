@@ -17,12 +17,12 @@ from protocol.alive import WorkerExit
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import ImagesDtype, PolicySpec, RunSpec
 from workers.collect.collector import Collector
-from workers.collect.split_vector_env import SplitVectorEnv
-from workers.env_loop import Pulse
+from workers.copies.env_loop import Pulse
+from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.evaluator import Evaluator
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
-from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Supervisor
+from workers.supervise.supervisor import Supervisor
+from workers.worker_thread import WorkerThread
 
 NEVER_S = 1e9  # the timeout of an order that may take any time
 

@@ -14,9 +14,9 @@ from learner.members.endpoint import BindSettings
 from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
+from workers.supervise.supervisor import Running
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Running
+from workers.worker_thread import WorkerThread
 
 
 def _nothing_handed(name: str) -> InheritedDescriptors | None:

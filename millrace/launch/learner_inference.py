@@ -31,9 +31,9 @@ from millrace.launch.vector import listen
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.specs import DescribeSpec
-from workers.collect.split_vector_env import SplitVectorEnv
+from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
-from workers.supervisor import STOP_WITHIN_S
+from workers.supervise.supervisor import STOP_WITHIN_S
 
 
 def train(

@@ -32,7 +32,7 @@ from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
 from workers.slots import LIMIT_VARIABLE, copies_per_machine
-from workers.supervisor import STOP_WITHIN_S, Supervisor
+from workers.supervise.supervisor import STOP_WITHIN_S, Supervisor
 
 log = logging.getLogger("millrace.learner")
 

@@ -21,7 +21,7 @@ from learner.run_folder.regular_files import open_regular, reason, subfolder
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
-from workers.supervisor import Supervisor, core_flags, timeout_flags
+from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
 
 LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing

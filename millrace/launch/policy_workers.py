@@ -24,9 +24,9 @@ from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import WorkerFlags
 from millrace.launch.vector import listen
-from workers.collect.split_vector_env import SplitVectorEnv
+from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
-from workers.supervisor import Supervisor
+from workers.supervise.supervisor import Supervisor
 
 
 @dataclass(frozen=True)

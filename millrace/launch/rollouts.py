@@ -25,7 +25,7 @@ from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.specs import DescribeSpec, RunSpec
-from workers.supervisor import Supervisor, core_flags, timeout_flags
+from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
 
 
 @dataclass(frozen=True)

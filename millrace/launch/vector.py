@@ -35,7 +35,7 @@ from protocol.envs.wrappers import WrapperLike
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
-from workers.supervisor import Supervisor, timeout_flags
+from workers.supervise.supervisor import Supervisor, timeout_flags
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join

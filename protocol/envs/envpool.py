@@ -2,7 +2,7 @@
 
 Rule: an id means the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and gymnasium's
 time limit applies. This file maps ids to envpool tasks and makes the env copies; the row format is kept by
-`workers/collect/envpool_copies.py`.
+`workers/copies/envpool_copies.py`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class EnvpoolSpec(NamedTuple):
     options: dict[str, Any]
     """keyword arguments of `envpool.make`"""
     limit: int
-    """steps after which `workers.collect.envpool_copies` truncates an episode; envpool itself does not"""
+    """steps after which `workers.copies.envpool_copies` truncates an episode; envpool itself does not"""
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     """Observation and action space of one copy."""

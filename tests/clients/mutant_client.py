@@ -41,7 +41,7 @@ from protocol.messages import (
 from protocol.specs import StepSpec
 from protocol.wire.codec import Buffer, decode_to_learner, encode
 from protocol.wire.worker_link import WorkerLink
-from workers.session import Session
+from workers.conversation.session import Session
 from workers.worker import Worker, WorkerOptions, identity
 
 replace = msgspec.structs.replace

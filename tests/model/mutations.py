@@ -31,8 +31,8 @@ COORDINATOR = "learner.rollouts.ticket_coordinator"
 LANES = "learner.rollouts.lanes"
 MEMBERSHIP = "learner.members.membership"
 PLACEMENT = "learner.members.lane_placement"
-SESSION = "workers.session"
-HELD = "workers.collect.held_rollouts"
+SESSION = "workers.conversation.session"
+HELD = "workers.conversation.held_rollouts"
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from tests.model.search import Search, explore
 from tests.model.settings import Settings
 from tests.model.training import Training
 from tests.model.world import World
-from workers.collect.held_rollouts import HeldRollouts, _HeldLane
-from workers.session import Identity, Session, _SessionState
+from workers.conversation.held_rollouts import HeldRollouts, _HeldLane
+from workers.conversation.session import Identity, Session, _SessionState
 
 SMALL = Training(workers=2, lanes=1, updates=1, faults=1)
 

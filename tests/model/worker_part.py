@@ -14,9 +14,9 @@ from tests.model.message_content import incarnation, rollout_content, rollout_of
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_rollouts
-from workers.collect.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
-from workers.session import Effect, Identity, Leave, Send, Session, Task, _SessionState
-from workers.states import State
+from workers.conversation.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
+from workers.conversation.session import Effect, Identity, Leave, Send, Session, Task, _SessionState
+from workers.conversation.states import State
 
 SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "_due_s", "_current"},

@@ -17,7 +17,7 @@ from protocol.rollout import Rollout
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
 from workers.collect.collector import OpenEnvCopies
-from workers.collect.env_copies import VectorCopies
+from workers.copies.env_copies import VectorCopies
 from workers.envs.toy import Scripted
 
 SCRIPTED = run_of(f"{TOY}Scripted-v0")

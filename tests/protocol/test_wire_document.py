@@ -28,8 +28,7 @@ from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from protocol.wire import codec, socket_options
 from protocol.wire import compression as packing
-from workers import session, states
-from workers.collect import held_rollouts
+from workers.conversation import held_rollouts, session, states
 
 DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"

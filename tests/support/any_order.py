@@ -25,7 +25,7 @@ from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_
 from protocol.wire.wake_up import WakePipe
 from tests.support.described import described
 from tests.support.fake_link import FakeLink
-from workers.env_errors import LaneFailed
+from workers.copies.env_errors import LaneFailed
 from workers.step.stepper import Stepper
 
 Choose = Callable[[int], int]

@@ -18,7 +18,7 @@ from tests.support.fake_ends import fake_rollout
 from tests.support.hostile_messages import hostile, real
 from tests.system.processes import START_S, Learner, Stage, free_port
 from tests.system.runs import accounted
-from workers.collect.env_copies import copy_seeds
+from workers.copies.env_copies import copy_seeds
 
 MESSAGES, STRANGERS = 100_000, 5
 GROWTH_MB = 20  # growth in the second half: by then the heap has the memory for messages that wait to be read

@@ -23,9 +23,9 @@ from protocol.specs import PolicySpec, RunSpec
 from tests.support.collectors import collect, no_pulse, random_collector, random_policy
 from tests.support.mask_envs import SIZES, InInfo, InObservation, Parts
 from workers.collect.collector import Collector, OpenEnvCopies
-from workers.collect.env_copies import VectorCopies
-from workers.collect.split_vector_env import SplitVectorEnv
-from workers.env_errors import LaneFailed
+from workers.copies.env_copies import VectorCopies
+from workers.copies.env_errors import LaneFailed
+from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.evaluator import EvaluationFailed, Evaluator
 
 ENVS: dict[str, Any] = {"InInfo": InInfo, "Parts": Parts, "InObservation": InObservation}

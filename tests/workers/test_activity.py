@@ -9,10 +9,10 @@ import gymnasium
 import pytest
 
 from protocol.alive import CallTimeouts
-from workers.env_errors import CopyRaised
-from workers.env_loop import EnvLoop
+from workers.activity import DOING, ENV_CALLS, SINCE_S, Activity, ActivityReader, activity, share_activity
+from workers.copies.env_errors import CopyRaised
+from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
-from workers.supervise.activity import DOING, ENV_CALLS, SINCE_S, Activity, ActivityReader, activity, share_activity
 
 
 class Watched(Countdown):

@@ -19,8 +19,8 @@ from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import bits, collect, no_pulse, random_collector
 from tests.support.described import run_spec
-from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
-from workers.collect.envpool_copies import EnvpoolCopies
+from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
+from workers.copies.envpool_copies import EnvpoolCopies
 from workers.envs import atari
 
 envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")

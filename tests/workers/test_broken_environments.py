@@ -26,8 +26,8 @@ from tests.support.collectors import (
     sync_vector_env_over,
     with_env,
 )
-from workers.collect.env_copies import LoopedCopies, VectorCopies
-from workers.env_errors import LaneFailed
+from workers.copies.env_copies import LoopedCopies, VectorCopies
+from workers.copies.env_errors import LaneFailed
 from workers.envs.toy import Countdown
 
 

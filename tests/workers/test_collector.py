@@ -32,8 +32,8 @@ from tests.support.collectors import (
 )
 from tests.support.rounding import assert_within, log_prob_variance, tolerance_of
 from workers.collect.collector import Collector
-from workers.collect.env_copies import copy_seeds
-from workers.collect.held_rollouts import Assignment
+from workers.conversation.held_rollouts import Assignment
+from workers.copies.env_copies import copy_seeds
 from workers.envs.toy import Countdown, Scripted
 
 # ------------------------------------------------------------------------------------------------ the same bits
@@ -302,7 +302,7 @@ def test_a_lane_released_while_its_copies_are_made_is_closed_after_the_collectio
 
 
 def test_the_pulse_is_called_between_slow_copies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # any step is a slow one
+    monkeypatch.setattr("workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
     random_collector(run).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))

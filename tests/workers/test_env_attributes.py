@@ -11,8 +11,8 @@ from gymnasium.vector import SyncVectorEnv
 from protocol.wire.plain_values import pack
 from tests.support.collectors import collect, no_pulse, random_collector, run_of
 from tests.support.fact_envs import Facts
-from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
-from workers.env_errors import CopyRaised, LaneFailed, Unusable
+from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from workers.copies.env_errors import CopyRaised, LaneFailed, Unusable
 
 FACTS = "tests.support.fact_envs:Facts-v0"
 

@@ -21,8 +21,8 @@ from protocol.policy.policy import Policy
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.collectors import no_pulse, random_policy, run_of
 from workers.collect.collector import Collector
-from workers.collect.held_rollouts import Assignment
-from workers.env_errors import LaneFailed
+from workers.conversation.held_rollouts import Assignment
+from workers.copies.env_errors import LaneFailed
 from workers.evaluate import episode_rows
 from workers.evaluate.evaluator import EvaluationFailed, Evaluator
 

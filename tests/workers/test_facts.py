@@ -24,11 +24,11 @@ from tests.support.collectors import (
 )
 from tests.support.fact_envs import Facts
 from workers.collect.collector import Collector
-from workers.collect.env_copies import VectorCopies
-from workers.collect.envpool_copies import EnvpoolCopies
-from workers.collect.facts import facts_of_copies, facts_of_info
-from workers.collect.split_vector_env import SplitVectorEnv
-from workers.env_errors import LaneFailed, Unusable
+from workers.copies.env_copies import VectorCopies
+from workers.copies.env_errors import LaneFailed, Unusable
+from workers.copies.envpool_copies import EnvpoolCopies
+from workers.copies.facts import facts_of_copies, facts_of_info
+from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.evaluator import EvaluationFailed, Evaluator
 
 NAMES = ("is_success", "distance", "speed")

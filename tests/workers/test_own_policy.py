@@ -21,7 +21,7 @@ from protocol.specs import RunSpec
 from tests.support.collectors import bits, collect, no_pulse, run_around, run_of
 from tests.support.own_policies import ARRAYS, EXTRAS, Broken, Linear
 from workers.collect.collector import Collector
-from workers.collect.env_copies import LoopedCopies
+from workers.copies.env_copies import LoopedCopies
 from workers.evaluate.evaluator import Evaluator
 
 HERE = "tests.support.own_policies:"

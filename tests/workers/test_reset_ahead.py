@@ -14,7 +14,7 @@ from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import pack
 from tests.support.collectors import no_pulse
-from workers.collect.env_copies import LoopedCopies
+from workers.copies.env_copies import LoopedCopies
 from workers.envs.reset_ahead import ResetAhead
 
 DEADLINE_S = 20.0

@@ -39,9 +39,9 @@ from protocol.messages import (
 )
 from protocol.specs import StepSpec
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollouts, run_spec
-from workers.collect.held_rollouts import REMEMBERED_TICKETS
-from workers.connection_rules import wait_limits_s
-from workers.session import (
+from workers.conversation.connection_rules import wait_limits_s
+from workers.conversation.held_rollouts import REMEMBERED_TICKETS
+from workers.conversation.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
     NO_LEARNER,
@@ -55,8 +55,8 @@ from workers.session import (
     Statistics,
     Task,
 )
-from workers.states import TABLE, State
-from workers.supervisor import EXIT_UNSUITABLE
+from workers.conversation.states import TABLE, State
+from workers.exit_codes import EXIT_UNSUITABLE
 
 M = TypeVar("M")
 

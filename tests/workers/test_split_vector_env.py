@@ -18,8 +18,8 @@ from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
 from workers.collect.collector import Collector
-from workers.collect.held_rollouts import Assignment
-from workers.collect.split_vector_env import SplitVectorEnv
+from workers.conversation.held_rollouts import Assignment
+from workers.copies.split_vector_env import SplitVectorEnv
 
 LANES = 3
 RUNS = {

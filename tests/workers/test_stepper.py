@@ -20,8 +20,8 @@ from protocol.messages import Call, Reset, Returned, Step, Stepped
 from protocol.wire.plain_values import pack, unpack
 from tests.support.bit_equality import bit_equal
 from tests.support.described import step_spec
-from workers.env_errors import LaneFailed
-from workers.env_loop import EnvLoop
+from workers.copies.env_errors import LaneFailed
+from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
 from workers.step.stepper import Stepper
 
@@ -229,7 +229,7 @@ class OnlyWhileOpen(Countdown):
 
 
 def test_a_lane_that_is_released_during_a_step_is_closed_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # a pulse after each copy
+    monkeypatch.setattr("workers.copies.env_loop.PULSE_S", -1.0)  # a pulse after each copy
     stepper, envs = Stepper(step_spec(VectorEnvSettings(OnlyWhileOpen, 2, lanes=1))), list[OnlyWhileOpen]()
     stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)
     envs += [cast(OnlyWhileOpen, env.unwrapped) for env in stepper._lanes[0]._loop.envs]

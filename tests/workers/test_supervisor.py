@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 import pytest
 
 from protocol.alive import CallTimeouts, Doing, WorkerActivity, WorkerExit
+from workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
 from workers.supervise.ending import Ending
-from workers.supervisor import (
+from workers.supervise.supervisor import (
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
     ENFORCE_EVERY_S,
-    EXIT_NO_LEARNER,
-    EXIT_UNSUITABLE,
     HANGS_AFTER_S,
     HEALTHY_S,
     LEAVE_WITHIN_S,
@@ -271,7 +270,7 @@ def test_every_request_to_stop_is_passed_on_and_a_worker_that_does_not_leave_is_
         if "wait" in worker.requests:
             worker.end = Ending(-9, "was killed")
 
-    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
+    monkeypatch.setattr("workers.supervise.supervisor.time.sleep", sleeps)
     assert machine.host.run(lambda: requests, lambda line: None) == 1
     assert worker.requests == ["stop", "stop", "stop", "wait"]
     assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)
@@ -308,7 +307,7 @@ def test_of_those_that_stay_only_what_hangs_from_before_the_end_of_a_run_is_kill
             if worker.requests and worker.end is None:
                 worker.end = Ending(-9 if worker is hangs else 0, "ended", on_purpose=worker is not hangs)
 
-    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
+    monkeypatch.setattr("workers.supervise.supervisor.time.sleep", sleeps)
     assert machine.host.run(lambda: int(machine.now > stop_at_s), lambda line: None, notice) == 0
     assert hangs.requests == ["kill"]
     assert [(name, worker.requests) for name, worker in machine.started[2:]] == [("w1", ["stop"]), ("w0", ["stop"])]
@@ -327,7 +326,7 @@ def test_a_worker_that_hangs_when_it_should_leave_is_killed_soon(monkeypatch: py
         if worker.requests[-1:] in (["kill"], ["wait"]):
             worker.end = Ending(-9, "was killed")
 
-    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
+    monkeypatch.setattr("workers.supervise.supervisor.time.sleep", sleeps)
     stop_requests = lambda: int(cause == "told to leave" and machine.now > 1)  # noqa: E731
     assert machine.host.run(stop_requests, lambda line: None, notice) == 1
     assert machine.now == pytest.approx(1 + HANGS_AFTER_S, abs=5 * POLL_S)

@@ -38,12 +38,12 @@ from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from tests.support.collectors import TOY, bits, collect, random_collector, run_of
 from workers import slots as slot_file
+from workers.activity import ActivityReader, activity
 from workers.collect.collector import Collector
+from workers.conversation.session import Leave, Session
 from workers.evaluate.evaluator import Evaluator
-from workers.session import Leave, Session
+from workers.exit_codes import EXIT_UNSUITABLE
 from workers.slots import Slots
-from workers.supervise.activity import ActivityReader, activity
-from workers.supervisor import EXIT_UNSUITABLE
 from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_collector
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)

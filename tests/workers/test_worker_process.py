@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 
 from workers import program
+from workers.activity import ENV_CALLS, ActivityReader
 from workers.supervise import worker_process
-from workers.supervise.activity import ENV_CALLS, ActivityReader
 from workers.supervise.ending import Ending
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 

@@ -21,11 +21,11 @@ from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode, describe_first_non_finite, not_of_space
 from protocol.specs import Leaf, RunSpec
 from protocol.wire.plain_values import pack, unpack
-from workers.collect.env_copies import EnvCopies, Leaves, copy_seeds
-from workers.collect.facts import Facts
-from workers.env_errors import CopyRaised, LaneFailed, lane_failed
-from workers.env_loop import Pulse
-from workers.env_results import leaf_writers
+from workers.copies.env_copies import EnvCopies, Leaves, copy_seeds
+from workers.copies.env_errors import CopyRaised, LaneFailed, lane_failed
+from workers.copies.env_loop import Pulse
+from workers.copies.env_results import leaf_writers
+from workers.copies.facts import Facts
 
 
 class CollectedLane:

@@ -26,16 +26,16 @@ from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
+from workers.activity import MAKING, activity
 from workers.collect.acting import RolloutActions, acting_of
 from workers.collect.collected_lane import CollectedLane
-from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
-from workers.collect.envpool_copies import EnvpoolCopies
-from workers.collect.held_rollouts import Assignment
+from workers.conversation.held_rollouts import Assignment
+from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from workers.copies.env_errors import CopyRaised, LaneFailed, lane_failed
+from workers.copies.env_loop import Pulse
+from workers.copies.env_results import write_numbers
+from workers.copies.envpool_copies import EnvpoolCopies
 from workers.env_copy import make_copy
-from workers.env_errors import CopyRaised, LaneFailed, lane_failed
-from workers.env_loop import Pulse
-from workers.env_results import write_numbers
-from workers.supervise.activity import MAKING, activity
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""

@@ -19,13 +19,13 @@ from protocol.envs.action_masks import without_mask
 from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import make_flatten
 from protocol.errors import UsageError
-from workers.collect.env_copies import made_without_order_check
-from workers.collect.facts import facts_of_info
-from workers.collect.mask_reader import MaskReader
-from workers.env_errors import CopyRaised, Unusable
-from workers.env_loop import PULSE_S, EnvLoop, Pulse
-from workers.env_results import missing_leaf
-from workers.supervise.activity import EVALUATING, activity
+from workers.activity import EVALUATING, activity
+from workers.copies.env_copies import made_without_order_check
+from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_loop import PULSE_S, EnvLoop, Pulse
+from workers.copies.env_results import missing_leaf
+from workers.copies.facts import facts_of_info
+from workers.copies.mask_reader import MaskReader
 
 
 class CopyStep(NamedTuple):

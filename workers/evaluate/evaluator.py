@@ -28,9 +28,9 @@ from protocol.random_streams import Purpose, generator
 from protocol.rollout import LARGEST_REWARD, Episode, outside_of_space
 from protocol.specs import RunSpec
 from workers.collect.acting import acting_of
-from workers.env_errors import CopyRaised, Unusable
-from workers.env_loop import Pulse
-from workers.env_results import leaf_writers, one_number
+from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_loop import Pulse
+from workers.copies.env_results import leaf_writers, one_number
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
 from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, LoopedEvaluationCopies
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Array
-from workers.collect.split_vector_env import SplitVectorEnv
-from workers.env_loop import Pulse
+from workers.copies.env_loop import Pulse
+from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.evaluation_copies import CopiesLost, CopyStep
 
 

@@ -1,4 +1,4 @@
-"""The env copies of one lane of a vector environment, in any of the autoreset modes of `workers/env_loop.py`.
+"""The env copies of one lane of a vector environment, in any of the autoreset modes of `workers/copies/env_loop.py`.
 
 Rule: observations, rewards, flags and infos are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` over the same
 copies.
@@ -21,9 +21,9 @@ from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unfla
 from protocol.errors import UsageError
 from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
-from workers.env_errors import Unusable
-from workers.env_loop import EnvLoop, Infos, Pulse
-from workers.env_results import leaf_writers, read_leaves, write_numbers
+from workers.copies.env_errors import Unusable
+from workers.copies.env_loop import EnvLoop, Infos, Pulse
+from workers.copies.env_results import leaf_writers, read_leaves, write_numbers
 
 
 class Rows(NamedTuple):

@@ -24,10 +24,10 @@ from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack, unpack
 from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
 from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
-from workers.env_errors import CopyRaised, lane_failed
-from workers.env_loop import Infos, Pulse
+from workers.activity import STEPPING, activity
+from workers.copies.env_errors import CopyRaised, lane_failed
+from workers.copies.env_loop import Infos, Pulse
 from workers.step.stepped_lane import Rows, SteppedLane, new_rows
-from workers.supervise.activity import STEPPING, activity
 
 
 class Stepper:

@@ -1,1 +1,1 @@
-"""Supervision of workers: what they do, as their supervisor sees it, and what it tells the learner."""
+"""The supervisor of the workers of one machine: it starts them, watches them, and tells the learner what they do."""

@@ -24,8 +24,8 @@ from protocol.alive import CALLS, NO_ENVIRONMENT_CODE, CallTimeouts, WorkerActiv
 from protocol.bounds import one_line
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
+from workers.activity import STACK_SIGNAL, ActivityReader
 from workers.slots import free_all, open_slots, touch
-from workers.supervise.activity import STACK_SIGNAL, ActivityReader
 from workers.supervise.ending import Ending
 from workers.supervise.process_group import kill, live_members, process_stat
 from workers.watchdog import deepest_frame, where_it_hung

@@ -17,7 +17,7 @@ from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder
 from protocol.keys.keys import ClientList, Key, Token
 from protocol.specs import StepSpec
-from workers.connection_rules import checked_token
+from workers.conversation.connection_rules import checked_token
 from workers.security import allowed_code
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)

@@ -39,7 +39,7 @@ from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.fake_link import FakeLink
-from workers.env_errors import CopyRaised, LaneFailed, Unusable, lane_failed
+from workers.copies.env_errors import CopyRaised, LaneFailed, Unusable, lane_failed
 
 
 class Noisy:

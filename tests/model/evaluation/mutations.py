@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
 TICKETS = "learner.rollouts.evaluation_tickets"
-HELD = "workers.evaluate.held_evaluations"
+HELD = "workers.conversation.held_evaluations"
 
 OF_THE_LEARNER = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),

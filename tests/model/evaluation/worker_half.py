@@ -15,7 +15,7 @@ from tests.model.conversation import Content
 from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
 from tests.model.worker_part import Worker
 from tests.support.fake_ends import fake_evaluated, fake_rows
-from workers.session import Effect, EvaluationTask, Send
+from workers.conversation.session import Effect, EvaluationTask, Send
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating

@@ -38,7 +38,7 @@ from learner.rollouts.ledger import Ledger
 from protocol.messages import Alive, Hello, Rollout
 from tests.model.traces.record import SUFFIX, Record, Said, SaidRollout, SaidWeights, read
 from tests.model.traces.replay import NotAccepted, Replay
-from workers.session import Session
+from workers.conversation.session import Session
 
 OLD_CONNECTION = b"\0"  # the routing ids of workers begin with their name
 

@@ -19,7 +19,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from protocol.arrays import Array
 from protocol.messages import Rollout, ToLearner, ToWorker, Weights
 from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
-from workers.session import CloseLanes, EvaluationTask, Leave, Send, StartSession, Task
+from workers.conversation.session import CloseLanes, EvaluationTask, Leave, Send, StartSession, Task
 
 SUFFIX = ".trace"
 KEPT_WEIGHTS = 64  # digests of weights: the learner of a soak must not grow by them

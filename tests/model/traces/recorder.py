@@ -22,7 +22,7 @@ from typing import Any
 FOLDER = "MILLRACE_TRACE"
 COORDINATOR = "learner.rollouts.ticket_coordinator"
 DESCRIBE = "learner.members.describe_coordinator"
-SESSION = "workers.session"
+SESSION = "workers.conversation.session"
 COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent")
 METHODS = {
     "TicketCoordinator": (

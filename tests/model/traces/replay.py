@@ -17,7 +17,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from tests.model import learner_part
 from tests.model.traces.record import Digests, Record, SaidMember, message_of
-from workers.session import Session
+from workers.conversation.session import Session
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 COORDINATOR = "learner.vector_env.order_coordinator"
 HUB = "learner.vector_env.step_hub"
 LOST = "learner.vector_env.lost_lanes"
-HELD = "workers.step.held_orders"
+HELD = "workers.conversation.held_orders"
 
 OF_THE_LEARNER = {
     "a lost order is not sent again": Mutation(COORDINATOR, "out.append((member.peer, self.orders[ticket]))", "pass"),

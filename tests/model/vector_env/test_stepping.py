@@ -16,7 +16,7 @@ from tests.model.search import explore
 from tests.model.vector_env import learner_half, worker_half
 from tests.model.vector_env.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
 from tests.model.vector_env.stepping import Stepping
-from workers.step.held_orders import HeldOrders, _HeldLane
+from workers.conversation.held_orders import HeldOrders, _HeldLane
 
 LIST = "tests.model.vector_env.mutations"
 SMALL = [

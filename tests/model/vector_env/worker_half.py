@@ -25,9 +25,9 @@ from tests.model.vector_env.order_content import (
     order_of,
 )
 from tests.model.worker_part import PAUSE_S
-from workers.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession
-from workers.states import State
-from workers.step.held_orders import _HeldLane
+from workers.conversation.held_orders import _HeldLane
+from workers.conversation.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession
+from workers.conversation.states import State
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping

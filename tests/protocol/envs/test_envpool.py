@@ -22,8 +22,8 @@ from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from tests.support.described import run_spec
-from workers.collect.env_copies import LoopedCopies, StepResult, copy_seeds
-from workers.collect.envpool_copies import EnvpoolCopies
+from workers.copies.env_copies import LoopedCopies, StepResult, copy_seeds
+from workers.copies.envpool_copies import EnvpoolCopies
 from workers.envs.toy import Countdown
 
 here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")

@@ -20,7 +20,7 @@ from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from tests.support.described import run_spec
-from workers.collect.env_copies import LoopedCopies, VectorCopies, copy_seeds
+from workers.copies.env_copies import LoopedCopies, VectorCopies, copy_seeds
 from workers.envs.toy import Countdown
 
 SHORT = {"max_episode_steps": 7}  # CartPole cannot fall so soon: every episode ends by the clock

@@ -14,7 +14,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.bounds import one_line
-from workers.env_errors import Unusable
+from workers.copies.env_errors import Unusable
 
 Facts = Mapping[int, tuple[float, ...]]
 """By env copy: the facts of the episode that ended in this step."""

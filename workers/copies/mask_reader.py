@@ -18,7 +18,7 @@ from protocol.bounds import one_line
 from protocol.envs.action_masks import has_mask
 from protocol.envs.spaces import action_spec
 from protocol.policy.masks import MASK, choices, no_choice
-from workers.env_errors import Unusable
+from workers.copies.env_errors import Unusable
 
 DTYPES = ("bool", "int8", "uint8", "int64", "int32")
 _NONE: Mapping[str, Any] = {}

@@ -19,9 +19,7 @@ import numpy as np
 
 from protocol.envs.env_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
-from workers.env_copy import close_copy, make_copy
-from workers.env_errors import CopyRaised
-from workers.supervise.activity import (
+from workers.activity import (
     DOING,
     ENV_CALLS,
     MAKING,
@@ -31,6 +29,8 @@ from workers.supervise.activity import (
     WAITING,
     activity,
 )
+from workers.copies.env_errors import CopyRaised
+from workers.env_copy import close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 Infos = list[tuple[int, dict[str, Any]]]

@@ -16,12 +16,12 @@ from gymnasium.vector import VectorEnv
 from protocol.arrays import Array
 from protocol.envs.envpool import EnvpoolSpec
 from protocol.envs.spaces import make_flatten
-from workers.collect.env_copies import Leaves, StepResult
-from workers.collect.facts import facts_of_copies, of_ended
+from workers.activity import RESETTING, STEPPING, activity
+from workers.copies.env_copies import Leaves, StepResult
+from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_loop import Pulse
+from workers.copies.facts import facts_of_copies, of_ended
 from workers.env_copy import close_copy, give_back
-from workers.env_errors import CopyRaised, Unusable
-from workers.env_loop import Pulse
-from workers.supervise.activity import RESETTING, STEPPING, activity
 
 
 class EnvpoolCopies:

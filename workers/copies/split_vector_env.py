@@ -19,11 +19,11 @@ from protocol.envs.spaces import make_flatten
 from protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
 from protocol.specs import RunSpec
 from protocol.wire.plain_values import unpack
-from workers.collect.env_copies import EnvCopies, Leaves, StepResult
-from workers.collect.facts import Facts, facts_of_copies, of_ended
-from workers.collect.mask_reader import MaskReader
-from workers.env_errors import CopyRaised, Unusable, lane_failed
-from workers.env_loop import Pulse
+from workers.copies.env_copies import EnvCopies, Leaves, StepResult
+from workers.copies.env_errors import CopyRaised, Unusable, lane_failed
+from workers.copies.env_loop import Pulse
+from workers.copies.facts import Facts, facts_of_copies, of_ended
+from workers.copies.mask_reader import MaskReader
 
 METHODS = ("close", "render", "reset", "step")  # of every environment
 Result = TypeVar("Result")

@@ -13,8 +13,8 @@ from protocol.alive import CallTimeouts, WorkerActivity
 from protocol.bounds import one_line
 from protocol.env_spec import AllowedCode
 from protocol.wire.worker_link import WorkerLink
-from workers.session import Leave, Session
-from workers.supervise.activity import Activity, ActivityReader, share_activity
+from workers.activity import Activity, ActivityReader, share_activity
+from workers.conversation.session import Leave, Session
 from workers.supervise.ending import Ending
 from workers.worker import MakeCollector, Worker, WorkerOptions, identity, make_local_collector
 

@@ -25,21 +25,21 @@ from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import unpack
-from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
-from workers.collect.mask_reader import MaskReader
+from workers.activity import RESETTING, STEPPING, activity
+from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_loop import EnvLoop, Infos, Pulse
+from workers.copies.env_results import missing_leaf, read_leaves
+from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
+from workers.copies.mask_reader import MaskReader
 from workers.env_copy import close_copy
-from workers.env_errors import CopyRaised, Unusable
-from workers.env_loop import EnvLoop, Infos, Pulse
-from workers.env_results import missing_leaf, read_leaves
 from workers.envs.reset_ahead import ResetAhead
-from workers.supervise.activity import RESETTING, STEPPING, activity
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]
 
 
 class StepResult(NamedTuple):
-    """Result of one step of N copies; `workers/env_results.py` writes each part into an array [N, …]."""
+    """Result of one step of N copies; `workers/copies/env_results.py` writes each part into an array [N, …]."""
 
     leaves: Leaves
     reward: Any

@@ -2,7 +2,7 @@
 
 Rule: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
 because the next Heartbeat lists all tickets that this worker holds, and the learner sends again what is missing. What a
-worker holds is in `collect/held_rollouts.py`, `evaluate/held_evaluations.py` and `step/held_orders.py`.
+worker holds is in the files beside this one that begin with `held_`.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from protocol.messages import (
 )
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from workers.collect.held_rollouts import Assignment, HeldRollouts
-from workers.connection_rules import REJOIN_TIMEOUT_S
-from workers.evaluate.held_evaluations import HeldEvaluations
-from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
-from workers.step.held_orders import HeldOrders
-from workers.supervisor import EXIT_UNSUITABLE
+from workers.conversation.connection_rules import REJOIN_TIMEOUT_S
+from workers.conversation.held_evaluations import HeldEvaluations
+from workers.conversation.held_orders import HeldOrders
+from workers.conversation.held_rollouts import Assignment, HeldRollouts
+from workers.conversation.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
+from workers.exit_codes import EXIT_UNSUITABLE
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
 NO_LEARNER = "no learner answered"

@@ -20,6 +20,7 @@ from typing import Protocol
 
 from protocol.alive import NO_TIMEOUTS, CallTimeouts, WorkerActivity, WorkerExit
 from protocol.errors import UsageError
+from workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
 from workers.supervise.ending import Ending
 
 log = logging.getLogger("millrace.worker")
@@ -30,9 +31,6 @@ ENFORCE_EVERY_S = 0.2
 STOP_WITHIN_S = 3.0  # at the end of a local run, after the workers were asked to leave
 LEAVE_WITHIN_S = 30.0  # after the request to leave, as long as calls of the environment return: a rollout may take long
 HANGS_AFTER_S = 8.0  # after the request to leave, or the end of the run: how long one call of the environment may take
-EXIT_REFUSED = 2
-# As in sysexits: no learner answered; this worker cannot take part in the run. Others than the supervisor get 1, and 2.
-EXIT_NO_LEARNER, EXIT_UNSUITABLE = 69, 65
 
 
 class Running(Protocol):

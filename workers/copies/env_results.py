@@ -18,7 +18,7 @@ import numpy as np
 from protocol.arrays import Array
 from protocol.bounds import one_line
 from protocol.specs import Leaf
-from workers.env_errors import Unusable
+from workers.copies.env_errors import Unusable
 
 Numbers = tuple[Any, Any, Any]
 """Reward, terminated and truncated of N copies: each an array or a sequence."""

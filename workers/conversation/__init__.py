@@ -1,0 +1,1 @@
+"""The worker's half of the conversation: what it answers, what it holds, and when it leaves. Imports no environment code."""
