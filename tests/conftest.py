@@ -27,6 +27,7 @@ import psutil
 import pytest
 
 from tests.support import preloaded
+from workers import env_copy, slots
 from workers.slots import FILE_VARIABLE
 from workers.supervise import worker_process
 
@@ -94,8 +95,13 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
+    monkeypatch.setattr(slots, "_of_processes", {})  # copies that a test does not close hold no slots of another test
+    monkeypatch.setattr(env_copy, "_slots", {})
+    env_copy._of_process.cache_clear()
     threads = set(threading.enumerate())
     yield
+    if (own := slots._of_processes.get(os.getpid())) is not None:
+        os.close(own.fd)
     deadline = time.monotonic() + LEAVE_WITHIN_S
     if _has_children(os.getpid()):  # psutil reads all of /proc
         children = [child for child in psutil.Process().children(recursive=True) if _runs(child)]

@@ -52,7 +52,7 @@ class Slots:
         `most`: how many slots the machine has; 0: no limit.
         """
         self.most = most
-        self.fd, self.pid = open_slots() if fd is None else fd, os.getpid()
+        self.fd = open_slots() if fd is None else fd
         self._taken: set[int] = set()
         self._lock = threading.Lock()
 
@@ -95,22 +95,23 @@ class Slots:
             _lock(self.fd, fcntl.F_UNLCK, slot, 1)
 
 
-_of_process: Slots | None = None
+_of_processes: dict[int, Slots] = {}
+"""By process: a fork needs its own, because it shares the open file, and so the locks."""
 
 
 def slots() -> Slots:
     """The slots of this process."""
-    global _of_process
-    if _of_process is None or _of_process.pid != os.getpid():  # a fork shares the open file, and so the locks
-        _of_process = Slots(most=copies_per_machine())
-    return _of_process
+    if (own := _of_processes.get(os.getpid())) is None:
+        opened = Slots(most=copies_per_machine())
+        if (own := _of_processes.setdefault(os.getpid(), opened)) is not opened:  # another thread was first
+            os.close(opened.fd)
+    return own
 
 
 def share_slots(fd: int) -> None:
     """Hold the slots of this process, a worker, together with its supervisor, which has opened the file."""
-    global _of_process
     os.set_inheritable(fd, False)
-    _of_process = Slots(fd, copies_per_machine())
+    _of_processes[os.getpid()] = Slots(fd, copies_per_machine())
 
 
 def copies_per_machine() -> int:

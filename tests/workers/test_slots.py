@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
@@ -80,6 +81,20 @@ def test_threads_never_share_a_slot() -> None:
     own = Slots()
     with ThreadPoolExecutor(8) as threads:
         assert sorted(threads.map(lambda _: own.take(), range(400))) == list(range(400))
+
+
+def test_threads_that_ask_at_the_same_time_get_the_same_slots(monkeypatch: pytest.MonkeyPatch) -> None:
+    both_open = Barrier(2, timeout=10.0)
+
+    def opened() -> int:
+        both_open.wait()
+        return open_slots()
+
+    monkeypatch.setattr(module, "open_slots", opened)
+    with ThreadPoolExecutor(2) as threads:
+        first, second = threads.map(lambda _: slots(), range(2))
+    assert first is second
+    first.give_back(first.take())
 
 
 def test_a_process_and_its_fork_never_share_a_slot() -> None:
@@ -172,7 +187,7 @@ def test_a_copy_that_waited_long_enough_gives_up(monkeypatch: pytest.MonkeyPatch
 def test_the_variable_is_the_limit_of_every_process_and_what_is_no_number_is_refused_before_a_worker_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "_of_process", None)
+    monkeypatch.setattr(module, "_of_processes", {})
     monkeypatch.setenv(LIMIT_VARIABLE, "3")
     assert slots().most == 3
     share_slots(fd := open_slots())

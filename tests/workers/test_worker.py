@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -159,7 +160,7 @@ def test_a_worker_without_a_slot_leaves_without_a_failure_and_ends_when_there_is
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(slot_file, "WAIT_S", 0.0)
-    monkeypatch.setattr(slot_file, "_of_process", Slots(most=RUN.copies))
+    monkeypatch.setattr(slot_file, "_of_processes", {os.getpid(): Slots(most=RUN.copies)})
     others, waited = Slots(), [0]
     others.take()
 
