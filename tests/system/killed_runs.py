@@ -48,6 +48,7 @@ COMMON: dict[str, object] = {
 }  # fmt: skip
 DQN: dict[str, object] = {"algo": "dqn", "learning-starts": 64, "gradient-steps": 4, "replay-size": 600, "batch-size": 16}
 PPO: dict[str, object] = {"n-epochs": 2, "batch-size": 32}
+TARGET = 9  # a return that an evaluation of a policy at random reaches in nearly every run
 VARIANTS: dict[str, dict[str, object]] = {
     "ppo": {**PPO, "checkpoint-every-updates": 1, "workers": 2},
     "dqn, prioritized": {**DQN, "replay": "prioritized", "checkpoint-every-updates": 1, "workers": 1},
@@ -62,7 +63,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     "dqn, lag 1, tcp": {
         **DQN, "max-lag": 1, "transport": "tcp", "checkpoint-every-updates": 3, "keep-checkpoints": 1, "workers": 2,
     },
-    "ppo to a return": {**PPO, "target-return": 9, "checkpoint-every-updates": 1, "workers": 1},
+    "ppo to a return": {**PPO, "target-return": TARGET, "checkpoint-every-updates": 1, "workers": 1},
 }  # fmt: skip
 """Flags of `millrace train CartPole-v1`."""
 TIMES_S = {  # from the beginning of a phase until the kill, at most, on an idle machine
@@ -320,21 +321,21 @@ class OneRun:
         run = self._run()
         assert run is not None
         summary: dict[str, Any] = json.loads((run / "summary.json").read_text())
-        to_a_return = "target-return" in self.flags
-        assert summary["stop_reason"] == ("target return 9 reached" if to_a_return else "all steps done"), summary
         T, steps, most_lag = (int(str(self.flags.get(name, 0))) for name in ("rollout-steps", "steps", "max-lag"))
-        assert to_a_return or steps - T * ENVS < summary["env_steps"] <= steps
         ledger = accounted(summary, lanes=LANES, rows=T * ENVS // LANES, max_lag=most_lag)
         self.account.tickets.update({name: ledger[name] for name in ("issued", "used", "stale", "lost", "outstanding")})
         rows = read_rows(run / "metrics.jsonl")
         assert [row["time/iterations"] for row in rows] == list(range(1, summary["updates"] + 1)), "rows of metrics"
         assert all("train/n_updates" in row for row in rows[1:] if "eval/mean_reward" not in row)
-        self._check_evaluations(rows, summary)
+        returns = self._check_evaluations(rows, summary)
+        reached = "target-return" in self.flags and max(returns, default=0.0) >= TARGET
+        assert summary["stop_reason"] == (f"target return {TARGET} reached" if reached else "all steps done"), summary
+        assert reached or steps - T * ENVS < summary["env_steps"] <= steps
         left = [path.name for path in run.glob("**/*.tmp")]
         assert not left, f"files that a killed process left: {left}"
 
-    def _check_evaluations(self, rows: list[dict[str, Any]], summary: dict[str, Any]) -> None:
-        """Each evaluation was made when it was due, and the best of them was kept."""
+    def _check_evaluations(self, rows: list[dict[str, Any]], summary: dict[str, Any]) -> list[float]:
+        """Each evaluation was made when it was due, and the best of them was kept. Returns their mean returns."""
         every = due = int(str(self.flags["eval-every"]))
         returns = []
         for row in rows:
@@ -345,6 +346,7 @@ class OneRun:
                 returns.append(row["eval/mean_reward"])
         best = summary["best"]
         assert best["chosen_by"] == max([*returns, summary["evaluation"]["return_mean"]]), (best, returns)
+        return returns
 
 
 def _text(said: Path) -> str:
