@@ -1,0 +1,93 @@
+"""What a supervisor tells the learner, and when. The times are those that the test names; the socket is real."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zmq
+
+from protocol.alive import Alive, WorkerActivity, WorkerExit
+from workers.supervise.learner_notice import ENDED_AFTER_S, ENDED_FOR_S, EVERY_S, EVERY_S_WHILE_SLOW, SLOW_S, AliveSender
+
+SOON_MS = 10_000
+STARTING = WorkerActivity("w0", 1, "starting", 0.0, 0)
+WAITING, SLOW = WorkerActivity("w0", 1, "waiting", 9.0, 5), WorkerActivity("w0", 1, "stepping", 2 * SLOW_S, 5)
+CRASHED, LEFT = WorkerExit("w1", 2, "was killed", True), WorkerExit("w2", 3, "exit code 0", False)
+
+
+class Notices:
+    """A sender, and the learner's end of its connection."""
+
+    def __init__(self, address: str) -> None:
+        self.learner: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
+        self.learner.bind(address)
+        self.sender = AliveSender(address, None)
+
+    def said(self) -> Alive:
+        """The next message."""
+        assert self.learner.poll(SOON_MS)
+        self.peer, head, *_ = self.learner.recv_multipart()
+        return msgspec.msgpack.decode(head, type=Alive)
+
+    def close(self) -> None:
+        self.sender.close()
+        self.learner.close(linger=0)
+
+
+@pytest.fixture
+def notices(tmp_path: Path) -> Iterator[Notices]:
+    made = Notices(f"ipc://{tmp_path}/s")
+    yield made
+    made.close()
+
+
+def test_nothing_is_said_before_a_worker_has_joined(notices: Notices) -> None:
+    notices.sender.send([STARTING], [], 0.0)
+    notices.sender.send([STARTING, WAITING], [], 0.1)
+    assert notices.said().running == (WAITING,)
+
+
+@pytest.mark.parametrize(("doing", "every_s"), [(WAITING, EVERY_S), (SLOW, EVERY_S_WHILE_SLOW)])
+def test_it_is_said_again_after_a_time_that_is_shorter_while_a_call_takes_long(
+    notices: Notices, doing: WorkerActivity, every_s: float
+) -> None:
+    again = msgspec.structs.replace(doing, env_calls=6)
+    for activity, now in ((doing, 0.0), (msgspec.structs.replace(doing, env_calls=7), 0.9 * every_s), (again, every_s)):
+        notices.sender.send([activity], [], now)
+    assert [notices.said().running[0].env_calls for _ in range(2)] == [5, 6]
+
+
+def test_a_call_that_begins_to_take_long_is_told_sooner_than_was_due(notices: Notices) -> None:
+    notices.sender.send([WAITING], [], 0.0)
+    notices.sender.send([SLOW], [], 0.1)
+    notices.sender.send([SLOW], [], 0.1 + EVERY_S_WHILE_SLOW)
+    assert [notices.said().running[0].doing for _ in range(2)] == ["waiting", "stepping"]
+
+
+def test_a_failed_worker_is_named_at_once_and_one_that_left_a_moment_later(notices: Notices) -> None:
+    notices.sender.send([WAITING], [], 0.0)
+    notices.sender.send([WAITING], [LEFT], 0.1)  # its own last messages come first
+    notices.sender.send([WAITING], [CRASHED], 0.2)
+    notices.sender.send([WAITING], [], 0.1 + ENDED_AFTER_S)
+    assert [notices.said().ended for _ in range(3)] == [(), (CRASHED,), (LEFT, CRASHED)]
+
+
+def test_who_has_ended_is_named_for_a_while(notices: Notices) -> None:
+    notices.sender.send([WAITING], [CRASHED], 0.0)
+    for now in (EVERY_S, ENDED_FOR_S):
+        notices.sender.send([WAITING], [], now)
+    assert [notices.said().ended for _ in range(3)] == [(CRASHED,), (CRASHED,), ()]
+
+
+@pytest.mark.parametrize(("head", "over"), [(["Drain", "done"], True), (["HeartbeatReply", 1], False), ("Drain", False)])
+def test_only_a_drain_says_that_the_run_is_over(notices: Notices, head: object, over: bool) -> None:
+    notices.sender.send([WAITING], [], 0.0)
+    notices.said()
+    assert not notices.sender.run_is_over()
+    notices.learner.send_multipart([notices.peer, msgspec.msgpack.encode(head)])
+    assert notices.sender._socket is not None
+    assert notices.sender._socket.poll(SOON_MS)
+    assert notices.sender.run_is_over() is over
