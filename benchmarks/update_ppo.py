@@ -9,7 +9,6 @@ its norm, Adam with eps 1e-5, losses read as numbers. The usual style is modules
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from itertools import cycle
 
 import torch
@@ -79,7 +78,7 @@ def usual(rows: Minibatch, width: int) -> Callable[[Tensor], object]:
 
 def ours(rows: Minibatch, policy: PolicySpec, graph: bool) -> Callable[[Tensor], object]:
     """An update by `PPO.step` on rows of a batch, by their numbers."""
-    with passes_in_torch() if graph else nullcontext():
+    with passes_in_torch(graph):
         algorithm = PPO(CONFIG, policy, total_steps=1, seed=0)
     return lambda index: algorithm.step(rows.select(index))
 

@@ -8,7 +8,6 @@ step of RMSProp and what they log. SAC and TD3: the shapes of Pendulum, 256 tran
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -68,7 +67,7 @@ def dqn(width: int, target: float) -> Contest:
     )
 
     def ours(graph: bool) -> Callable[[], float]:
-        with passes_in_torch() if graph else nullcontext():
+        with passes_in_torch(graph):
             made = DQN(config, DQN.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
         for seed in range(20):
             made.replay.add(some_batch(32, seed))
@@ -100,12 +99,17 @@ def continuous(name: str, width: int, target: float | None) -> Contest:
     rows, size = 256, 10_000
     config = settings(net=(width, width), batch_size=rows, replay_size=size)
     observation, action = (Leaf("", "box", (3,), "float32"),), ActionSpec("box", (1,), "float32", low=(-2.0,), high=(2.0,))
-    made = algorithm(config, algorithm.policy_spec(config, observation, action), total_steps=NEVER, seed=0)
-    generator = np.random.default_rng(0)
-    for seed in range(20):
-        batch = some_batch(32, seed)
-        actions = generator.uniform(-1, 1, (*batch.reward.shape, 1)).astype(np.float32)
-        made.replay.add(msgspec.structs.replace(batch, obs=(batch.obs[0][..., :3],), action=actions))
+
+    def ours(graph: bool) -> Callable[[], float]:
+        with passes_in_torch(graph):
+            made = algorithm(config, algorithm.policy_spec(config, observation, action), total_steps=NEVER, seed=0)
+        generator = np.random.default_rng(0)
+        for seed in range(20):
+            batch = some_batch(32, seed)
+            actions = generator.uniform(-1, 1, (*batch.reward.shape, 1)).astype(np.float32)
+            made.replay.add(msgspec.structs.replace(batch, obs=(batch.obs[0][..., :3],), action=actions))
+        return lambda: repeated(lambda: made.step(made.transitions(made.replay.sample(rows))), STEPS)
+
     theirs = peer(
         "MlpPolicy",
         gymnasium.make("Pendulum-v1"),
@@ -116,11 +120,11 @@ def continuous(name: str, width: int, target: float | None) -> Contest:
         device="cpu",
     )
     theirs.learn(500)
-
-    def ours() -> float:
-        return repeated(lambda: made.step(made.transitions(made.replay.sample(rows))), STEPS)
-
-    runs = {"peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS, "graph": ours, "ours": ours}
+    runs = {
+        "peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS,
+        "graph": ours(True),
+        "ours": ours(False),
+    }
     return Contest(f"{name}, {width} units", rows, "SB3", target, runs)
 
 
@@ -130,7 +134,7 @@ def a2c(steps: int, target: float) -> Contest:
     config = A2CConfig(rollout_steps=steps)
 
     def ours(graph: bool) -> Callable[[], float]:
-        with passes_in_torch() if graph else nullcontext():
+        with passes_in_torch(graph):
             made = A2C(config, A2C.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
         return lambda: repeated(lambda: made.update(batch, lambda: None), STEPS)
 

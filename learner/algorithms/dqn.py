@@ -51,7 +51,7 @@ class DQN(OffPolicy):
         return replace(OffPolicy.policy_spec(config, observation, action), head="q", dueling=config.dueling)
 
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        super().__init__(config, policy, total_steps=total_steps, seed=seed)
         self.net, self.target = (q_network(policy, device, seed) for _ in range(2))
         avoid_compiler_import()
         optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW

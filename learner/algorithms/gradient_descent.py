@@ -172,7 +172,10 @@ class GradientDescent(Algorithm):
         self.load_other_state(state)
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. Target networks start as the networks; a replay buffer is empty."""
+        """See `Algorithm.start_from`. A replay buffer is empty.
+
+        Target networks start as the networks; if the critic is taken, as they were.
+        """
         own = GradientDescent.state_dict(self)
         GradientDescent.load_state_dict(self, start.into(own, self.tensors, self.optimizers))
 

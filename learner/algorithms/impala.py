@@ -32,7 +32,7 @@ class Impala(ActorCritic):
         return min(self.config.minibatches, rows)
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """V-trace advantages and targets under the newest weights; `rho` is the mean clipped ratio, 1 on the newest rows."""
+        """V-trace advantages and targets under the newest weights; `rho` is the mean ratio clipped at 1; 1 on new rows."""
         config, values = self.config, self.values(observations, pulse)
         log_ratio = self.log_probs(observations, batch, pulse) - batch.log_prob
         target, advantage = vtrace(

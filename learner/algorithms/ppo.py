@@ -1,7 +1,8 @@
 """PPO (Schulman et al. 2017). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock; seeded.
 
-An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows.
-The update is `ActorCritic.update`; here are its loss, its schedules and its early stop.
+An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows. With
+a recurrent core a minibatch is whole columns of the batch, and may have more. The update is `ActorCritic.update`; here are
+its loss, the schedule of its clip range and its early stop.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class PPO(ActorCritic):
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
         """L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)] + vf_coef · E[(V − G)²] − ent_coef · E[H(π)],  ρ = π(a) / π_old(a).
 
-        Schulman et al. 2017, equations 7 and 9. The value loss is clipped if `clip_range_vf` is set.
+        Schulman et al. 2017, equations 7 and 9. The value loss is clipped if `clip_range_vf` is set; V_old is then G − A, so
+        another `estimate` must keep G = A + V.
         """
         config = self.config
         log_ratio = rows.log_prob_now - rows.log_prob
@@ -79,8 +81,9 @@ class PPO(ActorCritic):
         A subclass with a loss of its own logs what it likes: what it does not log is not among them.
         """
         found = super().metrics(epochs, estimates)
-        found |= {"train/loss": epochs[-1][-1]["loss"], "train/n_updates": float(self.epochs)}
-        found |= {"train/clip_range": self.clip_range}
+        found |= {"train/n_updates": float(self.epochs), "train/clip_range": self.clip_range}
+        if epochs[-1]:  # `estimate` may use no row
+            found["train/loss"] = epochs[-1][-1]["loss"]
         if divergences := [step["approx_kl"] for step in epochs[-1] if "approx_kl" in step]:
             found["train/approx_kl"] = float(np.mean(divergences))
         return found

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from learner.algorithms.algorithm import Start
 from learner.algorithms.gradient_descent import Metrics
 from learner.algorithms.kernels.networks import leaf_of
 from learner.algorithms.replay.continuous import Continuous
@@ -75,6 +76,11 @@ class SAC(Continuous):
     def temperature_loss(self, log_temperature: Tensor, log_prob: Tensor) -> Tensor:
         """−E[log α (log π(ã|s) + target entropy)]."""
         return -(log_temperature * (log_prob + self.target_entropy)).mean()
+
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm.start_from`. A temperature that the earlier run did not learn is learned from its initial value."""
+        anew = {"log_temperature": self.log_temperature, "ent_coef_optimizer": {"state": {}}}
+        super().start_from(start._replace(state=anew | start.state))
 
     def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
         """One gradient step of the critics, the actor and the temperature; then the target critics move."""

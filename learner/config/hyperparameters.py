@@ -87,7 +87,7 @@ class ActorCriticConfig(RecurrentConfig, frozen=True):
     """Settings of an actor-critic with generalized advantage estimation and several epochs of minibatches."""
 
     batch_size: Free[Count] = 64
-    """Largest number of rows (steps of one env copy) in a minibatch."""
+    """Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more."""
     n_epochs: Free[Count] = 10
     """Number of epochs: how often an update uses each row."""
     gae_lambda: Free[Fraction] = 0.95

@@ -163,6 +163,17 @@ def test_a_fixed_temperature_is_a_setting_and_is_not_taken(tmp_path: Path) -> No
     assert algorithm.log_temperature.exp().item() == pytest.approx(0.125, rel=1e-6)
 
 
+@pytest.mark.parametrize("parts", ["auto", "policy", "critic", "all"])
+def test_a_temperature_that_was_fixed_is_learned_from_its_initial_value(tmp_path: Path, parts: str) -> None:
+    run, before = earlier_run("sac", tmp_path, ent_coef=0.125)
+    algorithm, _ = started("sac", tmp_path, run, from_parts=parts)
+    assert algorithm.log_temperature.item() == 0
+    assert torch.equal(algorithm.net.actor, before.net.actor)
+    assert torch.equal(algorithm.net.critics, before.net.critics) == (parts != "policy")
+    algorithm.update(rows(algorithm, 3), no_pulse)
+    assert algorithm.log_temperature.item() != 0
+
+
 @pytest.mark.parametrize("algo", ["sac", "td3"])
 def test_no_uniform_actions_come_first(tmp_path: Path, algo: str) -> None:
     """Also after a resume before learning_starts."""

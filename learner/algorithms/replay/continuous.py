@@ -68,7 +68,7 @@ class Continuous(Clones, OffPolicy):
     def __init__(
         self, config: ContinuousConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
     ) -> None:
-        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        super().__init__(config, policy, total_steps=total_steps, seed=seed)
         self.seed = seed
         self.net, self.target = (actor_and_critics(policy, device, seed) for _ in range(2))
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))

@@ -64,9 +64,7 @@ class OffPolicy(GradientDescent):
 
     Config: ClassVar[type[AlgorithmConfig]] = OffPolicyConfig
 
-    def __init__(
-        self, config: OffPolicyConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
-    ) -> None:
+    def __init__(self, config: OffPolicyConfig, policy: PolicySpec, *, total_steps: int, seed: int) -> None:
         super().__init__(config, policy, total_steps=total_steps)
         self.replay = MixedReplay(
             policy.observation,

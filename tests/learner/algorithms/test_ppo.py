@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.minibatches import Minibatch
+from learner.algorithms.actor_critic import Estimates, Pulse
+from learner.algorithms.minibatches import Minibatch, Observations
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
+from protocol.arrays import Floats
+from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.support.batches import (
     DISCRETE,
@@ -78,6 +81,19 @@ def test_target_kl_stops_before_the_step_that_would_go_on() -> None:
     assert held_metrics["train/n_updates"] == 1
     assert int(held.state_dict()["optimizer"]["state"][0]["step"]) == 1  # the second minibatch saw how far the first went
     assert not torch.equal(held.net.flat, start)
+
+
+def test_an_update_whose_estimate_uses_no_row_changes_no_weight() -> None:
+    class UsesNone(PPO):
+        def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
+            return super().estimate(batch, observations, reward, pulse)._replace(used=np.zeros_like(batch.valid))
+
+    algorithm = UsesNone(PPOConfig(), DISCRETE, total_steps=10_000, seed=0)
+    before = algorithm.net.flat.clone()
+    metrics = algorithm.update(batch(algorithm, 0), no_pulse)
+    assert torch.equal(algorithm.net.flat, before)
+    assert "train/loss" not in metrics
+    assert algorithm.version == 1
 
 
 def test_schedules_follow_the_steps_used() -> None:
