@@ -90,10 +90,11 @@ class Simulated:
                 self._do(self._session.handle(decode_to_worker(frames), now))
         except zmq.Again:
             pass
-        while (task := self._session.next_task()) is not None:
+        while (task := self._session.next_work()) is not None:
+            assert isinstance(task, Task)
             if self._arrivals[task.weights.version, self._number] == 0.0:
                 self._arrivals[task.weights.version, self._number] = now
-            self._do(self._session.finished(self._rollouts(task)))
+            self._do(self._session.work_ended(self._rollouts(task)))
         self.tick(now)
 
     def _rollouts(self, task: Task) -> list[Rollout]:

@@ -14,7 +14,7 @@ import platform
 import socket
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -23,7 +23,7 @@ from pathlib import Path
 from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
 from protocol.errors import BadMessage, PolicyFailed, UsageError, UserFacingError, first_line
-from protocol.messages import Order, Stepped, ToLearner, Weights
+from protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, Weights
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import make_policy
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
@@ -42,9 +42,11 @@ from workers.conversation.session import (
     Leave,
     Send,
     Session,
+    SharedOrders,
     StartSession,
     Statistics,
     Task,
+    Work,
 )
 from workers.conversation.states import State
 from workers.copies.env_errors import LaneFailed
@@ -72,7 +74,7 @@ def make_local_collector(run: RunSpec) -> tuple[Collector, Evaluator]:
 
 
 class _Abandoned(Exception):
-    """The rollouts in progress are no longer wanted."""
+    """The work in progress is no longer wanted."""
 
 
 def _no_stop_requests() -> int:
@@ -137,7 +139,7 @@ class Worker:
                 self._do(self._session.tick(self._clock()))
                 self._connect_again_if_unheard()
                 if self._left is None:
-                    idle_s = min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock()))
+                    idle_s = min(IDLE_S, max(0.0, self._session.due_s - self._clock()))
                     self._listen(self._serve_shared_memory(idle_s))
                 while self._left is None and self._work():
                     self._listen(0.0)
@@ -149,15 +151,46 @@ class Worker:
 
     def _work(self) -> bool:
         """Do the next piece of work; False if there is none."""
-        if (evaluation := self._session.next_evaluation()) is not None:
-            self._evaluate(evaluation)
-        elif (task := self._session.next_task()) is not None:
-            self._collect(task)
-        elif (order := self._session.next_order()) is not None:
-            self._execute(order)
-        else:
+        work = self._session.next_work()
+        if work is None:
             return False
+        try:
+            answers = self._do_work(work)
+        except _Abandoned:
+            answers = []
+        except Exception as error:
+            self._fail(error)
+            return True
+        self._update_statistics()
+        self._do(self._session.work_ended(answers))
         return True
+
+    def _do_work(self, work: Work) -> Sequence[Rollout | Evaluated | Answer]:
+        """Collect, evaluate, or execute an order. Raises `_Abandoned` once the work is no longer wanted."""
+
+        def pulse() -> None:
+            self._pulse(work)
+
+        match work:
+            case Task(session, weights, assignments):
+                return self._loaded_collector(weights).collect(assignments, weights.version, session, pulse)
+            case EvaluationTask(weights, order):
+                self._loaded_collector(weights)
+                assert self._evaluator is not None
+                return [self._evaluator.play(order, lambda rows: self._do([Send(rows)]), pulse)]
+        assert self._stepper is not None
+        with self._heartbeats.lock_released():
+            return [self._stepper.execute(work, lambda: self._pulse_from_env_code(work))]
+
+    def _loaded_collector(self, weights: Weights) -> Collector:
+        """The collector, whose policy acts under these weights. The evaluator has the same policy."""
+        collector = self._collector
+        assert collector is not None
+        if self._loaded is not weights:
+            collector.load(to_float32(weights.parameters), weights.buffers)
+            collector.env_attributes = b"" if weights.env_attributes is None else weights.env_attributes.tobytes()
+            self._loaded = weights
+        return collector
 
     def _listen(self, timeout_s: float) -> None:
         """Handle signals, then all messages that have arrived."""
@@ -195,70 +228,9 @@ class Worker:
             self._unheard_from_s = self._waited_s
             self._link.connect_again()
 
-    def _collect(self, task: Task) -> None:
-        collector = self._collector
-        assert collector is not None
-
-        def pulse() -> None:
-            self._pulse(task.session)
-
-        try:
-            self._load(collector, task.weights)
-            rollouts = collector.collect(task.assignments, task.weights.version, task.session, pulse)
-        except _Abandoned:
-            rollouts = []
-        except Exception as error:
-            self._fail(error)
-            return
-        self._update_statistics()
-        self._do(self._session.finished(rollouts))
-
-    def _load(self, collector: Collector, weights: Weights) -> None:
-        """Let the policy act under these weights."""
-        if self._loaded is not weights:
-            collector.load(to_float32(weights.parameters), weights.buffers)
-            collector.env_attributes = b"" if weights.env_attributes is None else weights.env_attributes.tobytes()
-            self._loaded = weights
-
-    def _evaluate(self, task: EvaluationTask) -> None:
-        collector, evaluator, order = self._collector, self._evaluator, task.order
-        assert collector is not None
-        assert evaluator is not None
-
-        def pulse() -> None:
-            self._pulse(order.session)
-            if self._session.evaluation_abandoned(order.session):
-                raise _Abandoned
-
-        answer = None
-        try:
-            self._load(collector, task.weights)
-            answer = evaluator.play(order, lambda rows: self._do([Send(rows)]), pulse)
-        except _Abandoned:
-            pass
-        except Exception as error:
-            self._fail(error)
-            return
-        self._update_statistics()
-        self._do(self._session.evaluated(answer))
-
-    def _execute(self, order: Order) -> None:
-        stepper = self._stepper
-        assert stepper is not None
-        try:
-            with self._heartbeats.lock_released():
-                answer = stepper.execute(order, lambda: self._pulse_from_env_code(order.session))
-        except _Abandoned:
-            return
-        except Exception as error:
-            self._fail(error)
-            return
-        self._update_statistics()
-        self._do(self._session.answered(answer))
-
     def _serve_shared_memory(self, timeout_s: float) -> float:
         """Execute the orders in shared memory, if it is used, until a message may have arrived. How long to wait for it."""
-        stepper, session = self._stepper, self._session.session
+        stepper, orders = self._stepper, SharedOrders(self._session.session)
         if stepper is None or not stepper.uses_shared_memory:
             return timeout_s
         message_announced = False
@@ -266,7 +238,10 @@ class Worker:
         try:
             with self._heartbeats.lock_released():
                 message_announced = stepper.serve_shared_memory(
-                    min(timeout_s, PULSE_S), lambda: self._pulse_from_env_code(session), session, self._send_from_env_code
+                    min(timeout_s, PULSE_S),
+                    lambda: self._pulse_from_env_code(orders),
+                    orders.session,
+                    self._send_from_env_code,
                 )
         except _Abandoned:
             pass
@@ -276,7 +251,7 @@ class Worker:
         self._update_statistics()
         return AFTER_WAKE_UP_S if message_announced else 0.0
 
-    def _pulse(self, session: int) -> None:
+    def _pulse(self, work: Work | SharedOrders) -> None:
         """Every `PULSE_S`, handle messages and send what is due. Raises `_Abandoned` once the work is no longer wanted."""
         now = self._clock()
         if now >= self._pulse_due_s:
@@ -285,14 +260,14 @@ class Worker:
             self._update_statistics()
             self._listen(0.0)
             self._do(self._session.tick(now))
-            if self._session.abandoned(session):
+            if self._session.is_unwanted(work):
                 raise _Abandoned
 
-    def _pulse_from_env_code(self, session: int) -> None:
+    def _pulse_from_env_code(self, work: Work | SharedOrders) -> None:
         """As `_pulse`, but called by environment code while an order is executed."""
         if self._clock() >= self._pulse_due_s:
             with self._heartbeats.lock_reacquired():
-                self._pulse(session)
+                self._pulse(work)
 
     def _send_from_env_code(self, answer: Stepped) -> None:
         with self._heartbeats.lock_reacquired():
@@ -311,13 +286,13 @@ class Worker:
     def _decline(self, error: UsageError) -> None:
         """Leave the run. Without a slot, this process ends when there is room for a lane: then it is started again."""
         self._close_all()
-        goodbye, *rest = self._session.decline(_line(error), 1 if isinstance(error, NoSlot) else EXIT_UNSUITABLE)
-        self._do([goodbye])
+        *said, leave = self._session.decline(_line(error), 1 if isinstance(error, NoSlot) else EXIT_UNSUITABLE)
+        self._do(said)
         copies = getattr(self._session.run, "copies", 1)
         while isinstance(error, NoSlot) and not (self._options.stop_requests() or slots().have_room(copies)):
             self._options.feed_watchdog(self._clock())
             time.sleep(PULSE_S)
-        self._do(rest)
+        self._do([leave])
 
     def _update_statistics(self) -> None:
         if (source := self._collector or self._stepper) is not None:

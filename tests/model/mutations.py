@@ -93,22 +93,19 @@ MUTATIONS = {
     "a worker that joins again repeats its Hello": Mutation(
         SESSION, "self._attempt += 1", "self._attempt = self.identity.process_nonce + 1"
     ),
-    "finished work stays in progress": Mutation(
-        SESSION,
-        "self._current.in_progress = ()\n        effects: list",
-        "effects: list",
-    ),
-    "replies to heartbeats are not counted": Mutation(SESSION, "self._current.replies = number", "pass"),
+    "finished work stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
+    "a worker takes work while it works": Mutation(SESSION, "self._current.in_progress = work is not None", "pass"),
+    "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
     "new weights are acknowledged again and again": Mutation(
-        SESSION, "self._current.acknowledged_version = self._current.version\n        described", "described"
+        SESSION, "current.acknowledged_version = current.version\n", "pass\n"
     ),
     "a Collect confirms nothing": Mutation(
         SESSION,
-        "self._current.rollouts.forget_received(received)\n                again",
+        "current.rollouts.forget_received(received)\n                again",
         "again",
     ),
     "an asked-for rollout is not sent again": Mutation(
-        SESSION, "return [Send(rollout) for rollout in again if rollout is not None]", "return []"
+        SESSION, "return [Send(answer) for answer in again if answer is not None]", "return []"
     ),
     "a finished ticket is forgotten": Mutation(HELD, " or permit.ticket in lane.finished:", ":"),
     "a rollout that has not arrived is forgotten": Mutation(
@@ -121,14 +118,14 @@ MUTATIONS = {
         SESSION, 'getattr(message, "session", self.session) != self.session:', "False:"
     ),
     "heartbeats are due only with new weights": Mutation(
-        SESSION, "if now < self._due_s and self._current.acknowledged_version", "if self._current.acknowledged_version"
+        SESSION, "if now < self.due_s and self._current.acknowledged_version", "if self._current.acknowledged_version"
     ),
     "heartbeats at half the rate needed": Mutation(
         SESSION,
-        "self._due_s = now + self.run.heartbeat_s",
-        "self._due_s = now + 2 * self.run.heartbeat_s",
+        "self.due_s = now + self.run.heartbeat_s",
+        "self.due_s = now + 2 * self.run.heartbeat_s",
     ),
-    "a lost Release is never said again": Mutation(SESSION, "return self._release_unlisted(received)", "return []"),
+    "a lost Release is never said again": Mutation(SESSION, "return current.release_unlisted(received)", "return []"),
     "a lane reopened on a new incarnation keeps the old lane's state": Mutation(
         HELD,
         "lane = self._lanes[permit.lane] = _HeldLane(permit.incarnation)",

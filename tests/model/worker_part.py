@@ -13,13 +13,13 @@ from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
-from tests.support.fake_ends import fake_rollouts
+from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
 from workers.conversation.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
-from workers.conversation.session import Effect, Identity, Leave, Send, Session, Task, _SessionState
+from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task, _SessionState
 from workers.conversation.states import State
 
 SAVED: dict[type, set[str]] = {
-    Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "_due_s", "_current"},
+    Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
     _SessionState: {"rollouts", "weights", "in_progress", "replies", "acknowledged_version"},
     HeldRollouts: {"_lanes"},
     _HeldLane: {"incarnation", "sequence", "tickets", "kept", "finished"},
@@ -43,7 +43,7 @@ class Worker:
     """of its process; a later process has a larger one"""
     session: Session | None = None
     """None: its process has ended"""
-    task: Task | None = None
+    task: Task | EvaluationTask | None = None
     frozen: bool = False
     shut_out: bool = False
     """whether its key was revoked: the learner hears nothing of it"""
@@ -76,8 +76,9 @@ class Worker:
     def finish(self, now: float) -> list[ToLearner]:
         assert self.session is not None
         assert self.task is not None
-        rollouts, self.task = fake_rollouts(self.task), None
-        return self._turn(self.session.finished(rollouts), now)
+        task, self.task = self.task, None
+        answers = fake_rollouts(task) if isinstance(task, Task) else [fake_evaluated(task)]
+        return self._turn(self.session.work_ended(answers), now)
 
     def turn(self, now: float) -> list[ToLearner]:
         """Time has passed."""
@@ -112,17 +113,26 @@ class Worker:
 
     # ---------------------------------------------------------------- inside
 
+    def _begin(self, work: Task | EvaluationTask) -> list[ToLearner]:
+        """What the worker says when this work begins."""
+        self.task = work
+        return []
+
     def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
         current = self.session
         assert current is not None
-        if self.task is not None and current.abandoned(self.task.session):
+        if self.task is not None and current.is_unwanted(self.task):
             self.task = None
-            effects = effects + current.finished([])
-        if self.task is None:
-            self.task = current.next_task()
+            effects = effects + current.work_ended([])
+        work = current.next_work()
+        if work is not None:
+            assert self.task is None, "a worker does two pieces of work at the same time"
+            assert isinstance(work, Task | EvaluationTask)
+            effects = effects + [Send(said) for said in self._begin(work)]
         effects = effects + current.tick(now)
         most = self.settings.rollouts_per_update * (1 + self.settings.max_lag)
-        assert current.held_count() <= most, f"a worker holds {current.held_count()} rollouts, of at most {most}"
+        held = held_count(current)
+        assert held <= most, f"a worker holds {held} rollouts, of at most {most}"
         sent: list[ToLearner] = []
         for effect in effects:
             if isinstance(effect, Send):
@@ -147,16 +157,17 @@ def saved(worker: Worker, now: float) -> Content:
         None if current.run is None else session(current.session),
         name(Kind.ATTEMPT, current._attempt, worker.number),
         max(current._unanswered_s - now, -TIMEOUT_S - 1.0),
-        max(current._due_s - now, 0.0),
+        max(current.due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items()),
         held.version,
-        tuple(ticket(number) for number in held.in_progress),
+        held.in_progress,
         None if current.run is None else name(Kind.REPLIES, held.replies, current.session),
         held.acknowledged_version,
     )
     task = worker.task
-    work = None if task is None else (session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments))
-    return nonce, flags, fields, work
+    if not isinstance(task, Task):
+        return nonce, flags, fields, None
+    return nonce, flags, fields, (session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments))
 
 
 def _lane(number: int, lane: _HeldLane) -> Content:
@@ -183,10 +194,10 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     current = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
     current.state, current._attempt = State(state), attempt.value
-    current._unanswered_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
+    current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
     held.weights = None if version < 0 else weights(version)
-    held.in_progress = tuple(each.value for each in in_progress)
+    held.in_progress = in_progress
     held.acknowledged_version = acknowledged
     if of_session is not None:
         current.run, current.session, held.replies = settings.run, of_session.value, replies.value

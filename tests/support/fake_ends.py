@@ -60,6 +60,11 @@ def fake_rollouts(task: Task) -> list[Rollout]:
     return [fake_rollout(task.session, a.lane, a.ticket, task.weights.version, a.sequence) for a in task.assignments]
 
 
+def held_count(session: Session) -> int:
+    """Number of tickets and rollouts that a worker holds."""
+    return len(session._current.rollouts)
+
+
 def fake_evaluated(task: EvaluationTask) -> Evaluated:
     """Result of an evaluator: episodes of two steps whose return names the seed and the version."""
     order = task.order
@@ -222,14 +227,11 @@ class World:
         session = worker.session
         while worker.inbox:
             self.say(worker, session.handle(worker.inbox.pop(0), self.now))
-        match worker.task:
-            case Task() if session.abandoned(worker.task.session):
-                worker.task = None
-                self.say(worker, session.finished([]))
-            case EvaluationTask() if session.evaluation_abandoned(worker.task.order.session):
-                worker.task = None
-                self.say(worker, session.evaluated(None))
-        if worker.task is None and (task := session.next_evaluation() or session.next_task()) is not None:
+        if worker.task is not None and session.is_unwanted(worker.task):
+            worker.task = None
+            self.say(worker, session.work_ended([]))
+        if worker.task is None and (task := session.next_work()) is not None:
+            assert isinstance(task, Task | EvaluationTask)
             worker.task = task
             self.at(self.random.uniform(0.01, 0.4), lambda: self._finish(worker, task))
         self.say(worker, session.tick(self.now))
@@ -242,13 +244,13 @@ class World:
             return
         worker.task = None
         if isinstance(task, Task):
-            self.say(worker, worker.session.finished(fake_rollouts(task)))
+            self.say(worker, worker.session.work_ended(fake_rollouts(task)))
         else:
             order = task.order
             assert task.weights.version == order.version, "evaluated under other weights than those of the order"
             for n, step in itertools.product(range(len(order.seeds)), range(2)) if order.send_rows else ():
                 self.say(worker, [Send(fake_rows(order.session, order.ticket, n, step))])
-            self.say(worker, worker.session.evaluated(fake_evaluated(task)))
+            self.say(worker, worker.session.work_ended([fake_evaluated(task)]))
         self._serve(worker)
 
     # ------------------------------------------------------------ learner
@@ -412,5 +414,5 @@ class World:
             assert coordinator.lanes[ticket.lane].owner == ticket.peer, "a ticket of a lane that its worker does not own"
         if self.epoch == 0:
             for worker in self.workers.values():
-                holds = worker.session.held_count()
+                holds = held_count(worker.session)
                 assert holds <= self.per_update * (1 + self.max_lag), f"{worker.name!r} holds {holds} rollouts"

@@ -38,7 +38,7 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.specs import StepSpec
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollouts, run_spec
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 from workers.conversation.connection_rules import wait_limits_s
 from workers.conversation.held_rollouts import REMEMBERED_TICKETS
 from workers.conversation.session import (
@@ -47,6 +47,7 @@ from workers.conversation.session import (
     NO_LEARNER,
     CloseLanes,
     Effect,
+    EvaluationTask,
     Identity,
     Leave,
     Send,
@@ -64,6 +65,7 @@ WHO = Identity("w0", "host", 7, 77, "fake 1")
 RUN = run_spec(lanes=4)  # heartbeat_s 1, learner_timeout_s 6
 SESSION = 11
 JOIN_S, REJOIN_S = 60.0, 600.0
+EVALUATE = Evaluate(SESSION, 8, 0, (1, 2), True, 100, False, False)
 FIRST = WHO.process_nonce + 1  # number of the first attempt to join
 
 
@@ -108,14 +110,14 @@ def ready(*messages: ToWorker, version: int | None = 0) -> Session:
 
 
 def task_of(session: Session) -> Task:
-    task = session.next_task()
-    assert task is not None
+    task = session.next_work()
+    assert isinstance(task, Task)
     return task
 
 
 def collected(session: Session) -> list[Rollout]:
     """Collect the next task; the rollouts that were said."""
-    return sent(session.finished(fake_rollouts(task_of(session))), Rollout)
+    return sent(session.work_ended(fake_rollouts(task_of(session))), Rollout)
 
 
 def hello_attempt(effects: Sequence[Effect]) -> int:
@@ -147,15 +149,15 @@ def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
 
 def test_next_due_s_is_the_time_of_the_next_hello() -> None:
     session = joining()
-    assert session.next_due_s() == 0.0
+    assert session.due_s == 0.0
     session.tick(0.0)
-    assert session.next_due_s() == HELLO_FIRST_S
+    assert session.due_s == HELLO_FIRST_S
 
 
 def test_joining_again_raises_the_attempt_and_resets_the_backoff() -> None:
     session = ready()
     assert hello_attempt(session.handle(Rejoin(SESSION), 5.0)) == FIRST + 1
-    assert session.next_due_s() == 5.0 + HELLO_FIRST_S
+    assert session.due_s == 5.0 + HELLO_FIRST_S
 
 
 def test_welcome_starts_a_session() -> None:
@@ -186,14 +188,14 @@ def test_welcome_for_a_process_that_has_ended_is_ignored() -> None:
 def test_a_repeated_welcome_is_ignored() -> None:
     session = ready(collect((0, 0)))
     assert session.handle(Welcome(SESSION, FIRST, RUN), 0.1) == []
-    assert session.held_count() == 1
+    assert held_count(session) == 1
 
 
 def test_welcome_to_another_session_of_the_same_attempt_starts_anew() -> None:
     """The learner gave this worker up, then heard a late Hello of it."""
     session = ready(collect((0, 0)))
     assert session.handle(Welcome(12, FIRST, RUN), 0.1) == [StartSession(RUN)]
-    assert (session.session, session.held_count()) == (12, 0)
+    assert (session.session, held_count(session)) == (12, 0)
 
 
 def test_every_other_message_while_joining_is_ignored() -> None:
@@ -201,7 +203,7 @@ def test_every_other_message_while_joining_is_ignored() -> None:
     session.tick(0.0)
     for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneIncarnation(0, 0),)), Rejoin(0)):
         assert session.handle(message, 0.1) == []
-    assert (session.state, session.held_count()) == (State.JOINING, 0)
+    assert (session.state, held_count(session)) == (State.JOINING, 0)
 
 
 def test_a_worker_gives_up_joining_with_exit_code_1() -> None:
@@ -242,17 +244,17 @@ def test_a_worker_that_stays_waits_without_a_limit_until_it_has_joined() -> None
 
 def test_a_repeated_collect_is_collected_once() -> None:
     session = ready(collect((0, 0)), collect((0, 0)))
-    assert session.held_count() == 1
+    assert held_count(session) == 1
     assert len(collected(session)) == 1
-    assert session.next_task() is None
+    assert session.next_work() is None
 
 
 def test_a_repeat_of_the_ticket_in_progress_is_collected_once() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
     session.handle(collect((0, 0)), 0.1)
-    assert len(sent(session.finished(fake_rollouts(task)), Rollout)) == 1
-    assert session.next_task() is None
+    assert len(sent(session.work_ended(fake_rollouts(task)), Rollout)) == 1
+    assert session.next_work() is None
 
 
 def test_a_repeat_of_a_finished_ticket_sends_the_same_rollout_object_again() -> None:
@@ -260,16 +262,16 @@ def test_a_repeat_of_a_finished_ticket_sends_the_same_rollout_object_again() -> 
     (rollout,) = collected(session)
     (again,) = sent(session.handle(collect((0, 0)), 1.0), Rollout)
     assert again is rollout
-    assert session.next_task() is None
+    assert session.next_work() is None
 
 
 def test_a_rollout_is_kept_until_the_learner_has_received_it() -> None:
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0)), 1.0)
-    assert session.held_count() == 1
+    assert held_count(session) == 1
     session.handle(HeartbeatReply(SESSION, 2, lanes(0, below=1)), 2.0)
-    assert session.held_count() == 0
+    assert held_count(session) == 0
 
 
 def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_one_kept() -> None:
@@ -277,7 +279,7 @@ def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_on
     first, second = collected(session) + collected(session)
     assert (first.sequence, second.sequence) == (0, 1)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0, ahead=(1,))), 1.0)
-    assert session.held_count() == 1
+    assert held_count(session) == 1
     assert sent(session.handle(collect((0, 0)), 1.0), Rollout) == [first]
 
 
@@ -285,14 +287,14 @@ def test_collect_also_lists_what_was_received() -> None:
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(collect((1, 0), received=lanes(0, below=1)), 0.1)
-    assert session.held_count() == 1  # the new ticket
+    assert held_count(session) == 1  # the new ticket
 
 
 def test_received_of_another_incarnation_of_the_lane_drops_nothing() -> None:
     session = ready(collect((0, 0), incarnation=1))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=9, incarnation=0)), 1.0)
-    assert session.held_count() == 1
+    assert held_count(session) == 1
 
 
 def test_a_late_repeat_of_a_ticket_whose_rollout_was_received_is_ignored() -> None:
@@ -300,7 +302,7 @@ def test_a_late_repeat_of_a_ticket_whose_rollout_was_received_is_ignored() -> No
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=1)), 1.0)
     assert session.handle(collect((0, 0), received=lanes(0, below=1)), 1.1) == []
-    assert session.next_task() is None
+    assert session.next_work() is None
 
 
 def test_the_sequence_counts_the_rollouts_of_an_incarnation_of_the_lane() -> None:
@@ -310,14 +312,14 @@ def test_the_sequence_counts_the_rollouts_of_an_incarnation_of_the_lane() -> Non
 
 def test_a_rollout_starts_only_under_weights_at_least_as_new_as_its_ticket_asks_for() -> None:
     session = ready(collect((0, 0), version=2), version=1)
-    assert session.next_task() is None
+    assert session.next_work() is None
     session.handle(weights(2), 0.2)
     assert task_of(session).weights.version == 2
 
 
 def test_without_weights_nothing_starts() -> None:
     session = ready(collect((0, 0), version=0), version=None)
-    assert session.next_task() is None
+    assert session.next_work() is None
 
 
 def test_a_task_has_the_newest_weights() -> None:
@@ -338,15 +340,25 @@ def test_the_oldest_startable_ticket_of_every_lane_is_taken_together_in_lane_ord
 def test_one_task_at_a_time() -> None:
     session = ready(collect((0, 0), (1, 0), (2, 1)))
     task = task_of(session)
-    assert session.next_task() is None
-    session.finished(fake_rollouts(task))
+    assert session.next_work() is None
+    session.work_ended(fake_rollouts(task))
     assert task_of(session).assignments[0].ticket == 1
+
+
+def test_an_evaluation_comes_before_rollouts() -> None:
+    session = ready(collect((0, 0)), EVALUATE)
+    task = session.next_work()
+    assert isinstance(task, EvaluationTask)
+    assert session.next_work() is None
+    answer = fake_evaluated(task)
+    assert session.work_ended([answer]) == [Send(answer)]
+    assert task_of(session).assignments[0].ticket == 0
 
 
 def test_finished_with_nothing_puts_the_tickets_back() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
-    assert session.finished([]) == []
+    assert session.work_ended([]) == []
     assert task_of(session).assignments[0].ticket == 0
 
 
@@ -358,11 +370,11 @@ def test_the_worker_holds_at_most_what_the_learner_has_outstanding() -> None:
         fresh = [(issued + n, 0) for n in range(5)]
         session.handle(collect(*fresh, received=lanes(0, below=arrived)), 0.1)
         issued += 5
-        assert session.held_count() <= 5
-        while session.next_task() is not None:
-            session.finished([])
+        assert held_count(session) <= 5
+        while session.next_work() is not None:
+            session.work_ended([])
             arrived += len(collected(session))
-            assert session.held_count() <= 5
+            assert held_count(session) <= 5
     assert arrived == issued == 500
 
 
@@ -400,14 +412,14 @@ def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     assert session.tick(0.9) == []
     (heartbeat,) = sent(session.tick(1.0), Heartbeat)
     assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"step": 0.5}, 0)
-    assert session.next_due_s() == 2.0
+    assert session.due_s == 2.0
 
 
 def test_a_heartbeat_lists_the_ticket_in_progress_and_no_finished_one() -> None:
     session = ready(collect((7, 0), (8, 0)))
     task = task_of(session)
     assert sent(session.tick(1.0), Heartbeat)[0].tickets == (7, 8)
-    session.finished(fake_rollouts(task))
+    session.work_ended(fake_rollouts(task))
     assert sent(session.tick(2.0), Heartbeat)[0].tickets == (8,)
 
 
@@ -424,7 +436,7 @@ def test_a_higher_incarnation_starts_the_lane_anew_with_sequence_0() -> None:
     session = ready(collect((0, 0), (1, 0)))
     collected(session)
     session.handle(collect((2, 0), incarnation=1), 0.1)
-    assert session.held_count() == 1  # the ticket and the rollout of the old incarnation are dropped
+    assert held_count(session) == 1  # the ticket and the rollout of the old incarnation are dropped
     (assignment,) = task_of(session).assignments
     assert (assignment.ticket, assignment.incarnation, assignment.sequence) == (2, 1, 0)
 
@@ -432,7 +444,7 @@ def test_a_higher_incarnation_starts_the_lane_anew_with_sequence_0() -> None:
 def test_a_ticket_of_an_older_incarnation_is_ignored() -> None:
     session = ready(collect((2, 0), incarnation=1))
     session.handle(collect((1, 0), received=lanes(0, incarnation=1)), 0.1)
-    assert session.held_count() == 1
+    assert held_count(session) == 1
     assert task_of(session).assignments[0].ticket == 2
 
 
@@ -440,14 +452,14 @@ def test_release_closes_the_lane_and_drops_its_tickets_and_rollouts() -> None:
     session = ready(collect((0, 0), (1, 1)))
     collected(session)
     assert session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.1) == [CloseLanes((LaneIncarnation(0, 0),))]
-    assert session.held_count() == 1
+    assert held_count(session) == 1
     assert session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.2) == []  # a repeat
 
 
 def test_a_late_release_does_not_close_a_later_incarnation() -> None:
     session = ready(collect((0, 0), incarnation=2))
     assert session.handle(Release(SESSION, (LaneIncarnation(0, 1),)), 0.1) == []
-    assert session.held_count() == 1
+    assert held_count(session) == 1
 
 
 def test_a_lane_missing_from_a_heartbeat_reply_is_closed() -> None:
@@ -460,7 +472,7 @@ def test_a_late_copy_of_a_message_closes_no_lane_that_came_after_it(copy: ToWork
     """Else the lane would start again in the same incarnation, and count its rollouts from 0 again."""
     session = ready(HeartbeatReply(SESSION, 1, ()), collect((0, 0)), collect((1, 1), received=lanes(0, 1)))
     assert session.handle(copy, 0.2) == []
-    assert session.held_count() == 2
+    assert held_count(session) == 2
 
 
 def test_a_late_copy_of_an_order_opens_its_released_lane_until_the_next_reply() -> None:
@@ -470,7 +482,7 @@ def test_a_late_copy_of_an_order_opens_its_released_lane_until_the_next_reply() 
     session.handle(order, 0.1)
     assert session.handle(Release(SESSION, (lane,)), 0.2) == [CloseLanes((lane,))]
     assert session.handle(order, 0.3) == []
-    assert session.next_order() == order
+    assert session.next_work() == order
     assert session.handle(HeartbeatReply(SESSION, 1, ()), 0.4) == [CloseLanes((lane,))]
 
 
@@ -478,7 +490,7 @@ def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_sen
     session = ready(collect((0, 0), (1, 1)))
     task = task_of(session)
     session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.1)
-    assert [rollout.lane for rollout in sent(session.finished(fake_rollouts(task)), Rollout)] == [1]
+    assert [rollout.lane for rollout in sent(session.work_ended(fake_rollouts(task)), Rollout)] == [1]
 
 
 # -------------------------------------------------------------------- sessions
@@ -487,14 +499,14 @@ def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_sen
 def test_nothing_of_a_session_outlives_it() -> None:
     session = ready(collect((0, 0), (1, 0), (2, 1)))
     rollouts = fake_rollouts(task_of(session))
-    session.finished(rollouts)
+    session.work_ended(rollouts)
     session.handle(HeartbeatReply(SESSION, 9, lanes(0, 1)), 0.1)
     closed, *_ = session.handle(Rejoin(SESSION), 1.0)
     assert closed == CloseLanes((LaneIncarnation(0, 0), LaneIncarnation(1, 0)))
-    assert session.held_count() == 0
+    assert held_count(session) == 0
     session.handle(Welcome(12, FIRST + 1, RUN), 1.1)
-    assert session.held_count() == 0
-    assert session.next_task() is None
+    assert held_count(session) == 0
+    assert session.next_work() is None
     (heartbeat,) = sent(session.tick(2.2), Heartbeat)
     assert (heartbeat.session, heartbeat.replies, heartbeat.version, heartbeat.tickets) == (12, 0, -1, ())
 
@@ -502,14 +514,14 @@ def test_nothing_of_a_session_outlives_it() -> None:
 def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_sent() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
-    assert not session.abandoned(task.session)
+    assert not session.is_unwanted(task)
     session.handle(Rejoin(SESSION), 1.0)
-    assert session.abandoned(task.session)
+    assert session.is_unwanted(task)
     session.handle(Welcome(12, FIRST + 1, RUN), 1.1)
-    assert session.abandoned(task.session)
+    assert session.is_unwanted(task)
     session.handle(msgspec.structs.replace(collect((0, 0)), session=12), 1.2)  # the same ticket number again
-    assert session.finished(fake_rollouts(task)) == []
-    assert session.held_count() == 1
+    assert session.work_ended(fake_rollouts(task)) == []
+    assert held_count(session) == 1
 
 
 def test_a_message_of_another_session_is_ignored() -> None:
@@ -522,7 +534,7 @@ def test_a_message_of_another_session_is_ignored() -> None:
         Rejoin(other),
     ):
         assert session.handle(message, 1.0) == []
-    assert (session.state, session.held_count()) == (State.READY, 1)
+    assert (session.state, held_count(session)) == (State.READY, 1)
     assert sent(session.tick(1.0), Heartbeat)[0].replies == 0
 
 
@@ -539,7 +551,7 @@ def test_a_worker_joins_a_silent_learner_again() -> None:
     assert sent(session.tick(1.0), Heartbeat)
     assert sent(session.tick(7.0), Heartbeat)
     assert hello_attempt(session.tick(7.1)) == FIRST + 1
-    assert (session.state, session.held_count()) == (State.JOINING, 0)
+    assert (session.state, held_count(session)) == (State.JOINING, 0)
 
 
 def test_a_learner_that_was_not_spoken_to_is_not_silent() -> None:
@@ -572,11 +584,21 @@ def test_stop_finishes_the_rollout_in_progress_and_returns_the_other_tickets_in_
     task = task_of(session)  # tickets 0 and 2
     assert session.stop() == []
     assert session.state is State.DRAINING
-    assert not session.abandoned(task.session)
-    *rollouts, goodbye, leave = session.finished(fake_rollouts(task))
+    assert not session.is_unwanted(task)
+    *rollouts, goodbye, leave = session.work_ended(fake_rollouts(task))
     assert [rollout.ticket for rollout in sent(rollouts, Rollout)] == [0, 2]
     assert goodbye == Send(Goodbye(SESSION, "told to stop", (1,)))
     assert leave == Leave(0, "told to stop")
+
+
+def test_an_evaluation_in_progress_is_not_finished_by_a_worker_that_drains() -> None:
+    session = ready(EVALUATE)
+    task = session.next_work()
+    assert isinstance(task, EvaluationTask)
+    assert not session.is_unwanted(task)
+    session.stop()
+    assert session.is_unwanted(task)
+    assert session.work_ended([]) == [Send(Goodbye(SESSION, "told to stop", (8,))), Leave(0, "told to stop")]
 
 
 def test_stop_without_work_in_progress_leaves_at_once() -> None:
@@ -595,7 +617,7 @@ def test_two_stops_leave_at_once() -> None:
     task = task_of(session)
     session.stop()
     assert session.stop() == [Leave(0, "told to stop")]
-    assert session.abandoned(task.session)
+    assert session.is_unwanted(task)
     assert session.stop() == []
 
 
@@ -603,8 +625,8 @@ def test_drain_finishes_the_rollout_in_progress_and_then_leaves() -> None:
     session = ready(collect((0, 0), (1, 0)))
     task = task_of(session)
     assert session.handle(Drain("finished"), 0.1) == []
-    assert session.next_task() is None
-    effects = session.finished(fake_rollouts(task))
+    assert session.next_work() is None
+    effects = session.work_ended(fake_rollouts(task))
     assert len(sent(effects, Rollout)) == 1
     assert effects[-2:] == [Send(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
 
@@ -624,7 +646,7 @@ def test_no_ticket_is_accepted_while_draining() -> None:
     task = task_of(session)
     session.stop()
     assert session.handle(collect((1, 0)), 0.1) == []
-    effects = session.finished(fake_rollouts(task))
+    effects = session.work_ended(fake_rollouts(task))
     assert sent(effects, Goodbye)[0].tickets == ()
 
 
@@ -709,7 +731,7 @@ def test_a_worker_that_has_left_sends_nothing() -> None:
     for message in EVERY_MESSAGE:
         assert session.handle(message, 1.0) == []
     assert session.tick(1e6) == session.stop() == session.fail("x", "", None) == []
-    assert session.next_task() is None
+    assert session.next_work() is None
 
 
 # -------------------------------------------------------------------- the table
@@ -752,10 +774,10 @@ def test_every_message_to_a_worker_is_tried() -> None:
 @pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
 def test_a_message_that_the_table_does_not_list_changes_nothing(state: State, message: ToWorker) -> None:
     session = in_state(state)
-    held = session.held_count()
+    held = held_count(session)
     effects = session.handle(message, 0.1)
     if type(message) not in TABLE[state]:
-        assert (effects, session.state, session.held_count()) == ([], state, held)
+        assert (effects, session.state, held_count(session)) == ([], state, held)
 
 
 @pytest.mark.parametrize("state", State)
@@ -769,7 +791,7 @@ def test_the_table_names_the_state_that_follows(state: State, message: ToWorker)
 def test_a_worker_sends_only_messages_for_a_learner() -> None:
     kinds = set(ToLearner.__args__)
     session = ready(collect((0, 0)))
-    effects = session.finished(fake_rollouts(task_of(session))) + session.tick(1.0) + session.stop()
+    effects = session.work_ended(fake_rollouts(task_of(session))) + session.tick(1.0) + session.stop()
     assert {type(effect.message) for effect in effects if isinstance(effect, Send)} <= kinds
 
 

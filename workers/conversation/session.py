@@ -102,6 +102,21 @@ class EvaluationTask:
     weights: Weights
     order: Evaluate
 
+    @property
+    def session(self) -> int:
+        """That of the order."""
+        return self.order.session
+
+
+@dataclass(frozen=True)
+class SharedOrders:
+    """Orders of a vector environment that come through shared memory, and not with messages."""
+
+    session: int
+
+
+Work = Task | EvaluationTask | Order
+
 
 @dataclass(frozen=True)
 class Identity:
@@ -148,7 +163,7 @@ class _SessionState:
     orders: HeldOrders = field(default_factory=HeldOrders)
     described: Described | None = None  # sent with every Heartbeat, because one may be lost
     weights: Weights | None = None
-    in_progress: tuple[int, ...] = ()  # tickets
+    in_progress: bool = False  # whether a piece of work is
     replies: int = 0  # number of the last HeartbeatReply
     acknowledged_version: int = -1  # newest version that a message of this worker has named
 
@@ -158,16 +173,47 @@ class _SessionState:
         return -1 if self.weights is None else self.weights.version
 
     def unfinished(self) -> tuple[int, ...]:
-        """Tickets that are not yet collected or executed."""
-        return (*self.rollouts.tickets(), *self.evaluations.tickets(), *self.orders.tickets())
+        """Tickets that are not yet collected or executed: as many as a message may name."""
+        return (*self.rollouts.tickets(), *self.evaluations.tickets(), *self.orders.tickets())[:MAX_TICKETS]
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
         return (*self.rollouts.lanes(), *self.orders.lanes())
 
+    def next_work(self, session: int) -> Work | None:
+        """The next piece of work: an evaluation of the weights held, else rollouts to collect together, else an order."""
+        if self.weights is not None:
+            if (evaluation := self.evaluations.next(self.version)) is not None:
+                return EvaluationTask(self.weights, evaluation)
+            if assignments := self.rollouts.startable(self.version):
+                return Task(session, self.weights, assignments)
+        return self.orders.next()
+
+    def keep(self, answer: Rollout | Evaluated | Answer) -> bool:
+        """Keep what work has led to; False if it is no longer wanted, for example because its lane was released."""
+        match answer:
+            case Rollout():
+                return self.rollouts.keep(answer)
+            case Evaluated():
+                return self.evaluations.keep(answer)
+        return self.orders.keep(answer)
+
+    def release(self, lanes: Sequence[LaneIncarnation]) -> list[Effect]:
+        """Drop these lanes."""
+        released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
+        return [CloseLanes(released)] if released else []
+
+    def release_unlisted(self, received: Sequence[Received]) -> list[Effect]:
+        """Drop the lanes that the learner does not list: their Release was lost.
+
+        Only a new HeartbeatReply may do so: a copy of an old message does not list the lanes that came after it.
+        """
+        listed = {of_lane.lane for of_lane in received}
+        return self.release([lane for lane in self.lanes() if lane.lane not in listed])
+
 
 class Session:
-    """State machine of one worker, from its first Hello until it leaves."""
+    """State machine of one worker, from its first Hello until it leaves. Call `tick` at `due_s`, at the latest."""
 
     def __init__(
         self, identity: Identity, now: float, *, join_timeout_s: float = 60.0, rejoin_timeout_s: float = REJOIN_TIMEOUT_S
@@ -181,7 +227,7 @@ class Session:
         self._rejoin_timeout_s = rejoin_timeout_s
         self._attempt = identity.process_nonce
         self._unanswered_s = math.inf  # when the first Heartbeat was sent since the learner was heard
-        self._due_s = self._joining_s = now
+        self.due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""
         self._current = _SessionState()
@@ -201,33 +247,31 @@ class Session:
             case Welcome():
                 return self._welcome(message, now)
             case Refuse(reason):
-                return self._leave(message, 2, reason)
+                return self.refused(reason)
             case Drain(reason):
                 return self._drain(message, reason)
             case Rejoin():
                 return self._rejoin(message, "the learner does not know this session", now)
         self._unanswered_s = math.inf
+        current = self._current
+        again: list[Rollout | Evaluated | Answer | None] = []
         match message:
-            case Weights(version):
-                if version > self._current.version:
-                    self._current.weights = message
+            case Weights(version) if version > current.version:
+                current.weights = message
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
-                self._current.rollouts.forget_received(received)
-                again = [self._current.rollouts.take(permit, version) for permit in permits]
-                return [Send(rollout) for rollout in again if rollout is not None]
+                current.rollouts.forget_received(received)
+                again = [current.rollouts.take(permit, version) for permit in permits]
             case Evaluate() if isinstance(self.run, RunSpec):
-                evaluated = self._current.evaluations.take(message)
-                return [] if evaluated is None else [Send(evaluated)]
+                again = [current.evaluations.take(message)]
             case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
-                answer = self._current.orders.take(message)
-                return [] if answer is None else [Send(answer)]
+                again = [current.orders.take(message)]
             case Release(_, lanes):
-                return self._release(lanes)
-            case HeartbeatReply(_, number, received) if number > self._current.replies:
-                self._current.replies = number
-                self._current.rollouts.forget_received(received)
-                return self._release_unlisted(received)
-        return []
+                return current.release(lanes)
+            case HeartbeatReply(_, number, received) if number > current.replies:
+                current.replies = number
+                current.rollouts.forget_received(received)
+                return current.release_unlisted(received)
+        return [Send(answer) for answer in again if answer is not None]
 
     def tick(self, now: float) -> list[Effect]:
         """Do what is due: Hello, Heartbeat (also to acknowledge new weights), or giving up on a silent learner."""
@@ -237,9 +281,9 @@ class Session:
             case State.JOINING:
                 if now - self._joining_s > self._join_timeout_s:
                     return self._leave(LearnerSilent(), 1, f"{NO_LEARNER} for {self._join_timeout_s:g} s")
-                if now < self._due_s:
+                if now < self.due_s:
                     return []
-                self._due_s = now + self._backoff_s
+                self.due_s = now + self._backoff_s
                 self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
                 return [Send(self.identity.hello(self._attempt))]
         assert self.run is not None
@@ -251,21 +295,28 @@ class Session:
         """A Heartbeat, if one is due. It changes nothing else, so it may be sent at any moment."""
         if self.run is None or self.state not in (State.READY, State.DRAINING):
             return []
-        if now < self._due_s and self._current.acknowledged_version == self._current.version:
+        if now < self.due_s and self._current.acknowledged_version == self._current.version:
             return []
-        self._due_s = now + self.run.heartbeat_s
+        self.due_s = now + self.run.heartbeat_s
         self._unanswered_s = min(self._unanswered_s, now)
-        self._current.acknowledged_version = self._current.version
-        described = self._current.described
-        return [Send(self._heartbeat()), *([] if described is None else [Send(described)])]
+        current, statistics = self._current, self._statistics
+        current.acknowledged_version = current.version
+        heartbeat = Heartbeat(
+            session=self.session,
+            replies=current.replies,
+            version=current.version,
+            tickets=current.unfinished(),
+            steps=statistics.steps,
+            stages=dict(statistics.stages),
+            resident_bytes=statistics.resident_bytes,
+        )
+        return [Send(each) for each in (heartbeat, current.described) if each is not None]
 
     def update_statistics(self, statistics: Statistics) -> None:
         """The next Heartbeat reports these."""
         self._statistics = statistics
 
-    def next_due_s(self) -> float:
-        """Time at which `tick` must be called at the latest."""
-        return self._due_s
+    # ---------------------------------------------------------------- leaving
 
     def stop(self) -> list[Effect]:
         """Leave: after the work in progress, or at once when called twice."""
@@ -274,19 +325,16 @@ class Session:
     def fail(self, error: str, traceback: str, lane: int | None, *, of_policy: bool = False) -> list[Effect]:
         """The environment, the user's policy (`of_policy`), or this worker raised: report it to the learner, and leave."""
         error = one_line(error)
-        effects: list[Effect] = []
-        if self.state in (State.READY, State.DRAINING):
-            effects.append(Send(Failure(self.session, error, last_text(traceback), lane, of_policy)))
-        return [] if self.state is State.LEFT else effects + self._leave(WorkerFailed(), 1, error)
+        failure = Failure(self.session, error, last_text(traceback), lane, of_policy)
+        return self._leave(WorkerFailed(), 1, error, failure)
 
     def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[Effect]:
         """Leave a run in which this worker cannot take part, or (with another exit code) not now."""
-        goodbye = Send(Goodbye(self.session, one_line(reason), ()))
-        return [goodbye, *self._leave(WorkerFailed(), exit_code, reason)]
+        return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
     def refused(self, reason: str) -> list[Effect]:
-        """Leave, because the learner's endpoint rejects this worker for good."""
-        return [] if self.state is State.LEFT else self._leave(Refuse(reason), 2, reason)
+        """Leave, because the learner, or its endpoint, rejects this worker for good."""
+        return self._leave(Refuse(reason), 2, reason)
 
     # ---------------------------------------------------------------- describing
 
@@ -297,76 +345,37 @@ class Session:
         self._current.described = Described(self.session, description)
         return [Send(self._current.described)]
 
-    # ---------------------------------------------------------------- collecting
+    # ---------------------------------------------------------------- working
 
-    def next_task(self) -> Task | None:
-        """The oldest ticket of every lane that can start, to be collected together. None when there is none."""
-        if not self._is_idle() or self._current.weights is None:
+    def next_work(self) -> Work | None:
+        """The next piece of work, which is in progress until `work_ended`. None if there is none, or one is in progress."""
+        if self.state is not State.READY or self._current.in_progress:
             return None
-        assignments = self._current.rollouts.startable(self._current.version)
-        if not assignments:
-            return None
-        self._current.in_progress = tuple(assignment.ticket for assignment in assignments)
-        return Task(self.session, self._current.weights, assignments)
+        work = self._current.next_work(self.session)
+        self._current.in_progress = work is not None
+        return work
 
-    def finished(self, rollouts: Sequence[Rollout]) -> list[Effect]:
-        """The task in progress has ended with these rollouts."""
-        # The session may have ended, or the lane may have been released, while it was collected.
-        kept = [each for each in rollouts if each.session == self.session and self._current.rollouts.keep(each)]
-        self._current.acknowledged_version = max([self._current.acknowledged_version, *(each.version for each in kept)])
-        return self._work_ended(kept)
+    def work_ended(self, answers: Sequence[Rollout | Evaluated | Answer]) -> list[Effect]:
+        """The work in progress has ended with these answers; with none, it was abandoned. A worker that drains leaves."""
+        current = self._current
+        # The session may have ended, or the lane may have been released, in the meantime.
+        kept = [each for each in answers if each.session == self.session and current.keep(each)]
+        versions = [each.version for each in kept if isinstance(each, Rollout)]
+        current.acknowledged_version = max([current.acknowledged_version, *versions])
+        current.in_progress = False
+        return [*map(Send, kept), *self._leave_if_drained()]
 
-    # ---------------------------------------------------------------- evaluating
-
-    def next_evaluation(self) -> EvaluationTask | None:
-        """The oldest order to evaluate the weights held. It is in progress until `evaluated`. None when there is none."""
-        if not self._is_idle() or self._current.weights is None:
-            return None
-        order = self._current.evaluations.next(self._current.version)
-        if order is None:
-            return None
-        self._current.in_progress = (order.ticket,)
-        return EvaluationTask(self._current.weights, order)
-
-    def evaluated(self, answer: Evaluated | None) -> list[Effect]:
-        """The evaluation in progress has ended with this answer, or with None: it was abandoned."""
-        if answer is None or answer.session != self.session or not self._current.evaluations.keep(answer):
-            return self._work_ended([])
-        return self._work_ended([answer])
-
-    def evaluation_abandoned(self, session: int) -> bool:
-        """True when an evaluation of this session is no longer wanted. A worker that leaves does not finish it."""
-        return self.state is not State.READY or session != self.session
-
-    # ---------------------------------------------------------------- stepping in lock-step
-
-    def next_order(self) -> Order | None:
-        """The oldest order that is not yet executed. It is in progress until `answered`."""
-        if not self._is_idle():
-            return None
-        order = self._current.orders.next()
-        self._current.in_progress = () if order is None else (order.ticket,)
-        return order
-
-    def answered(self, answer: Answer) -> list[Effect]:
-        """The order in progress was executed with this answer."""
-        is_wanted = answer.session == self.session and self._current.orders.keep(answer)
-        return self._work_ended([answer] if is_wanted else [])
-
-    def abandoned(self, session: int) -> bool:
-        """True when the work of this session is no longer wanted."""
-        return self.state in (State.JOINING, State.LEFT) or session != self.session
-
-    def held_count(self) -> int:
-        """Number of tickets and rollouts that this worker holds."""
-        return len(self._current.rollouts)
+    def is_unwanted(self, work: Work | SharedOrders) -> bool:
+        """True when this work is no longer wanted. A worker that drains finishes a rollout, but not an evaluation."""
+        goes_on = (State.READY,) if isinstance(work, EvaluationTask) else (State.READY, State.DRAINING)
+        return self.state not in goes_on or work.session != self.session
 
     # ---------------------------------------------------------------- inside
 
     def _join(self, now: float) -> None:
         """Start to join, as if for the first time."""
         self._attempt += 1
-        self._joining_s = self._due_s = now
+        self._joining_s = self.due_s = now
         self._backoff_s = HELLO_FIRST_S
         self._current = _SessionState()
 
@@ -377,7 +386,7 @@ class Session:
         self._current = _SessionState()
         self.run, self.session = message.run, message.session
         self._unanswered_s = math.inf
-        self._due_s = now + message.run.heartbeat_s
+        self.due_s = now + message.run.heartbeat_s
         self._join_timeout_s = self._rejoin_timeout_s
         return [StartSession(message.run)]
 
@@ -389,53 +398,24 @@ class Session:
         self._join(now)
         return [CloseLanes(lanes), *self.tick(now)]
 
-    def _is_idle(self) -> bool:
-        """Whether this worker may start a piece of work."""
-        return self.state is State.READY and not self._current.in_progress
-
-    def _work_ended(self, messages: Sequence[ToLearner]) -> list[Effect]:
-        """The work in progress has ended: send its messages, and leave if this worker drains."""
-        self._current.in_progress = ()
-        effects: list[Effect] = [Send(message) for message in messages]
-        return effects + (self._goodbye() if self.state is State.DRAINING else [])
-
-    def _release_unlisted(self, received: Sequence[Received]) -> list[Effect]:
-        """Drop the lanes that the learner does not list: their Release was lost.
-
-        Only a new HeartbeatReply may do so: a copy of an old message does not list the lanes that came after it.
-        """
-        listed = {of_lane.lane for of_lane in received}
-        return self._release([lane for lane in self._current.lanes() if lane.lane not in listed])
-
-    def _release(self, lanes: Sequence[LaneIncarnation]) -> list[Effect]:
-        released = (*self._current.rollouts.release(lanes), *self._current.orders.release(lanes))
-        return [CloseLanes(released)] if released else []
-
-    def _heartbeat(self) -> Heartbeat:
-        return Heartbeat(
-            session=self.session,
-            replies=self._current.replies,
-            version=self._current.version,
-            tickets=self._current.unfinished()[:MAX_TICKETS],
-            steps=self._statistics.steps,
-            stages=dict(self._statistics.stages),
-            resident_bytes=self._statistics.resident_bytes,
-        )
-
     def _drain(self, event: object, reason: str) -> list[Effect]:
         self._transition(event)
         self._reason = reason
+        return [Leave(0, reason)] if self.state is State.LEFT else self._leave_if_drained()
+
+    def _leave_if_drained(self) -> list[Effect]:
+        if self.state is not State.DRAINING or self._current.in_progress:
+            return []
+        goodbye = Goodbye(self.session, one_line(self._reason), self._current.unfinished())
+        return self._leave(WorkFinished(), 0, self._reason, goodbye)
+
+    def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[Effect]:
+        """Leave, once. The last message is said only within a session."""
         if self.state is State.LEFT:
-            return [Leave(0, reason)]
-        return [] if self._current.in_progress else self._goodbye()
-
-    def _goodbye(self) -> list[Effect]:
-        goodbye = Send(Goodbye(self.session, one_line(self._reason), self._current.unfinished()[:MAX_TICKETS]))
-        return [goodbye, *self._leave(WorkFinished(), 0, self._reason)]
-
-    def _leave(self, event: object, exit_code: int, reason: str) -> list[Effect]:
+            return []
+        said = [] if last is None or self.state is State.JOINING else [Send(last)]
         self._transition(event)
-        return [Leave(exit_code, reason)]
+        return [*said, Leave(exit_code, reason)]
 
     def _transition(self, event: object) -> None:
         self.state = TABLE[self.state][type(event)]

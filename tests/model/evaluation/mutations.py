@@ -49,9 +49,9 @@ OF_THE_WORKER = {
     "an answer is kept although rows belong to it": Mutation(
         HELD, "if not (order.send_rows or order.send_frames):", "if True:"
     ),
-    "a worker that evaluates takes other work": Mutation(SESSION, "self._current.in_progress = (order.ticket,)", "pass"),
+    "a worker that evaluates takes other work": Mutation(SESSION, "self._current.in_progress = work is not None", "pass"),
     "an evaluation of an earlier session goes on": Mutation(
-        SESSION, "return self.state is not State.READY or session != self.session", "return False"
+        SESSION, "return self.state not in goes_on or work.session != self.session", "return False"
     ),
 }
 MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}

@@ -14,8 +14,8 @@ from tests.model import worker_part
 from tests.model.conversation import Content
 from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
 from tests.model.worker_part import Worker
-from tests.support.fake_ends import fake_evaluated, fake_rows
-from workers.conversation.session import Effect, EvaluationTask, Send
+from tests.support.fake_ends import fake_rows
+from workers.conversation.session import EvaluationTask, Task
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
@@ -28,47 +28,33 @@ SAVED = {"_orders", "_answers"}
 class EvaluatingWorker(Worker):
     """One state of a worker, which an event changes."""
 
-    evaluation: EvaluationTask | None = None
     played: set[tuple[int, int]] = field(default_factory=set)
     """session and ticket of the orders that were played"""
 
     def end(self) -> None:
         super().end()
-        self.evaluation = None
         self.played = set()
 
     def finish(self, now: float) -> list[ToLearner]:
-        if self.evaluation is None:
-            return super().finish(now)
-        assert self.session is not None
-        assert self.task is None, "a worker evaluates and collects at the same time"
-        task, self.evaluation = self.evaluation, None
-        effects = [*_rows(task.order, EPISODE_STEPS - 1), *self.session.evaluated(fake_evaluated(task))]
-        return self._turn(effects, now)
+        last_rows = _rows(self.task.order, EPISODE_STEPS - 1) if isinstance(self.task, EvaluationTask) else []
+        return [*last_rows, *super().finish(now)]
 
-    def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
-        current = self.session
-        assert current is not None
-        if self.evaluation is not None and current.evaluation_abandoned(self.evaluation.order.session):
-            self.evaluation = None
-            effects = effects + current.evaluated(None)
-        if self.task is not None and current.abandoned(self.task.session):
-            self.task = None
-            effects = effects + current.finished([])
-        if self.evaluation is None and self.task is None and (task := current.next_evaluation()) is not None:
-            order, self.evaluation = task.order, task
-            assert task.weights.version == order.version, "an evaluation under other weights than those of its order"
+    def _begin(self, work: Task | EvaluationTask) -> list[ToLearner]:
+        first_rows = super()._begin(work)
+        if isinstance(work, EvaluationTask):
+            order = work.order
+            assert work.weights.version == order.version, "an evaluation under other weights than those of its order"
             assert (order.session, order.ticket) not in self.played, "an order to evaluate was played twice"
             if not order.send_rows:
                 self.played.add((order.session, order.ticket))
-            effects = effects + _rows(order, 0)
-        return super()._turn(effects, now)
+            first_rows += _rows(order, 0)
+        return first_rows
 
 
-def _rows(order: Evaluate, step: int) -> list[Effect]:
+def _rows(order: Evaluate, step: int) -> list[ToLearner]:
     """The row of this step of each episode, if they are asked for."""
     episodes = range(len(order.seeds) if order.send_rows else 0)
-    return [Send(fake_rows(order.session, order.ticket, episode, step)) for episode in episodes]
+    return [fake_rows(order.session, order.ticket, episode, step) for episode in episodes]
 
 
 # -------------------------------------------------------------------- to tuples and back
@@ -85,9 +71,10 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
     played = tuple(
         (session(number), ticket(each)) for number, each in sorted(worker.played) if number == worker.session.session
     )
-    task = worker.evaluation
-    running = None if task is None else (task.weights.version, content_of(task.order, worker.number))
-    return content, (orders, answers, played), running
+    task = worker.task
+    if not isinstance(task, EvaluationTask):
+        return content, (orders, answers, played), None
+    return content, (orders, answers, played), (task.weights.version, content_of(task.order, worker.number))
 
 
 def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWorker:
@@ -104,7 +91,7 @@ def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWor
     }
     worker.played = {(number.value, each.value) for number, each in played}
     if running is not None:
-        worker.evaluation = EvaluationTask(weights(running[0]), _order(running[1]))
+        worker.task = EvaluationTask(weights(running[0]), _order(running[1]))
     return worker
 
 

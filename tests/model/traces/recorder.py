@@ -34,7 +34,7 @@ METHODS = {
     "Membership": ("refuse", "record_activity"),
     "Session": (
         *("handle", "tick", "heartbeat_if_due", "update_statistics", "stop", "fail", "decline", "refused", "described"),
-        *("next_task", "finished", "next_evaluation", "evaluated", "next_order", "answered"),
+        *("next_work", "work_ended"),
     ),
 }
 CHANGE_NOTHING_IF_EMPTY = ("tick", "heartbeat_if_due")

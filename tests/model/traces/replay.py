@@ -74,7 +74,7 @@ class Replay:
     def play(self, record: Record, used: set[int] | None = None) -> Any:
         """Make a call again. Returns its arguments. `used`: for a new learner, the tickets that the run had used."""
         self.calls += 1
-        to_learner = record.part != "Session" or record.method in ("finished", "evaluated", "answered")
+        to_learner = record.part != "Session" or record.method == "work_ended"
         given = [self._made(each, to_learner=to_learner) for each in record.arguments]
         named = {name: self._made(value, to_learner=to_learner) for name, value in record.keywords.items()}
         try:

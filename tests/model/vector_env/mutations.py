@@ -47,10 +47,8 @@ OF_THE_WORKER = {
     ),
     "an executed order stays": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.answer = answer"),
     "an answer is not kept": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.order = None"),
-    "replies to heartbeats are not counted": Mutation(SESSION, "self._current.replies = number", "pass"),
-    "an answered order stays in progress": Mutation(
-        SESSION, "self._current.in_progress = ()\n        effects: list", "effects: list"
-    ),
+    "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
+    "an answered order stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
 }
 MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 

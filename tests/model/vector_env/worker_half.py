@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protocol.messages import Answer, ToLearner
+from protocol.messages import Answer, Call, Reset, Step, ToLearner
 from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, session, ticket
 from tests.model.names import ATTEMPTS, MASK, Kind, name
@@ -26,7 +26,7 @@ from tests.model.vector_env.order_content import (
 )
 from tests.model.worker_part import PAUSE_S
 from workers.conversation.held_orders import _HeldLane
-from workers.conversation.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession
+from workers.conversation.session import CloseLanes, Effect, Identity, Leave, Send, Session, SharedOrders, StartSession
 from workers.conversation.states import State
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Worker:
                 assert current is not None
                 assert self.work is not None
                 done, self.work = self.work, None
-                return self._turn(current.answered(done), now)
+                return self._turn(current.work_ended([done]), now)
             case ("time",):
                 return [] if current is None or self.frozen else self._turn([], now)
             case ("told",):
@@ -95,10 +95,13 @@ class Worker:
         current = self.session
         assert current is not None
         sent = self._do(effects)
-        if self.work is not None and current.abandoned(self.work.session):
+        if self.work is not None and current.is_unwanted(SharedOrders(self.work.session)):
             self.copies.pop(self.work.lane, None)
             self.work = None
-        if self.session is not None and self.work is None and (order := current.next_order()) is not None:
+            sent += self._do(current.work_ended([]))
+        if self.session is not None and (order := current.next_work()) is not None:
+            assert self.work is None, "a worker executes two orders at the same time"
+            assert isinstance(order, Reset | Step | Call)
             life, state = self.copies.get(order.lane, (order.incarnation, NEW))
             assert (order.session, order.ticket) != self.newest, "an order was executed twice"
             state = executed(order, state if life == order.incarnation else NEW)
@@ -139,9 +142,9 @@ def saved(worker: Worker, now: float) -> Content:
         None if current.run is None else session(current.session),
         name(Kind.ATTEMPT, current._attempt, worker.number),
         max(current._unanswered_s - now, -TIMEOUT_S - 1.0),
-        max(current._due_s - now, 0.0),
+        max(current.due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in sorted(held.orders._lanes.items())),
-        tuple(ticket(number) for number in held.in_progress),
+        held.in_progress,
         None if current.run is None else name(Kind.REPLIES, held.replies, current.session),
         tuple((lane, incarnation(lane, life), state) for lane, (life, state) in sorted(worker.copies.items())),
         None if worker.newest[0] != current.session else ticket(worker.newest[1]),
@@ -166,9 +169,9 @@ def loaded(content: Content, number: int, run: Stepping) -> Worker:
     current = worker.session = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
     current.state, current._attempt = State(state), attempt.value
-    current._unanswered_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
+    current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
-    held.in_progress = tuple(each.value for each in in_progress)
+    held.in_progress = in_progress
     if of_session is not None:
         current.run, current.session, held.replies = run.run, of_session.value, replies.value
     for lane, life, newest_of_lane, order, kept in lanes:
