@@ -175,7 +175,7 @@ class Stalled(RunError):
 
 
 class EnvironmentFailed(RunError):
-    """The environment raised; `detail` is the traceback where it happened.
+    """The environment raised; `detail` is the traceback where it happened. In a worker, `lane` is the lane of its copy.
 
     >>> import millrace
     >>> def broken():
@@ -186,6 +186,10 @@ class EnvironmentFailed(RunError):
     ...     print(error.detail.splitlines()[-1])
     OSError: the simulator has no licence
     """
+
+    def __init__(self, line: str, detail: str = "", lane: int | None = None) -> None:
+        super().__init__(line, detail)
+        self.lane = lane
 
 
 class PolicyFailed(RunError):

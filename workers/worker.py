@@ -22,7 +22,7 @@ from pathlib import Path
 
 from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
-from protocol.errors import BadMessage, PolicyFailed, UsageError, UserFacingError, first_line
+from protocol.errors import BadMessage, EnvironmentFailed, PolicyFailed, UsageError, UserFacingError, first_line
 from protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, Weights
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import make_policy
@@ -49,7 +49,6 @@ from workers.conversation.session import (
     Work,
 )
 from workers.conversation.states import State
-from workers.copies.env_errors import LaneFailed
 from workers.describe import describing
 from workers.evaluate.evaluator import Evaluator
 from workers.exit_codes import EXIT_UNSUITABLE
@@ -279,7 +278,7 @@ class Worker:
             self._decline(error)
             return
         detail = error.detail if isinstance(error, UserFacingError) else traceback.format_exc()
-        lane = error.lane if isinstance(error, LaneFailed) else None
+        lane = error.lane if isinstance(error, EnvironmentFailed) else None
         log.error("%s\n%s", error, detail)
         self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
 

@@ -17,6 +17,7 @@ from learner.vector_env.spec import requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
+from protocol.errors import EnvironmentFailed
 from protocol.messages import PROTOCOL_VERSION, Call, Failure, Goodbye, Hello, Order, Refuse, Reset, Step, Welcome
 from protocol.specs import StepSpec
 from protocol.wire.codec import Buffer, decode_to_worker
@@ -25,7 +26,6 @@ from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_
 from protocol.wire.wake_up import WakePipe
 from tests.support.described import described
 from tests.support.fake_link import FakeLink
-from workers.copies.env_errors import LaneFailed
 from workers.step.stepper import Stepper
 
 Choose = Callable[[int], int]
@@ -146,7 +146,7 @@ class AnyOrder(FakeLink):
         self.held.remove((name, order))
         try:
             answer = self._steppers[name].execute(order, no_pulse)
-        except LaneFailed as error:
+        except EnvironmentFailed as error:
             self._fail(name, error)
         else:
             self.inbox.append((name.encode(), answer))
@@ -156,10 +156,10 @@ class AnyOrder(FakeLink):
             self._steppers[name].serve_shared_memory(
                 0.0, no_pulse, self._sessions[name], lambda answer: self.inbox.append((name.encode(), answer))
             )
-        except LaneFailed as error:
+        except EnvironmentFailed as error:
             self._fail(name, error)
 
-    def _fail(self, name: str, error: LaneFailed) -> None:
+    def _fail(self, name: str, error: EnvironmentFailed) -> None:
         self.inbox.append((name.encode(), Failure(self._sessions[name], str(error), "traceback", error.lane)))
         self._end(name)
 

@@ -15,7 +15,7 @@ from protocol.arrays import Array, Bools
 from protocol.env_spec import EnvSpec
 from protocol.envs.action_masks import has_mask, without_mask
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import BadRollout
+from protocol.errors import BadRollout, EnvironmentFailed
 from protocol.messages import Evaluate
 from protocol.policy.masks import choices
 from protocol.rollout import Rollout, stack_rollouts, validate
@@ -24,9 +24,8 @@ from tests.support.collectors import collect, no_pulse, random_collector, random
 from tests.support.mask_envs import SIZES, InInfo, InObservation, Parts
 from workers.collect.collector import Collector, OpenEnvCopies
 from workers.copies.env_copies import VectorCopies
-from workers.copies.env_errors import LaneFailed
 from workers.copies.split_vector_env import SplitVectorEnv
-from workers.evaluate.evaluator import EvaluationFailed, Evaluator
+from workers.evaluate.evaluator import Evaluator
 
 ENVS: dict[str, Any] = {"InInfo": InInfo, "Parts": Parts, "InObservation": InObservation}
 
@@ -122,7 +121,7 @@ def test_a_wrong_mask_is_one_line_that_names_lane_copy_and_step(fault: str, open
     collector = random_collector(run) if open_copies is None else random_collector(run, open_copies)
     if open_copies is not None and fault == "short":
         pytest.skip("a SyncVectorEnv cannot join masks of different lengths")
-    with pytest.raises(LaneFailed) as caught:
+    with pytest.raises(EnvironmentFailed) as caught:
         collect(collector, run)
     line = str(caught.value)
     expected = "action_mask: expected 7 zeros and ones of int8 or bool in info, at least one allowed"
@@ -131,7 +130,7 @@ def test_a_wrong_mask_is_one_line_that_names_lane_copy_and_step(fault: str, open
 
 def test_a_wrong_mask_in_an_evaluation_is_one_line() -> None:
     run = masked_run("InInfo", fault="empty")
-    with pytest.raises(EvaluationFailed, match=r"copy 0, step \d+: action_mask: expected 7 zeros and ones"):
+    with pytest.raises(EnvironmentFailed, match=r"copy 0, step \d+: action_mask: expected 7 zeros and ones"):
         Evaluator(run, random_policy(run.policy)).play(Evaluate(1, 1, 0, (1,), True, 99, False, False), print, no_pulse)
 
 
@@ -188,7 +187,7 @@ def test_which_key_of_an_observation_is_a_mask(mask: Any, action: Any, expected:
 
 def test_a_run_without_masks_reads_none() -> None:
     run = msgspec.structs.replace(masked_run("InInfo"), masked=False)
-    with pytest.raises(LaneFailed, match="illegal action"):
+    with pytest.raises(EnvironmentFailed, match="illegal action"):
         collect(random_collector(run), run)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from protocol.alive import CallTimeouts
 from workers.activity import DOING, ENV_CALLS, SINCE_S, Activity, ActivityReader, activity, share_activity
-from workers.copies.env_errors import CopyRaised
+from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
 
@@ -70,11 +70,11 @@ def test_an_exit_in_environment_code_is_caught(kind: type[BaseException]) -> Non
     def make() -> gymnasium.Env[object, object]:
         raise kind(0)
 
-    with pytest.raises(CopyRaised):
+    with pytest.raises(CopyFailed):
         EnvLoop([make], lambda: None)
     loop = EnvLoop([Exits], lambda: None)
     loop.reset([0], [1], [None], lambda: None)
-    with pytest.raises(CopyRaised):
+    with pytest.raises(CopyFailed):
         loop.step([0], [None], lambda: None)
 
 

@@ -13,7 +13,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from protocol.arrays import Array
-from protocol.errors import UsageError
+from protocol.errors import EnvironmentFailed, UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import (
     TOY,
@@ -27,13 +27,12 @@ from tests.support.collectors import (
     with_env,
 )
 from workers.copies.env_copies import LoopedCopies, VectorCopies
-from workers.copies.env_errors import LaneFailed
 from workers.envs.toy import Countdown
 
 
-def failure_of(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> LaneFailed:
+def failure_of(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> EnvironmentFailed:
     """The error of a collector on this run's environment."""
-    with pytest.raises(LaneFailed) as caught:
+    with pytest.raises(EnvironmentFailed) as caught:
         collect(random_collector(run), run, lanes=lanes)
     assert "\n" not in str(caught.value)
     return caught.value
@@ -55,14 +54,14 @@ def test_the_lane_and_copy_that_raise_are_named() -> None:
             raise OSError("no display")
 
     run = run_of(f"{TOY}Countdown-v0", N=3)
-    with pytest.raises(LaneFailed, match="lane 5, copy 2, first reset: its environment raised OSError: no display"):
+    with pytest.raises(EnvironmentFailed, match="lane 5, copy 2, first reset: its environment raised OSError: no display"):
         collect(random_collector(run, loop_over([Countdown, Countdown, Third])), run, lanes=(5,))
 
 
 def test_an_environment_that_fails_once_works_again_in_a_new_incarnation(tmp_path: Path) -> None:
     run = run_of(f"{TOY}Raises-v0", kwargs={"once": str(tmp_path / "broke")})
     collector = random_collector(run)
-    with pytest.raises(LaneFailed):
+    with pytest.raises(EnvironmentFailed):
         collect(collector, run)
     collect(collector, run, incarnation=1)
 
@@ -72,13 +71,13 @@ def test_an_environment_that_cannot_be_made_is_named() -> None:
         raise RuntimeError("no licence\nfound")
 
     run = run_of(f"{TOY}Countdown-v0")
-    with pytest.raises(LaneFailed, match=r"lane 0, copy 0, made: .* RuntimeError: no licence$"):
+    with pytest.raises(EnvironmentFailed, match=r"lane 0, copy 0, made: .* RuntimeError: no licence$"):
         collect(random_collector(run, lambda r, lane, pulse: LoopedCopies([make] * 2, pulse)), run)
 
 
 def test_a_vector_environment_that_raises_is_named() -> None:
     run = run_of(f"{TOY}Raises-v0", N=2)
-    with pytest.raises(LaneFailed, match="lane 0, step 3: its environment raised ValueError: the toy"):
+    with pytest.raises(EnvironmentFailed, match="lane 0, step 3: its environment raised ValueError: the toy"):
         collect(random_collector(run, sync_vector_env_over([run.env.make] * 2)), run)
 
 
@@ -116,7 +115,7 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
     """What is said of an environment that answers this after `good` rows."""
     env = Answers(good, observation, reward, space)
     run = run_around(env, T=6)
-    with pytest.raises(LaneFailed) as caught:
+    with pytest.raises(EnvironmentFailed) as caught:
         collect(random_collector(run, loop_over([lambda: env])), run)
     return str(caught.value)
 
@@ -203,7 +202,9 @@ def test_the_copy_whose_observation_changes_is_named_even_if_another_makes_up_fo
     short, long = np.zeros(3, np.float32), np.zeros(5, np.float32)
     for copies, named in [((Turns(), Turns(short), Turns(long)), 1), ((Turns(long), Turns(), Turns(short)), 0)]:
         run = msgspec.structs.replace(run_around(copies[0], T=6), copies=3)
-        with pytest.raises(LaneFailed, match=rf"lane 0, copy {named}, step 3: observation: expected float32\[4\] as its"):
+        with pytest.raises(
+            EnvironmentFailed, match=rf"lane 0, copy {named}, step 3: observation: expected float32\[4\] as its"
+        ):
             collect(random_collector(run, loop_over([lambda env=env: env for env in copies])), run)  # type: ignore[misc]
 
 
@@ -256,7 +257,7 @@ class Far(Countdown):
 )
 def test_an_observation_from_which_no_policy_can_act_is_named(action_space: gymnasium.Space[Any], name: str) -> None:
     run = run_around(Far(action_space), T=4)
-    with pytest.raises(LaneFailed) as caught:
+    with pytest.raises(EnvironmentFailed) as caught:
         collect(random_collector(run, loop_over([lambda: Far(action_space)])), run)
     said = f"lane 0, {name} of the policy: expected finite values, got nan at step 0, copy 0, from observations up to 1e+39"
     assert str(caught.value) == f"{said}; wrap the environment so that they are smaller"
@@ -309,7 +310,7 @@ def test_a_vector_environment_whose_rewards_are_not_one_for_each_copy_is_named()
 
     run = run_of(f"{TOY}Countdown-v0", N=2)
     with pytest.raises(
-        LaneFailed, match=r"lane 0, step 0: reward: expected one for each of 2 copies, got an array of shape"
+        EnvironmentFailed, match=r"lane 0, step 0: reward: expected one for each of 2 copies, got an array of shape"
     ):
         collect(random_collector(run, lambda r, lane, pulse: VectorCopies(One([Countdown] * 2))), run)
 

@@ -8,11 +8,12 @@ import gymnasium
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from protocol.errors import EnvironmentFailed
 from protocol.wire.plain_values import pack
 from tests.support.collectors import collect, no_pulse, random_collector, run_of
 from tests.support.fact_envs import Facts
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
-from workers.copies.env_errors import CopyRaised, LaneFailed, Unusable
+from workers.copies.env_errors import CopyFailed
 
 FACTS = "tests.support.fact_envs:Facts-v0"
 
@@ -56,14 +57,14 @@ def test_the_outermost_that_has_the_attribute_gets_it(vector: bool) -> None:
 @pytest.mark.parametrize(("name", "what"), [("levle", "none"), ("step", "a method"), ("__dict__", "a private one")])
 def test_an_attribute_that_is_not_there_is_refused(vector: bool, name: str, what: str) -> None:
     copies, _ = made(vector)
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(CopyFailed) as caught:
         copies.assign(name, pack(1), no_pulse)
     assert caught.value.line == f"expected an attribute of the environment that is called {name}, got {what}"
 
 
 def test_what_a_setter_raises_is_the_environment_s() -> None:
     copies, _ = made(vector=False)
-    with pytest.raises(CopyRaised) as caught:
+    with pytest.raises(CopyFailed) as caught:
         copies.assign("small", pack(4), no_pulse)
     assert isinstance(caught.value.__cause__, ValueError)
 
@@ -102,5 +103,7 @@ def test_a_lane_names_the_attribute() -> None:
     run = run_of(FACTS)
     collector = random_collector(run)
     collector.env_attributes = pack({"levle": 2.0})
-    with pytest.raises(LaneFailed, match="lane 0, copy 0, set_env_attr levle: expected an attribute of the environment"):
+    with pytest.raises(
+        EnvironmentFailed, match="lane 0, copy 0, set_env_attr levle: expected an attribute of the environment"
+    ):
         collect(collector, run)

@@ -15,16 +15,15 @@ from gymnasium import spaces
 
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
+from protocol.errors import EnvironmentFailed, UsageError
 from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.policy.policy import Policy
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.collectors import no_pulse, random_policy, run_of
 from workers.collect.collector import Collector
 from workers.conversation.held_rollouts import Assignment
-from workers.copies.env_errors import LaneFailed
 from workers.evaluate import episode_rows
-from workers.evaluate.evaluator import EvaluationFailed, Evaluator
+from workers.evaluate.evaluator import Evaluator
 
 Array = np.ndarray[Any, Any]
 
@@ -206,7 +205,7 @@ def test_an_environment_may_keep_its_action() -> None:
 
 
 def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]) -> None:
-    with pytest.raises(EvaluationFailed) as caught:
+    with pytest.raises(EnvironmentFailed) as caught:
         play(Evaluator(echo_run(fails_at=2), Repeats()), order(1, 2))
     expected = "while the policy was evaluated: copy 0, step 1: its environment raised RuntimeError: the spring broke"
     assert str(caught.value) == expected
@@ -224,7 +223,7 @@ def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]
     ],
 )
 def test_an_unusable_value_is_named(bad: str, says: str) -> None:
-    with pytest.raises(EvaluationFailed, match=says):
+    with pytest.raises(EnvironmentFailed, match=says):
         play(Evaluator(echo_run(bad=bad), Repeats()), order(1))
 
 
@@ -259,9 +258,9 @@ def test_integers_of_another_dtype_are_taken_as_in_training_if_they_keep_their_v
         assert rollout.obs[0][:, 0].tolist() == [[255, 0], [255, 1], [255, 2], [255, 3], [255, 0]]
         return
     says = r"expected uint8\[2\] as its space says, got int64\[2\] with the value 256"
-    with pytest.raises(EvaluationFailed, match=f"copy 0, first reset: observation: {says}"):
+    with pytest.raises(EnvironmentFailed, match=f"copy 0, first reset: observation: {says}"):
         play(evaluator, order(1))
-    with pytest.raises(LaneFailed, match=says):
+    with pytest.raises(EnvironmentFailed, match=says):
         collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
 
 
@@ -290,7 +289,7 @@ def test_a_part_of_an_observation_that_is_missing_is_named(lost_after: int, wher
     policy = PolicySpec(observation_leaves(Parts().observation_space), action_spec(spaces.Discrete(2)))
     run = RunSpec(EnvSpec.of(lambda: Parts(lost_after)), policy, rollout_steps=4, copies=1, lanes=1, seed=1)
     says = f"copy 0, {where}: observation: expected the structure of its space, got a dict of 'left'"
-    with pytest.raises(EvaluationFailed, match=says):
+    with pytest.raises(EnvironmentFailed, match=says):
         play(Evaluator(run, random_policy(policy)), order(1))
 
 
@@ -300,7 +299,7 @@ def test_a_vector_reward_gets_the_advice_of_training(monkeypatch: pytest.MonkeyP
     for module, advice in ((None, ""), (sys, ", as --wrapper mo_gymnasium.wrappers:LinearReward does")):
         if module is not None:  # the package is imported
             monkeypatch.setitem(sys.modules, "mo_gymnasium", module)
-        with pytest.raises(EvaluationFailed) as caught:
+        with pytest.raises(EnvironmentFailed) as caught:
             play(Evaluator(echo_run(bad="vector"), Repeats()), order(1))
         assert str(caught.value) == f"while the policy was evaluated: {line}{advice}"
 
@@ -319,7 +318,7 @@ def test_an_observation_that_is_not_finite_is_named() -> None:
     run = run_of("CartPole-v1")
     spec = EnvSpec.of(lambda: Drifts(gymnasium.make("CartPole-v1")))
     run = msgspec.structs.replace(run, env=spec)
-    with pytest.raises(EvaluationFailed, match="copy 0, step 0: observation: expected finite numbers"):
+    with pytest.raises(EnvironmentFailed, match="copy 0, step 0: observation: expected finite numbers"):
         play(Evaluator(run, random_policy(run.policy)), order(1, 2))
 
 
@@ -419,5 +418,5 @@ def test_an_environment_that_cannot_be_filmed_is_refused() -> None:
     run = msgspec.structs.replace(echo_run(), env=EnvSpec("millrace-tests/Unseen-v0"))
     with pytest.raises(UsageError, match=r"Unseen-v0 cannot be filmed: expected it to render rgb_array, got \[\]"):
         Evaluator(run, Repeats()).play(order(1, frames=True), lambda rows: None, no_pulse)
-    with pytest.raises(EvaluationFailed, match=r"copy 0, render: expected an array \[H, W, 3\] of uint8, got float64"):
+    with pytest.raises(EnvironmentFailed, match=r"copy 0, render: expected an array \[H, W, 3\] of uint8, got float64"):
         Evaluator(painted(blank=True), Repeats()).play(order(1, frames=True), lambda rows: None, no_pulse)

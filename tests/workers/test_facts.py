@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from protocol.errors import EnvironmentFailed
 from protocol.messages import Evaluate
 from protocol.rollout import Rollout, validate
 from protocol.specs import RunSpec
@@ -25,11 +26,11 @@ from tests.support.collectors import (
 from tests.support.fact_envs import Facts
 from workers.collect.collector import Collector
 from workers.copies.env_copies import VectorCopies
-from workers.copies.env_errors import LaneFailed, Unusable
+from workers.copies.env_errors import CopyFailed
 from workers.copies.envpool_copies import EnvpoolCopies
 from workers.copies.facts import facts_of_copies, facts_of_info
 from workers.copies.split_vector_env import SplitVectorEnv
-from workers.evaluate.evaluator import EvaluationFailed, Evaluator
+from workers.evaluate.evaluator import Evaluator
 
 NAMES = ("is_success", "distance", "speed")
 FACTS = "tests.support.fact_envs:Facts-v0"
@@ -170,14 +171,14 @@ def test_what_is_no_number_names_the_key(vector: bool) -> None:
     copies = (lambda run, lane, pulse: VectorCopies(SyncVectorEnv([run.env.make] * 2), run.facts)) if vector else None
     collector = random_collector(run, copies) if copies else random_collector(run)
     expected = r"^lane 0, copy [01], step 2: info name: expected a number, got \w+ '?north'?; name only numbers"
-    with pytest.raises(LaneFailed, match=expected.replace("north'?", "north.*")):
+    with pytest.raises(EnvironmentFailed, match=expected.replace("north'?", "north.*")):
         collect(collector, run)
 
 
 def test_an_evaluation_names_the_key_too() -> None:
     run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), facts=("name",))
     evaluator = Evaluator(run, random_policy(run.policy))
-    with pytest.raises(EvaluationFailed, match=r"copy 0, step 2: info name: expected a number, got str 'north'"):
+    with pytest.raises(EnvironmentFailed, match=r"copy 0, step 2: info name: expected a number, got str 'north'"):
         evaluator.play(evaluate_order(run, 2), lambda rows: None, no_pulse)
 
 
@@ -194,7 +195,7 @@ def test_values_that_count_and_values_that_are_missing(value: Any, number: float
 
 @pytest.mark.parametrize("value", ["1", b"1", [], [1, 2], {}, np.ones(2), [[1], [2, 3]], 1j])
 def test_values_that_are_refused(value: Any) -> None:
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(CopyFailed) as caught:
         facts_of_info(["a"], {"a": value}, 1)
     assert caught.value.line.startswith("info a: expected a number, got ")
 
@@ -202,7 +203,7 @@ def test_values_that_are_refused(value: Any) -> None:
 def test_the_infos_of_copies() -> None:
     infos = {"a": np.array([1.0, 2.0]), "_a": np.array([True, False]), "b": np.array([3, 4]), "_c": np.ones(2, bool)}
     assert same(facts_of_copies(["a", "b", "c"], infos, 2), [[1.0, 3.0, math.nan], [math.nan, 4.0, math.nan]])
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(CopyFailed) as caught:
         facts_of_copies(["a"], {"a": np.ones(3)}, 2)
     assert caught.value.line.startswith("info a: expected a number for each of 2 copies, got ndarray")
 

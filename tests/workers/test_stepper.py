@@ -16,11 +16,11 @@ from gymnasium.vector import SyncVectorEnv
 
 import millrace
 from learner.vector_env.settings import VectorEnvSettings
+from protocol.errors import EnvironmentFailed
 from protocol.messages import Call, Reset, Returned, Step, Stepped
 from protocol.wire.plain_values import pack, unpack
 from tests.support.bit_equality import bit_equal
 from tests.support.described import step_spec
-from workers.copies.env_errors import LaneFailed
 from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
 from workers.step.stepper import Stepper
@@ -111,7 +111,7 @@ def stepped(env: Callable[[], Any], steps: int) -> list[Stepped]:
 def test_an_observation_that_does_not_fit_is_refused_at_every_step(nested: bool, later: str, got: str) -> None:
     named = "observation a" if nested else "observation"
     assert len(stepped(partial(Changes, nested), 3)) == 4
-    with pytest.raises(LaneFailed) as caught:
+    with pytest.raises(EnvironmentFailed) as caught:
         stepped(partial(Changes, nested, later=later), 4)
     expected = f"{named}: expected float32[2] as its space says, got {got}; fix the environment or its observation_space"
     assert str(caught.value) == f"lane 0, copy 0, step 3: {expected}"
@@ -286,11 +286,13 @@ def test_the_last_info_of_an_episode_is_not_that_of_the_reset() -> None:
 
 def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
     assert stepped(partial(Changes, reward=np.array([2.5])), 1)[1].reward.tolist() == [2.5, 2.5]
-    with pytest.raises(LaneFailed, match=r"copy 0, step 0: reward: expected a number, got an array of shape \(2,\); wrap"):
+    with pytest.raises(
+        EnvironmentFailed, match=r"copy 0, step 0: reward: expected a number, got an array of shape \(2,\); wrap"
+    ):
         stepped(partial(Changes, reward=np.zeros(2)), 1)
 
 
 def test_the_line_about_a_reward_of_several_numbers_names_mo_gymnasium_s_wrapper(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mo_gymnasium", ModuleType("mo_gymnasium"))
-    with pytest.raises(LaneFailed, match=r"one number, as --wrapper mo_gymnasium.wrappers:LinearReward does$"):
+    with pytest.raises(EnvironmentFailed, match=r"one number, as --wrapper mo_gymnasium.wrappers:LinearReward does$"):
         stepped(partial(Changes, reward=np.zeros(2)), 1)

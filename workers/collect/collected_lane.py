@@ -1,7 +1,7 @@
 """One lane that a worker collects on: its env copies, their running episodes, and the random generator of its actions.
 
 It keeps what one rollout passes on to the next: the last observations, which copies have ended, the running episodes. It
-raises `LaneFailed` for an environment that raises, for observations that do not fit their space, and for NaN.
+raises `EnvironmentFailed` for an environment that raises, for observations that do not fit their space, and for NaN.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from protocol.rollout import Episode, describe_first_non_finite, not_of_space
 from protocol.specs import Leaf, RunSpec
 from protocol.wire.plain_values import pack, unpack
 from workers.copies.env_copies import EnvCopies, Leaves, copy_seeds
-from workers.copies.env_errors import CopyRaised, LaneFailed, lane_failed
+from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.env_results import leaf_writers
 from workers.copies.facts import Facts
@@ -51,7 +51,7 @@ class CollectedLane:
         self._writers = leaf_writers(self._stored, run.copies)
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
-        """Set these attributes in all copies, unless they are set. Raises `LaneFailed` if a copy does not have one."""
+        """Set these attributes in all copies unless they are set. Raises `EnvironmentFailed` if a copy has none."""
         if packed == self._attributes:
             return
         before, now = (unpack(each) if each else {} for each in (self._attributes, packed))
@@ -60,8 +60,8 @@ class CollectedLane:
                 continue
             try:
                 self.copies.assign(name, pack(value), pulse)
-            except CopyRaised as error:
-                raise lane_failed(self.number, f"set_env_attr {name}", error) from error
+            except CopyFailed as error:
+                raise environment_failed(self.number, error, f"set_env_attr {name}") from error
         self._attributes = packed
 
     def reset(self, pulse: Pulse) -> None:
@@ -75,8 +75,8 @@ class CollectedLane:
         try:
             leaves = self.copies.reset(self._seeds, pulse)
             self.write_observations(self.joined([array[None] for array in self.obs]), 0, leaves)
-        except CopyRaised as error:
-            raise lane_failed(self.number, "first reset", error) from error
+        except CopyFailed as error:
+            raise environment_failed(self.number, error, "first reset") from error
         self._start_s = [perf_counter()] * len(self._start_s)
 
     def joined(self, arrays: Iterable[Array]) -> list[Array]:
@@ -84,7 +84,7 @@ class CollectedLane:
         return [writer.joined(array) for writer, array in zip(self._writers, arrays, strict=True)]
 
     def write_observations(self, joined: Iterable[Array], t: int, leaves: Leaves) -> None:
-        """Write observations into row `t` of the arrays. Raises `Unusable`, an error of one copy."""
+        """Write observations into row `t` of the arrays. Raises `CopyFailed`, an error of one copy."""
         for writer, array, values in zip(self._writers, joined, leaves, strict=True):
             writer.write(array[t], values)
 
@@ -97,13 +97,13 @@ class CollectedLane:
         """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""
         for leaf, array in zip(self._stored, obs, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise LaneFailed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
+                raise environment_failed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
             if (wrong := not_of_space(array, leaf)).any():
                 t, n = np.argwhere(wrong)[0][:2]
                 line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
-                raise LaneFailed(self.number, line)
+                raise environment_failed(self.number, line)
         if not np.isfinite(reward).all():
-            raise LaneFailed(self.number, f"reward: {describe_first_non_finite(reward)}")
+            raise environment_failed(self.number, f"reward: {describe_first_non_finite(reward)}")
 
     def check_acted(self, action: Array, log_prob: Array, obs: Sequence[Array]) -> None:
         """Raise if the policy computed no finite numbers from finite observations: some are too large for float32."""
@@ -111,7 +111,7 @@ class CollectedLane:
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
                 line = f"{name} of the policy: {describe_first_non_finite(array)}, from observations up to {largest:g}"
-                raise LaneFailed(self.number, f"{line}; wrap the environment so that they are smaller")
+                raise environment_failed(self.number, f"{line}; wrap the environment so that they are smaller")
 
     def finish(self, reward: Array, done: Bools, step_end_s: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """After T steps: which rows are valid [T, N], and the episodes that ended, oldest first.

@@ -31,7 +31,7 @@ from workers.collect.acting import RolloutActions, acting_of
 from workers.collect.collected_lane import CollectedLane
 from workers.conversation.held_rollouts import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
-from workers.copies.env_errors import CopyRaised, LaneFailed, lane_failed
+from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.env_results import write_numbers
 from workers.copies.envpool_copies import EnvpoolCopies
@@ -106,7 +106,7 @@ class Collector:
         """Collect one rollout for each assignment. Returns them in the order of the assignments.
 
         Each assignment must name a different lane. `pulse` is called at every step and may raise. If `pulse` raises, or an
-        environment does (`LaneFailed`), these lanes are closed and the unfinished rollouts are dropped.
+        environment does (`EnvironmentFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect: expected one assignment for each lane, got {assignments}")
@@ -119,7 +119,7 @@ class Collector:
             actions = self._acting.begin([lane.generator for lane in lanes])
             try:
                 self._act_and_step(rows, actions, lanes, pulse)
-            except (LaneFailed, EnvironmentFailed, PolicyFailed, IndexError):
+            except (EnvironmentFailed, PolicyFailed, IndexError):
                 # An invalid observation or reward may have caused the error. Then `check_values` raises the clearer one.
                 done = len(rows.step_end_s)
                 for i, lane in enumerate(lanes):
@@ -160,8 +160,8 @@ class Collector:
         self._opening = assignment.lane
         try:
             copies = self._open_copies(self._run, assignment.lane, pulse)
-        except CopyRaised as error:
-            raise lane_failed(assignment.lane, "made", error) from error
+        except CopyFailed as error:
+            raise environment_failed(assignment.lane, error, "made") from error
         lane = CollectedLane(self._run, assignment.lane, assignment.incarnation, copies)
         if self._opening == assignment.lane:
             self._lanes[assignment.lane] = lane
@@ -209,8 +209,8 @@ class Collector:
                     row = lane.copies.step(taken[i], pulse)
                     write_numbers(numbers, t, (row.reward, row.terminated, row.truncated))
                     lane.write_observations(obs, t + 1, row.leaves)
-                except CopyRaised as error:
-                    raise lane_failed(lane.number, f"step {t}", error) from error
+                except CopyFailed as error:
+                    raise environment_failed(lane.number, error, f"step {t}") from error
                 if row.facts:
                     lane.keep_facts(t, row.facts)
                 if (lost := row.lost) is not None:

@@ -26,7 +26,7 @@ from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import unpack
 from workers.activity import RESETTING, STEPPING, activity
-from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop, Infos, Pulse
 from workers.copies.env_results import missing_leaf, read_leaves
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
@@ -53,7 +53,7 @@ class StepResult(NamedTuple):
 
 
 class EnvCopies(Protocol):
-    """N env copies. Whatever the environment raises arrives as `CopyRaised`; what `pulse` raises passes through."""
+    """N env copies. Whatever the environment raises arrives as `CopyFailed`; what `pulse` raises passes through."""
 
     observation_space: gymnasium.Space[Any]
     """Observation space of one copy."""
@@ -163,7 +163,7 @@ def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any
 
 
 def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
-    """Set a public attribute that the environment, or one of its wrappers, has. Raises `CopyRaised`."""
+    """Set a public attribute that the environment, or one of its wrappers, has. Raises `CopyFailed`."""
     owner = env
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):
@@ -173,11 +173,11 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
         owner = owner.env
     if name.startswith("_") or not hasattr(owner, name) or callable(getattr(owner, name)):
         what = "a private one" if name.startswith("_") else "a method" if hasattr(owner, name) else "none"
-        raise Unusable(copy, f"expected an attribute of the environment that is called {name}, got {what}")
+        raise CopyFailed(copy, line=f"expected an attribute of the environment that is called {name}, got {what}")
     try:
         setattr(owner, name, value)
     except BaseException as error:
-        raise CopyRaised(copy, f"set_env_attr {name}") from error
+        raise CopyFailed(copy, f"set_env_attr {name}") from error
 
 
 class VectorCopies:
@@ -211,10 +211,10 @@ class VectorCopies:
                 return leaves
             no_end = np.zeros(self._per_copy, bool)
             return [*leaves, self._masks.read_all(observation, infos, no_end, no_end)]
-        except Unusable:
+        except CopyFailed:
             raise
         except BaseException as error:
-            raise CopyRaised(None, "reset") from error
+            raise CopyFailed(None, "reset") from error
 
     def _first(self, seeds: Sequence[int]) -> Any:
         """First observations, and infos. Most environments take a list of seeds, Atari an array, some one number."""
@@ -229,7 +229,7 @@ class VectorCopies:
         try:
             observation, reward, terminated, truncated, infos = self._env.step(actions)
         except BaseException as error:
-            raise CopyRaised(None, "step") from error
+            raise CopyFailed(None, "step") from error
         finally:
             self._activity.end(self._env.num_envs)
         for name, array in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
@@ -237,7 +237,7 @@ class VectorCopies:
                 line = (
                     f"{name}: expected one for each of {self._per_copy[0]} copies, got an array of shape {np.shape(array)}"
                 )
-                raise Unusable(None, line)
+                raise CopyFailed(None, line=line)
         try:
             leaves: Leaves = self._read(observation)
             if self._masks is not None:

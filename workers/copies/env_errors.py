@@ -1,49 +1,38 @@
-"""Errors of an environment, as a worker names them: the copy that raised, then the lane of that copy. Pure.
+"""Errors of an environment, as a worker names them: what an env copy did, then whose copy it is. Pure.
 
-Rule: the line of an error of a lane names the lane, once, at its beginning. Whoever shows the line adds nothing to it.
+Rule: the line of an error names the lane, or the evaluation, once, at its beginning. Whoever shows the line adds nothing.
 """
 
 from __future__ import annotations
 
 from traceback import format_exception
 
-from protocol.errors import RunError, first_line
+from protocol.errors import EnvironmentFailed, first_line
 
 
-class CopyRaised(Exception):
-    """An env copy raised; the environment's own exception is the cause.
+class CopyFailed(Exception):
+    """An env copy raised, and the environment's own exception is the cause; or it returned what no array can hold.
 
     `copy` is its number within the lane, or None where a vector environment does not say which one it was.
-    `doing` says what it did: "make", "reset" or a step.
+    `doing` says what it did: "make", "reset" or a step. `line` says what was expected and what it was, if it did not raise.
     """
 
-    def __init__(self, copy: int | None, doing: str) -> None:
-        super().__init__(copy, doing)
-        self.copy = copy
-        self.doing = doing
+    def __init__(self, copy: int | None, doing: str = "reset", line: str = "") -> None:
+        super().__init__(copy, doing, line)
+        self.copy, self.doing, self.line = copy, doing, line
 
 
-class Unusable(CopyRaised):
-    """An env copy returned what no array of the run can hold; `line` says what was expected and what it was."""
+def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = "") -> EnvironmentFailed:
+    """The error of a lane, or of an evaluation (None): one line, with the traceback as its detail if an env copy raised.
 
-    def __init__(self, copy: int | None, line: str, doing: str = "reset") -> None:
-        super().__init__(copy, doing)
-        self.line = line
-
-
-class LaneFailed(RunError):
-    """The environment raised, or returned data that no rollout can hold. `detail` is its traceback, if it raised."""
-
-    def __init__(self, lane: int, line: str, detail: str = "") -> None:
-        super().__init__(f"lane {lane}, {line}", detail)
-        self.lane = lane
-
-
-def lane_failed(lane: int, doing: str, error: CopyRaised) -> LaneFailed:
-    """The environment's own exception as an error of its lane: one line, with the traceback as its detail."""
-    where = doing if error.copy is None else f"copy {error.copy}, {doing}"
-    if isinstance(error, Unusable):
-        return LaneFailed(lane, f"{where}: {error.line}")
-    cause = error.__cause__ or error
-    line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
-    return LaneFailed(lane, line, "".join(format_exception(cause)))
+    `doing`: what the copy did, where that is known better than by the copy.
+    """
+    whose, detail = "while the policy was evaluated: " if lane is None else f"lane {lane}, ", ""
+    if isinstance(what, str):
+        return EnvironmentFailed(whose + what, detail, lane)
+    copy = "" if what.copy is None else f"copy {what.copy}, "
+    if not (line := what.line):
+        cause = what.__cause__ or what
+        line = f"its environment raised {type(cause).__name__}: {first_line(cause, '')}"
+        detail = "".join(format_exception(cause))
+    return EnvironmentFailed(f"{whose}{copy}{doing or what.doing}: {line}", detail, lane)

@@ -29,7 +29,7 @@ from workers.activity import (
     WAITING,
     activity,
 )
-from workers.copies.env_errors import CopyRaised
+from workers.copies.env_errors import CopyFailed
 from workers.env_copy import close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
@@ -42,7 +42,7 @@ PULSE_S = 0.05  # a loop over slow copies calls `pulse` this often
 
 
 class EnvLoop:
-    """N environments that are stepped one after the other. Whatever they raise arrives as `CopyRaised`."""
+    """N environments that are stepped one after the other. Whatever they raise arrives as `CopyFailed`."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class EnvLoop:
                 raise
             except BaseException as error:  # also SystemExit: the environment must not end the worker in silence
                 self.close()
-                raise CopyRaised(n, "make") from error
+                raise CopyFailed(n, "make") from error
         self.steps = 0
         """how often `step` stepped the copies"""
         self.reward: list[Any] = [0.0] * len(self.envs)
@@ -99,7 +99,7 @@ class EnvLoop:
                 with self._activity.during(RESETTING):
                     into[n], info = self.envs[n].reset(seed=seed, **further)
             except BaseException as error:
-                raise CopyRaised(n, "reset") from error
+                raise CopyFailed(n, "reset") from error
             self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False
             if info:
                 infos.append((n, _kept(info)))
@@ -137,7 +137,7 @@ class EnvLoop:
                 into[n] = observation
             except BaseException as error:
                 begin(WAITING)
-                raise CopyRaised(n, "reset" if resets else f"step {self.steps}") from error
+                raise CopyFailed(n, "reset" if resets else f"step {self.steps}") from error
             if info:
                 infos.append((n, _kept(info)))  # before the next copy may change the same dict
             if (now_s := perf_counter()) > pulse_due_s:

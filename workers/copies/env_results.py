@@ -1,4 +1,4 @@
-"""Writes what N env copies returned into arrays. What an array could only seem to hold is refused (`Unusable`).
+"""Writes what N env copies returned into arrays. What an array could only seem to hold is refused (`CopyFailed`).
 
 numpy's assignment broadcasts an observation of another shape, reads None as NaN and text as a number, and cuts fractions off
 for a space of integers. Here every observation has the shape of its space, and its dtype is cast only within its kind; an
@@ -18,7 +18,7 @@ import numpy as np
 from protocol.arrays import Array
 from protocol.bounds import one_line
 from protocol.specs import Leaf
-from workers.copies.env_errors import Unusable
+from workers.copies.env_errors import CopyFailed
 
 Numbers = tuple[Any, Any, Any]
 """Reward, terminated and truncated of N copies: each an array or a sequence."""
@@ -44,7 +44,7 @@ class LeafWriter:
     def write(self, joined: Array, values: Any) -> None:
         """Write into one row of a `joined` array. `values`: an array [N, *leaf], or N observations in order.
 
-        Raises `Unusable`; some copies may be written then.
+        Raises `CopyFailed`; some copies may be written then.
         """
         try:
             if self._lengths is not None and isinstance(values, (list, tuple)):
@@ -60,12 +60,12 @@ class LeafWriter:
             pass
         row = joined.reshape(self._shape)
         if len(values) != len(row):
-            raise Unusable(None, f"{_name(self._leaf)}: expected those of {len(row)} copies, got {len(values)}")
+            raise CopyFailed(None, line=f"{_name(self._leaf)}: expected those of {len(row)} copies, got {len(values)}")
         for n, value in enumerate(values):
             self.write_one(row, n, value)
 
     def write_one(self, row: Array, n: int, value: Any) -> None:
-        """Write the observation of copy `n` into `row` [N, *leaf]. Raises `Unusable`."""
+        """Write the observation of copy `n` into `row` [N, *leaf]. Raises `CopyFailed`."""
         try:
             array = np.asarray(value)
         except ValueError:  # rows of different lengths
@@ -87,11 +87,11 @@ class LeafWriter:
         got = f"got {array.dtype}{list(array.shape)}"
         if self._is_whole and array.shape == self._leaf.shape and array.dtype.kind in "iu":
             got += f" with the value {array[array.astype(self._dtype) != array].flat[0]}"
-        raise Unusable(n, f"{_name(self._leaf)}: {expected}, {got}; fix the environment or its observation_space")
+        raise CopyFailed(n, line=f"{_name(self._leaf)}: {expected}, {got}; fix the environment or its observation_space")
 
 
 def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any]) -> tuple[Sequence[Any], ...]:
-    """For each leaf of a Dict or Tuple observation, the values of N copies. Raises `Unusable` where a leaf is missing."""
+    """For each leaf of a Dict or Tuple observation, the values of N copies. Raises `CopyFailed` where a leaf is missing."""
     try:
         return tuple(zip(*map(read, observations), strict=True))
     except (LookupError, TypeError):
@@ -103,12 +103,12 @@ def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[A
         raise
 
 
-def missing_leaf(n: int | None, observation: Any, error: Exception) -> Unusable:
+def missing_leaf(n: int | None, observation: Any, error: Exception) -> CopyFailed:
     """The error for an observation in which a leaf of its space cannot be found."""
     keys = f" of {', '.join(map(repr, observation))}" if isinstance(observation, dict) else ""
-    return Unusable(
+    return CopyFailed(
         n,
-        f"observation: expected the structure of its space, got a {type(observation).__name__}{keys} "
+        line=f"observation: expected the structure of its space, got a {type(observation).__name__}{keys} "
         f"({type(error).__name__}: {error}); fix the environment or its observation_space",
     )
 
@@ -116,7 +116,7 @@ def missing_leaf(n: int | None, observation: Any, error: Exception) -> Unusable:
 def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
     """Write reward, terminated and truncated of N copies into this row of three arrays: `array[row]` has the shape [N].
 
-    An array of one element counts as a number, as in gymnasium. Raises `Unusable`, which names the copy.
+    An array of one element counts as a number, as in gymnasium. Raises `CopyFailed`, which names the copy.
     """
     reward, terminated, truncated = arrays
     try:
@@ -128,7 +128,7 @@ def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
 
 
 def one_number(name: str, n: int, value: Any) -> Any:
-    """Reward, terminated or truncated (`name`) of copy `n`, as a number. Raises `Unusable`; a vector reward gets advice."""
+    """Reward, terminated or truncated (`name`) of copy `n`, as a number. Raises `CopyFailed`, with advice for a vector."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths
@@ -136,11 +136,11 @@ def one_number(name: str, n: int, value: Any) -> Any:
     if array.size == 1 and array.dtype.kind in "biuf":
         return array.item()
     if array.size == 1:
-        raise Unusable(n, f"{name}: expected a number, got {one_line(repr(value), 80)}")
+        raise CopyFailed(n, line=f"{name}: expected a number, got {one_line(repr(value), 80)}")
     advice = "; wrap the environment so that it returns one number" if name == "reward" else ""
     if advice and "mo_gymnasium" in sys.modules:
         advice += ", as --wrapper mo_gymnasium.wrappers:LinearReward does"
-    raise Unusable(n, f"{name}: expected a number, got an array of shape {array.shape}{advice}")
+    raise CopyFailed(n, line=f"{name}: expected a number, got an array of shape {array.shape}{advice}")
 
 
 def leaf_writers(leaves: Iterable[Leaf], copies: int) -> list[LeafWriter]:

@@ -18,7 +18,7 @@ from protocol.envs.envpool import EnvpoolSpec
 from protocol.envs.spaces import make_flatten
 from workers.activity import RESETTING, STEPPING, activity
 from workers.copies.env_copies import Leaves, StepResult
-from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Pulse
 from workers.copies.facts import facts_of_copies, of_ended
 from workers.env_copy import close_copy, give_back
@@ -45,17 +45,17 @@ class EnvpoolCopies:
                 self._env = self._pool.make(seeds)
                 return self._read(self._env.reset()[0])
         except BaseException as error:
-            raise CopyRaised(None, "reset") from error
+            raise CopyFailed(None, "reset") from error
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step all copies at once, and reset those that were truncated here."""
         self._activity.begin(STEPPING)
         try:
             result, elapsed, facts = self._step_and_reset(actions) if self._truncated.any() else self._step(actions)
-        except Unusable:
+        except CopyFailed:
             raise
         except BaseException as error:
-            raise CopyRaised(None, "step") from error
+            raise CopyFailed(None, "step") from error
         finally:
             self._activity.end(len(actions))
         at_limit = elapsed >= self._pool.limit
@@ -87,8 +87,8 @@ class EnvpoolCopies:
         return StepResult(leaves, merged(result.reward), *flags), merged(elapsed), merged(facts)
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
-        """Raises `Unusable`: the copies are not Python objects."""
-        raise Unusable(None, "envpool's env copies have no attributes")
+        """Raises `CopyFailed`: the copies are not Python objects."""
+        raise CopyFailed(None, line="envpool's env copies have no attributes")
 
     def close(self) -> None:
         """Close the pool and its threads. What it raises is ignored."""

@@ -14,14 +14,14 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.bounds import one_line
-from workers.copies.env_errors import Unusable
+from workers.copies.env_errors import CopyFailed
 
 Facts = Mapping[int, tuple[float, ...]]
 """By env copy: the facts of the episode that ended in this step."""
 
 
 def facts_of_info(names: Sequence[str], info: Mapping[str, Any], copy: int | None = None) -> tuple[float, ...]:
-    """A number for each name. Raises `Unusable` for what is no number."""
+    """A number for each name. Raises `CopyFailed` for what is no number."""
     return tuple(_number(name, info.get(name, math.nan), copy) for name in names)
 
 
@@ -34,7 +34,9 @@ def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) 
         given = np.asarray(infos[name])
         there = np.asarray(infos.get(f"_{name}", np.ones(count, bool)))
         if given.shape[:1] != (count,) or there.shape != (count,):
-            raise Unusable(None, f"info {name}: expected a number for each of {count} copies, got {_shown(infos[name])}")
+            raise CopyFailed(
+                None, line=f"info {name}: expected a number for each of {count} copies, got {_shown(infos[name])}"
+            )
         for n in np.flatnonzero(there):
             table[n, k] = _number(name, given[n], int(n))
     return table
@@ -57,7 +59,7 @@ def _number(name: str, value: Any, copy: int | None) -> float:
         return math.nan
     if type(value) is int:
         return math.nan  # too large for a float
-    raise Unusable(copy, f"info {name}: expected a number, got {_shown(value)}; name only numbers in info_keys")
+    raise CopyFailed(copy, line=f"info {name}: expected a number, got {_shown(value)}; name only numbers in info_keys")
 
 
 def _shown(value: Any) -> str:

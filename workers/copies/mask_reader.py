@@ -1,7 +1,7 @@
 """Reads the masks of allowed actions that env copies report, in their observations or in `info`.
 
 Rule: where an action will be chosen, a mask is there, has a bit for each choice, and allows at least one choice of each
-entry of the action; else the environment is wrong (`Unusable`). After an episode's end no action is chosen. If the episode
+entry of the action; else the environment is wrong (`CopyFailed`). After an episode's end no action is chosen. If the episode
 was truncated, the mask is kept, because the value of the last observation counts; if there is none, all actions are allowed.
 """
 
@@ -18,7 +18,7 @@ from protocol.bounds import one_line
 from protocol.envs.action_masks import has_mask
 from protocol.envs.spaces import action_spec
 from protocol.policy.masks import MASK, choices, no_choice
-from workers.copies.env_errors import Unusable
+from workers.copies.env_errors import CopyFailed
 
 DTYPES = ("bool", "int8", "uint8", "int64", "int32")
 _NONE: Mapping[str, Any] = {}
@@ -35,7 +35,7 @@ class MaskReader:
         self._where = "its observation" if self._in_observation else "info"
 
     def read(self, n: int, observation: Any, info: Mapping[str, Any], terminated: Any, truncated: Any) -> Bools:
-        """The mask [choices] of copy `n` after a step or a reset. Raises `Unusable`."""
+        """The mask [choices] of copy `n` after a step or a reset. Raises `CopyFailed`."""
         if terminated:
             return self._all
         source = observation if self._in_observation else info
@@ -43,7 +43,7 @@ class MaskReader:
         return self._mask(n, value, bool(truncated))
 
     def read_all(self, observation: Any, infos: Mapping[str, Any], terminated: Bools, truncated: Bools) -> Bools:
-        """The masks [N, choices] of all copies of a vector environment. Raises `Unusable`.
+        """The masks [N, choices] of all copies of a vector environment. Raises `CopyFailed`.
 
         A copy that gets no action needs none: `terminated` says so.
         """
@@ -87,10 +87,10 @@ class MaskReader:
             raise self._wrong(n, f"one without a choice, {one_line(str(mask.astype(int).tolist()), 100)}")
         return mask
 
-    def _wrong(self, n: int, got: str) -> Unusable:
+    def _wrong(self, n: int, got: str) -> CopyFailed:
         parts = "" if len(self._action.sizes) < 2 else f" ({' + '.join(map(str, self._action.sizes))})"
         expected = f"expected {self._choices}{parts} zeros and ones of int8 or bool in {self._where}, at least one allowed"
-        return Unusable(n, f"{MASK}: {expected}, got {got}; fix the environment, or set action_masks to none")
+        return CopyFailed(n, line=f"{MASK}: {expected}, got {got}; fix the environment, or set action_masks to none")
 
 
 def _as_array(value: Any) -> Array | None:

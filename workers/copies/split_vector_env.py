@@ -20,7 +20,7 @@ from protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
 from protocol.specs import RunSpec
 from protocol.wire.plain_values import unpack
 from workers.copies.env_copies import EnvCopies, Leaves, StepResult
-from workers.copies.env_errors import CopyRaised, Unusable, lane_failed
+from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.facts import Facts, facts_of_copies, of_ended
 from workers.copies.mask_reader import MaskReader
@@ -73,9 +73,9 @@ class SplitVectorEnv:
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
         try:
             self._result = self.step_some(range(self._lanes), slice(len(in_order)), in_order, pulse)
-        except Unusable as error:
+        except CopyFailed as error:
             lane, copy = divmod(error.copy or 0, len(in_order) // self._lanes)
-            raise lane_failed(lane, "step", Unusable(copy, error.line)) from error
+            raise environment_failed(lane, CopyFailed(copy, "step", error.line)) from error
 
     def step_some(self, lanes: Sequence[int], copies: slice, actions: Array, pulse: Pulse) -> StepResult:
         """Step these lanes, which have these copies, with their actions. The result has a row for every copy there is."""
@@ -141,10 +141,10 @@ class SplitVectorEnv:
             there = self._have(chosen, name)
             if not there or name in METHODS:
                 what = "a method" if there else "none"
-                raise Unusable(None, f"expected an attribute of the environment that is called {name}, got {what}")
+                raise CopyFailed(None, line=f"expected an attribute of the environment that is called {name}, got {what}")
             self._calls.assign_some(chosen, name, [unpack(packed)] * len(chosen))
         except EnvironmentFailed as error:
-            raise CopyRaised(None, f"set_env_attr {name}") from error
+            raise CopyFailed(None, f"set_env_attr {name}") from error
 
     def _have(self, copies: Sequence[int], name: str) -> bool:
         """Whether these copies have the attribute. Those of a client in another language have none."""

@@ -21,7 +21,7 @@ from protocol.envs.spaces import make_flatten
 from protocol.errors import UsageError
 from workers.activity import EVALUATING, activity
 from workers.copies.env_copies import made_without_order_check
-from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import PULSE_S, EnvLoop, Pulse
 from workers.copies.env_results import missing_leaf
 from workers.copies.facts import facts_of_info
@@ -45,7 +45,7 @@ class CopiesLost(Exception):
 
 
 class EvaluationCopies(Protocol):
-    """Env copies without autoreset. What the environment raises arrives as `CopyRaised`, what `pulse` raises passes.
+    """Env copies without autoreset. What the environment raises arrives as `CopyFailed`, what `pulse` raises passes.
 
     `step` may raise `CopiesLost`.
     """
@@ -124,10 +124,10 @@ class LoopedEvaluationCopies:
                 facts = facts_of_info(self._facts, info, n) if self._facts and (terminated or truncated) else ()
                 leaves = self._leaves(n, observation, info, terminated, truncated)
                 results.append(CopyStep(leaves, reward, terminated, truncated, facts))
-            except Unusable as error:
-                raise Unusable(n, error.line, f"step {self._steps[n]}") from error
+            except CopyFailed as error:
+                raise CopyFailed(n, f"step {self._steps[n]}", error.line) from error
             except BaseException as error:
-                raise CopyRaised(n, f"step {self._steps[n]}") from error
+                raise CopyFailed(n, f"step {self._steps[n]}") from error
             self._steps[n] += 1
             if perf_counter() > pulse_due_s:
                 self._activity.end()
@@ -138,7 +138,7 @@ class LoopedEvaluationCopies:
         return results
 
     def _leaves(self, n: int, observation: Any, info: dict[str, Any], terminated: Any, truncated: Any) -> tuple[Any, ...]:
-        """The arrays of an observation of copy `n`; in a masked run the mask follows. Raises `Unusable`."""
+        """The arrays of an observation of copy `n`; in a masked run the mask follows. Raises `CopyFailed`."""
         try:
             leaves = self._read(observation)
         except (LookupError, TypeError) as error:
@@ -153,7 +153,7 @@ class LoopedEvaluationCopies:
             with self._activity.during(EVALUATING):
                 return self._loop.envs[copy].render()
         except BaseException as error:
-            raise CopyRaised(copy, "render") from error
+            raise CopyFailed(copy, "render") from error
 
     def close(self) -> None:
         """Close every copy. What a copy raises is ignored."""

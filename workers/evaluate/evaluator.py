@@ -11,14 +11,13 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from time import perf_counter
-from traceback import format_exception
 from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Array
 from protocol.envs.spaces import action_converter_of, action_spec, observation_leaves
-from protocol.errors import RunError, UsageError, first_line
+from protocol.errors import UsageError
 from protocol.messages import Evaluate, Evaluated
 from protocol.policy.masks import stored_leaves
 from protocol.policy.own_policy import OwnPolicy
@@ -28,7 +27,7 @@ from protocol.random_streams import Purpose, generator
 from protocol.rollout import LARGEST_REWARD, Episode, outside_of_space
 from protocol.specs import RunSpec
 from workers.collect.acting import acting_of
-from workers.copies.env_errors import CopyRaised, Unusable
+from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.env_results import leaf_writers, one_number
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
@@ -36,13 +35,6 @@ from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, Loo
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
 """Makes this number of copies, with this render mode."""
-
-
-class EvaluationFailed(RunError):
-    """The environment raised, or returned something unusable, while the policy was evaluated."""
-
-    def __init__(self, line: str, detail: str = "") -> None:
-        super().__init__(f"while the policy was evaluated: {line}", detail)
 
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
@@ -71,22 +63,17 @@ class Evaluator:
     def play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:
         """Play one episode for each seed. `send` gets the rows, if the order asks for them.
 
-        `pulse` is called at every step and may raise. If it raises, or the environment does (`EvaluationFailed`), all copies
-        are closed.
+        `pulse` is called at every step and may raise. If it raises, or the environment does (`EnvironmentFailed`), all
+        copies are closed.
         """
         began_s = perf_counter()
         try:
             while True:
                 with suppress(CopiesLost):
                     return self._play(order, send, pulse)
-        except CopyRaised as error:
+        except CopyFailed as error:
             self.close()
-            cause = error.__cause__ or error
-            where = error.doing if error.copy is None else f"copy {error.copy}, {error.doing}"
-            line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
-            if isinstance(error, Unusable):
-                raise EvaluationFailed(f"{where}: {error.line}") from error
-            raise EvaluationFailed(line, "".join(format_exception(cause))) from error
+            raise environment_failed(None, error) from error
         except BaseException:
             self.close()
             raise
@@ -169,8 +156,8 @@ class Evaluator:
                 continue
             try:
                 writer.write_one(array[0], n, value)
-            except Unusable as error:
-                raise EvaluationFailed(f"copy {n}, {_moment(when)}: {error.line}") from error
+            except CopyFailed as error:
+                raise environment_failed(None, error, _moment(when)) from error
 
     def _check_values(self, obs: tuple[Array, ...], when: str | int) -> None:
         """Raise if an observation of the batch is not finite, or not a value of a space that counts its values."""
@@ -178,17 +165,17 @@ class Evaluator:
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
                 where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
-                raise EvaluationFailed(f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
+                raise environment_failed(None, f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
             if leaf.kind != "box" and outside_of_space(array, leaf):
                 n, why = next((n, why) for n in range(array.shape[1]) if (why := outside_of_space(array[0, n], leaf)))
                 where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
-                raise EvaluationFailed(f"{where}: {why}")
+                raise environment_failed(None, f"{where}: {why}")
 
     def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
         try:
             frame = as_frame(copies.render(n)) if sender.wants_frame else None
         except ValueError as error:
-            raise EvaluationFailed(f"copy {n}, {error}") from error
+            raise environment_failed(None, f"copy {n}, {error}") from error
         shown = obs[: len(self._run.policy.observation)]  # without the mask
         sender.observe([leaf[0, n] for leaf in shown], frame)
 
@@ -198,14 +185,14 @@ def _moment(when: str | int) -> str:
 
 
 def _finite_reward(reward: Any, n: int, t: int) -> float:
-    """The reward as a number. Raises `EvaluationFailed` if it is none that a rollout could hold."""
+    """The reward as a number. Raises `EnvironmentFailed` if it is none that a rollout could hold."""
     try:
         try:
             number = float(reward)
         except (TypeError, ValueError):
             number = float(one_number("reward", n, reward))
-    except Unusable as error:
-        raise EvaluationFailed(f"copy {n}, step {t}: {error.line}") from error
+    except CopyFailed as error:
+        raise environment_failed(None, error, f"step {t}") from error
     if not abs(number) <= LARGEST_REWARD:
-        raise EvaluationFailed(f"copy {n}, step {t}: reward: expected a finite float32, got {number}")
+        raise environment_failed(None, f"copy {n}, step {t}: reward: expected a finite float32, got {number}")
     return number

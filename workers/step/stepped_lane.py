@@ -21,7 +21,7 @@ from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unfla
 from protocol.errors import UsageError
 from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
-from workers.copies.env_errors import Unusable
+from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop, Infos, Pulse
 from workers.copies.env_results import leaf_writers, read_leaves, write_numbers
 
@@ -83,8 +83,8 @@ class SteppedLane:
             for writer, row, values in zip(self._writers, self._joined, leaves, strict=True):
                 writer.write(row, values)
             self._write_numbers()
-        except Unusable as error:
-            raise Unusable(error.copy, error.line, f"step {step}") from error
+        except CopyFailed as error:
+            raise CopyFailed(error.copy, f"step {step}", error.line) from error
         return infos
 
     def _write_numbers(self) -> None:

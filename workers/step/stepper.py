@@ -25,7 +25,7 @@ from protocol.wire.plain_values import pack, unpack
 from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
 from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
 from workers.activity import STEPPING, activity
-from workers.copies.env_errors import CopyRaised, lane_failed
+from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Infos, Pulse
 from workers.step.stepped_lane import Rows, SteppedLane, new_rows
 
@@ -57,7 +57,7 @@ class Stepper:
         self._spin_s = 0.0  # how long to spin before the next wait for the wake pipe
 
     def execute(self, order: Order, pulse: Pulse) -> Answer:
-        """The answer to the order. Raises `LaneFailed`, and what `pulse` raises; the lane is then closed."""
+        """The answer to the order. Raises `EnvironmentFailed`, and what `pulse` raises; the lane is then closed."""
         try:
             lane = self._lane_for(order.lane, order.incarnation, pulse)
             with self._runs(order.lane, lane):
@@ -70,9 +70,9 @@ class Stepper:
                         infos = self._step(lane, order.actions, pulse)
                     case Call():
                         return _call(order, lane, self._allow_private_names)
-        except CopyRaised as error:
+        except CopyFailed as error:
             self.close([order.lane])
-            raise lane_failed(order.lane, error.doing, error) from error
+            raise environment_failed(order.lane, error) from error
         except BaseException:
             self.close([order.lane])
             raise
@@ -118,9 +118,9 @@ class Stepper:
         try:
             with self._runs(number, lane):
                 infos = pack_infos(self._step(lane, memory.lanes[number].actions, pulse))
-        except CopyRaised as error:
+        except CopyFailed as error:
             self.close([number])
-            raise lane_failed(number, error.doing, error) from error
+            raise environment_failed(number, error) from error
         if number not in self._lanes:
             return True  # it was released meanwhile, and another worker may answer for it
         if not memory.answer(number, order, infos):

@@ -39,7 +39,7 @@ from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.fake_link import FakeLink
-from workers.copies.env_errors import CopyRaised, LaneFailed, Unusable, lane_failed
+from workers.copies.env_errors import CopyFailed, environment_failed
 
 
 class Noisy:
@@ -140,10 +140,10 @@ def test_no_line_of_a_traceback_looks_like_a_line_of_the_log() -> None:
 
 
 def test_a_failure_names_its_lane_once() -> None:
-    error = CopyRaised(1, "step")
+    error = CopyFailed(1, "step")
     error.__cause__ = ValueError("boom")
-    for failed in (lane_failed(0, "step 7", error), lane_failed(0, "step 7", Unusable(1, "boom")), LaneFailed(0, "boom")):
-        line = describe(EnvironmentRaised("w", "h", str(failed)))
+    for what in (error, CopyFailed(1, line="boom"), "boom"):
+        line = describe(EnvironmentRaised("w", "h", str(environment_failed(0, what, "step 7"))))
         assert line.startswith("worker w (h): lane 0, ")
         assert line.count("lane 0") == 1
     assert describe(EnvironmentRaised("w", "h", "lane 0: boom", "")).count("lane 0") == 1, "it is shown as it came"
