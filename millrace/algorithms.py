@@ -44,7 +44,7 @@ Tools:
 
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
-  `policy_log_prob` or `squashed_sample` of their outputs.
+  `policy_log_prob` or `squashed_sample` of their outputs. `trainable`: a leaf of autograd's graph for a flat tensor.
 - `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Transitions`, the
   tensors of a sample, and `CriticLoss`, what a loss says of them.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
@@ -91,7 +91,7 @@ from learner.config.hyperparameters import (
 from learner.config.on_resume import Adaptable, Fixed, Free
 from protocol.errors import UsageError
 from protocol.policy.features import features, normalize
-from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
+from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, trainable
 from protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
 from protocol.random_streams import Purpose, torch_seed
 from protocol.rollout import Batch
@@ -157,5 +157,6 @@ __all__ = [
     "scheduled",
     "squashed_sample",
     "torch_seed",
+    "trainable",
     "vtrace",
 ]

@@ -22,7 +22,7 @@ from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.gradient_descent import Metrics, clip_norm
 from learner.algorithms.kernels.networks import actor_critic_network
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, flat_tensor
 from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
@@ -81,7 +81,8 @@ class ActorCritic(Clones):
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
         self.tensors = {"parameters": self.net.flat}
-        self.optimizers = {"optimizer": make_optimizer(config.optimizer, self.net.flat, config.learning_rate)}
+        optimizer = make_optimizer(config.optimizer, self.net.flat, config.learning_rate, eps=1e-5)  # ε of Stable-Baselines3
+        self.optimizers = {"optimizer": optimizer}
 
     # ---------------------------------------------------------------- what an algorithm defines
 
@@ -143,18 +144,24 @@ class ActorCritic(Clones):
             return {}
         self.set_schedules()
         observations = self.observations(batch)
-        reward = self.rewards.count_and_scale(batch) if self.config.normalize_rewards else batch.reward
+        self.count(batch)
+        reward = self.scaled(batch.reward)
         estimates: list[Estimates] = []
         epochs: list[list[Metrics]] = []
-        for _ in range(self.n_epochs):
+        ended = False
+        while len(epochs) < self.n_epochs and not ended:
             if not estimates or self.estimates_each_epoch:
                 estimates.append(self.estimate(batch, observations, reward, pulse))
                 minibatches = self._minibatches(batch, observations, estimates[-1])
-            epochs.append(self._steps(next(minibatches), pulse))
-            if epochs[-1] and self.stops(epochs[-1][-1]):
-                break
+            epochs.append([])
+            for minibatch in next(minibatches):
+                measured, ended = self.step(minibatch)
+                epochs[-1].append(measured)
+                pulse()
+                if ended:
+                    break
         self._check_spread_of_actions()
-        self.count_update(batch, observations, len(epochs))
+        self.count_update(batch, len(epochs))
         return self.metrics(epochs, estimates)
 
     def _minibatches(self, batch: Batch, observations: Observations, estimates: Estimates) -> Iterator[Iterable[Minibatch]]:
@@ -165,27 +172,27 @@ class ActorCritic(Clones):
         while True:
             yield single or rows.shuffled(estimates.used, count, self.generator)
 
-    def _steps(self, minibatches: Iterable[Minibatch], pulse: Pulse) -> list[Metrics]:
-        """A step on each minibatch, until one ends the update."""
-        found: list[Metrics] = []
-        for minibatch in minibatches:
-            found.append(self.step(minibatch))
-            pulse()
-            if self.stops(found[-1]):
-                break
-        return found
+    def step(self, minibatch: Minibatch) -> tuple[Metrics, bool]:
+        """One gradient step on a minibatch. Returns what was measured before it, and whether that ends the update instead.
 
-    def step(self, minibatch: Minibatch) -> Metrics:
-        """One gradient step on a minibatch of valid rows, unless `stops` forbids it. Returns what was measured before it."""
+        Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the logged numbers and the
+        gradient's norm are finite, scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer.
+        """
+        optimizer = self.optimizers["optimizer"]
         loss, numbers = self._checked(self.loss(self.evaluate(minibatch)))
-        metrics = self.differentiate(loss, self.net.flat, {**numbers, "loss": loss})
+        metrics = self.differentiate(loss, optimizer, {**numbers, "loss": loss})
         clip_norm(self.net.flat, metrics["grad_norm"], self.config.max_grad_norm)
-        if not self.stops(metrics):
-            take_step(self.optimizers["optimizer"])
-        return metrics
+        ends = self.stops(metrics)
+        if not ends:
+            take_step(optimizer)
+        return metrics, ends
 
     def evaluate(self, minibatch: Minibatch) -> LossInput:
-        """The rows of a minibatch with the network's outputs."""
+        """The rows of a minibatch with the network's outputs: a pass of the network, and the distribution on top.
+
+        The logits of actions that are not allowed become -1e30. A Box has a normal distribution that is not clipped. A small
+        network on the CPU computes the same in numpy (`kernels.networks`).
+        """
         features, images, action, log_prob, raw, target, recurrent, mask = minibatch
         outputs = self.net.evaluate(features, images, recurrent, action, mask)
         advantage = losses.standardized(raw) if self.standardizes_advantages() else raw
@@ -209,20 +216,19 @@ class ActorCritic(Clones):
                 f"{MAX_LOG_STD:g}, got {largest:.3g}; try a lower ent_coef, or a lower learning_rate"
             )
 
-    def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
-        """Count an update of `epochs` epochs with this batch: steps, versions, observation statistics."""
+    def count_update(self, batch: Batch, epochs: int) -> None:
+        """Count an update of `epochs` epochs with this batch: steps and versions. Its observation statistics take effect."""
         self.env_steps += batch.env_steps
         self.version += 1
         # Workers acted under the statistics that were published before this batch. The losses must normalize observations
         # with the same statistics: otherwise the probability ratio would not be 1 for an unchanged policy. So the
-        # statistics change only after the update. They are published together with the weights.
-        self.normalizer.update(observations.raw_features[:-1], batch.valid)
+        # new statistics take effect only after the update. They are published together with the weights.
         self.statistics = self.normalizer.buffers()
 
     def metrics(self, epochs: Sequence[Sequence[Metrics]], estimates: Sequence[Estimates]) -> Metrics:
         """The metrics of an update: means over its gradient steps and estimates, and the state of the schedules."""
         found = self.means(step for epoch in epochs for step in epoch)
-        found["train/learning_rate"] = self.optimizers["optimizer"].param_groups[0]["lr"]
+        found["train/learning_rate"] = self.learning_rate
         found["train/n_updates"] = float(self.version)
         log_std = self.net.parameters.get("actor.log_std")
         if log_std is not None:
@@ -277,14 +283,6 @@ class ActorCritic(Clones):
         """See `GradientDescent`."""
         super().load_other_state(state)
         self.generator.set_state(state["generator"])
-
-
-def make_optimizer(kind: str, flat: Tensor, learning_rate: float) -> torch.optim.Optimizer:
-    """Adam or RMSprop for the flat parameters, with ε 1e-5 outside the square root, as in Stable-Baselines3."""
-    avoid_compiler_import()
-    if kind == "adam":
-        return torch.optim.Adam([flat], lr=learning_rate, eps=1e-5, fused=True)
-    return torch.optim.RMSprop([flat], lr=learning_rate, alpha=0.99, eps=1e-5)
 
 
 def _explained_variance(estimates: Estimates) -> float:

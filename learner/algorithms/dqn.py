@@ -17,7 +17,7 @@ from torch import Tensor
 from learner.algorithms import losses
 from learner.algorithms.gradient_descent import Metrics, clip_norm
 from learner.algorithms.kernels.networks import q_network
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Floats
@@ -53,11 +53,9 @@ class DQN(OffPolicy):
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed)
         self.net, self.target = (q_network(policy, device, seed) for _ in range(2))
-        avoid_compiler_import()
-        optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW
-        made = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
-        self.optimizers = {"optimizer": made}
+        optimizer = make_optimizer(config.optimizer, self.net.flat, config.learning_rate, amsgrad=config.amsgrad)
+        self.optimizers = {"optimizer": optimizer}
 
     def steps_due(self) -> int:
         """The same number of gradient steps in each update, once learning has started."""
@@ -90,9 +88,10 @@ class DQN(OffPolicy):
     def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
         """One gradient step on a minibatch; then the target network is updated."""
         found = self.loss(rows)
-        metrics = self.differentiate(found.loss, self.net.flat, {**found.numbers, "loss": found.loss})
+        optimizer = self.optimizers["optimizer"]
+        metrics = self.differentiate(found.loss, optimizer, {**found.numbers, "loss": found.loss})
         self._clip_gradient(metrics["grad_norm"])
-        take_step(self.optimizers["optimizer"])
+        take_step(optimizer)
         self.gradient_steps += 1
         self._update_target()
         return metrics, found.error

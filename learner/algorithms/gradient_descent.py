@@ -59,18 +59,20 @@ class GradientDescent(Algorithm):
     # ---------------------------------------------------------------- an update
 
     def remaining(self) -> float:
-        """The fraction of the run that remains: 1 in the first update, above 0 in the last."""
+        """The fraction of the run that remains before this batch, 1 − env_steps / total_steps; above 0 to the end."""
         return max(0.0, 1 - self.env_steps / self._total_steps)
 
     def set_schedules(self) -> None:
         """Set what depends on how much of the run remains. Called at the start of each update."""
+        learning_rate = scheduled(self.config.learning_rate, self.config.learning_rate_schedule, self.remaining())
         for optimizer in self.optimizers.values():
-            optimizer.param_groups[0]["lr"] = self.learning_rate
+            optimizer.param_groups[0]["lr"] = learning_rate
 
     @property
     def learning_rate(self) -> float:
-        """The learning rate that the settings and the schedule say."""
-        return scheduled(self.config.learning_rate, self.config.learning_rate_schedule, self.remaining())
+        """That of this update, which all optimizers have."""
+        found: float = next(iter(self.optimizers.values())).param_groups[0]["lr"]
+        return found
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Features [B, D] as the networks take them, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
@@ -97,13 +99,14 @@ class GradientDescent(Algorithm):
             self.count(batch)
         self.statistics = self.normalizer.buffers()
 
-    def differentiate(self, loss: Tensor, flat: Tensor, numbers: Mapping[str, Tensor | float]) -> Metrics:
-        """Write the gradient of a loss into `flat.grad`, the memory of the gradients of all parameters that `flat` holds.
+    def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> Metrics:
+        """Write the gradient of a loss into `grad` of the flat tensor of an optimizer, the memory of all its gradients.
 
-        Returns the numbers, and `grad_norm`, as floats.
+        Sets it to zero first, and calls `loss.backward()`. Returns the numbers, and `grad_norm`, as floats.
 
         Raises `RunError` if one of them is not finite, and `UsageError` for what is no number.
         """
+        (flat,) = optimizer.param_groups[0]["params"]
         gradient = flat.grad
         assert gradient is not None
         gradient.zero_()
@@ -198,7 +201,7 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
 
 
 def scheduled(first: float, schedule: str, remaining: float) -> float:
-    """The value of a setting when this fraction of the run remains: `linear` falls to 0, `constant` does not change."""
+    """The value of a setting when this fraction of the run remains: `linear` is first · remaining, `constant` is first."""
     return first * (remaining if schedule == "linear" else 1)
 
 

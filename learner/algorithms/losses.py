@@ -1,4 +1,4 @@
-"""The losses, in plain torch, and metrics about them. Pure: tensors [B] in, tensors of no dimension out.
+"""The losses, in plain torch, and metrics about them. Pure. Each takes tensors [B] and returns one number.
 
 B is the number of rows of a minibatch. All of them are valid: rows are masked where minibatches are selected.
 """
@@ -14,7 +14,7 @@ from protocol.arrays import Floats
 
 
 def standardized(advantage: Tensor) -> Tensor:
-    """Advantages [B] with mean 0 and standard deviation 1. A single row has no standard deviation and stays as it is."""
+    """Advantages [B] with mean 0 and standard deviation 1, that of a sample (n − 1). A single row stays as it is."""
     if len(advantage) < 2:
         return advantage
     std, mean = torch.std_mean(advantage)

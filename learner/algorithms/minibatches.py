@@ -1,6 +1,7 @@
 """Rows of a batch in the form of the network's input, and the selection of minibatches from them.
 
-Rule: rows that are not valid never enter a minibatch, and in an epoch each of the others enters one.
+Rule: rows that are not valid never enter a loss, and in an epoch each of the others enters one. A recurrent core runs over
+them too, as its columns have them.
 
 A batch has T rows for each of ΣN env copies (columns). Row numbers count the rows as one flat sequence of T · ΣN rows in
 time order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.

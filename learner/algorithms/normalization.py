@@ -89,10 +89,10 @@ class ObservationNormalizer:
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
         return raw, x, [array for leaf, array in zip(self._spec.observation, leaves, strict=True) if leaf.is_image]
 
-    def update(self, features: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
+    def update(self, raw: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
         if self._enabled:
-            self._moments.update(self._bounded(features[valid]))
+            self._moments.update(self._bounded(raw[valid]))
 
     def _bounded(self, rows: Floats | Doubles) -> Floats | Doubles:
         """The rows [B, D], with far values replaced. In the first batch, 99 in 100 rows set the scale."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from learner.algorithms import losses
 from learner.algorithms.actor_critic import ActorCritic, Estimates
 from learner.algorithms.gradient_descent import Metrics, scheduled
-from learner.algorithms.minibatches import LossInput, Observations
+from learner.algorithms.minibatches import LossInput
 from learner.config.hyperparameters import PPOConfig
 from protocol.errors import UsageError
 from protocol.rollout import Batch
@@ -88,9 +88,9 @@ class PPO(ActorCritic):
             found["train/approx_kl"] = float(np.mean(divergences))
         return found
 
-    def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
+    def count_update(self, batch: Batch, epochs: int) -> None:
         """See `ActorCritic`."""
-        super().count_update(batch, observations, epochs)
+        super().count_update(batch, epochs)
         self.epochs += epochs
 
     def other_state(self) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lam
         δₜ = rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ)
         Aₜ = δₜ + γλ Aₜ₊₁ [neither terminated nor truncated]
 
-    The targets of V are A + values[:-1].
+    The targets of V are A + values[:-1]. Where an episode is truncated, V(sₜ₊₁) is that of its final observation.
     """
     T, N = reward.shape
     assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"

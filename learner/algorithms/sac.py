@@ -13,10 +13,11 @@ from torch import Tensor
 
 from learner.algorithms.algorithm import Start
 from learner.algorithms.gradient_descent import Metrics
-from learner.algorithms.kernels.networks import leaf_of
+from learner.algorithms.kernels.optimizer_step import make_optimizer
 from learner.algorithms.replay.continuous import Continuous
 from learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from learner.config.hyperparameters import SACConfig
+from protocol.policy.networks import trainable
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -31,18 +32,13 @@ class SAC(Continuous):
         return SAC.bounded_policy_spec(config, observation, action, head="squashed")
 
     def __init__(self, config: SACConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        # Before the optimizers are made, which take it from `parts`.
-        self.log_temperature = torch.full((1,), math.log(1.0 if config.ent_coef is None else config.ent_coef), device=device)
-        self.log_temperature.grad = torch.zeros_like(self.log_temperature)
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        self.log_temperature = torch.full((1,), math.log(1.0 if config.ent_coef is None else config.ent_coef), device=device)
         if config.ent_coef is None:
+            self.log_temperature.grad = torch.zeros_like(self.log_temperature)
             self.tensors["log_temperature"] = self.log_temperature
+            self.optimizers["ent_coef_optimizer"] = make_optimizer("adam", self.log_temperature, config.learning_rate)
         self.target_entropy = -math.prod(policy.action.shape) if config.target_entropy is None else config.target_entropy
-
-    def parts(self) -> dict[str, Tensor]:
-        """See `Continuous.parts`; a fixed temperature needs no optimizer."""
-        temperature = {"ent_coef_optimizer": self.log_temperature} if self.config.ent_coef is None else {}
-        return super().parts() | temperature
 
     @property
     def temperature(self) -> float:
@@ -91,7 +87,7 @@ class SAC(Continuous):
         measured |= self.descend("actor", loss, {"entropy": -log_prob.mean()})
 
         if self.config.ent_coef is None:
-            loss = self.temperature_loss(leaf_of(self.log_temperature), log_prob)
+            loss = self.temperature_loss(trainable(self.log_temperature, self.log_temperature.grad), log_prob)
             measured |= self.descend("ent_coef", loss, {})
 
         self.target.critics.lerp_(self.net.critics, self.config.tau)

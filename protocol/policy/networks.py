@@ -154,6 +154,13 @@ class Convolutions(NamedTuple):
         return F.relu(F.linear(h.flatten(1), weight, bias)).float()
 
 
+def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
+    """A leaf of autograd's graph in the memory of `values`, which are changed in place, and of their gradient."""
+    leaf = values.detach().requires_grad_()
+    leaf.grad = gradient
+    return leaf
+
+
 class FlatNetwork:
     """Named parameters that are views of one flat tensor, and the layers before the heads: encoder, convolutions, core."""
 
@@ -170,9 +177,8 @@ class FlatNetwork:
         at = 0
         for field in self.fields:
             end = at + math.prod(field.shape)
-            view = self.flat[at:end].view(field.shape).detach().requires_grad_()
-            view.grad = self.flat_grad[at:end].view(field.shape)
-            self.parameters[field.name] = view
+            values, gradient = (each[at:end].view(field.shape) for each in (self.flat, self.flat_grad))
+            self.parameters[field.name] = trainable(values, gradient)
             at = end
         self._relu = spec.activation == "relu"
         self._encoder = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
@@ -352,8 +358,7 @@ class ActorAndCritics(FlatNetwork):
         """[A] and [C] float32, which share memory with `flat`"""
         self.actor.grad, self.critics.grad = (self.flat_grad[end] for end in ends)
         self._actor = self.layers([*hidden_names(spec), "actor.out"])
-        self._critics = self.critics.detach().requires_grad_()
-        self._critics.grad = self.critics.grad
+        self._critics = trainable(self.critics, self.critics.grad)
 
     def _stacked(self, critics: int, flat: Tensor) -> list[Tensor]:
         """Weight [critics, out, in] and bias [critics, out] of each layer of the critics, as views of `flat` [C]."""

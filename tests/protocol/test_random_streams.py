@@ -153,7 +153,7 @@ def test_no_two_generators_of_a_run_coincide(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(torch.nn.init, "orthogonal_", initial)
     config = SACConfig()
     sac = SAC(config, SAC.policy_spec(config, (BOX,), GAUSSIAN.action), total_steps=100, seed=seed)
-    sac.replay.add_prior([], 500)
+    sac.replay.add_prior([], 500, 0.5)
     assert sac.replay.prior is not None
     streams |= {"replay": draws(sac.replay.generator), "prior": draws(sac.replay.prior.generator)}
     factory = f"{__name__}:drawing_encoder"

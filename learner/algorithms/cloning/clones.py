@@ -48,12 +48,11 @@ class Clones(GradientDescent):
         size = len(rows.at)
         count = math.ceil(size / getattr(self.config, "batch_size", BATCH_SIZE))
         optimizer = self.optimizers[self.cloned_by]
-        (flat,) = optimizer.param_groups[0]["params"]
         for epoch in range(self.clone_steps // count, self.config.clone_epochs):
             order = generator(self.seed, Purpose.CLONING, epoch).permutation(size)
             for some in np.array_split(order, count)[self.clone_steps % count :]:
                 loss, _ = self.cloning_loss(rows.select(some))
-                self.differentiate(loss, flat, {"clone/loss": loss})
+                self.differentiate(loss, optimizer, {"clone/loss": loss})
                 optimizer.param_groups[0]["lr"] = LEARNING_RATE
                 take_step(optimizer)
                 self.clone_steps += 1

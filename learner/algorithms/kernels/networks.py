@@ -16,7 +16,7 @@ from learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
 from protocol.arrays import Array
 from protocol.policy.features import feature_size
 from protocol.policy.layout import CRITICS, hidden_names
-from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput
+from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput, trainable
 from protocol.specs import PolicySpec
 
 MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
@@ -50,7 +50,7 @@ class SmallActorCritic(ActorCriticNetwork):
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
-        leaf, relu, actor = leaf_of(self.flat), spec.activation == "relu", hidden_names(spec)
+        leaf, relu, actor = trainable(self.flat, self.flat_grad), spec.activation == "relu", hidden_names(spec)
         trunks = [actor] if spec.shared_net else [actor, hidden_names(spec, "critic")]
 
         def evaluation(values: Mapping[str, Array], gradients: Mapping[str, Array]) -> Evaluation:
@@ -84,7 +84,7 @@ class SmallQNetwork(QNetwork):
         super().__init__(spec, device, seed=seed)
         names = ("q.out", "q.value") if spec.dueling else ("q.out",)
         trunks = Trunks([hidden_names(spec)], [(name, 0) for name in names])
-        self._small = SmallMLP(leaf_of(self.flat), self.fields, trunks, spec.activation == "relu")
+        self._small = SmallMLP(trainable(self.flat, self.flat_grad), self.fields, trunks, spec.activation == "relu")
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """See `QNetwork`."""
@@ -97,10 +97,10 @@ class SmallActorAndCritics(ActorAndCritics):
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
         relu, acting = spec.activation == "relu", self.fields[: self.acting_fields]
-        actor, leaf = Trunks([hidden_names(spec)], [("actor.out", 0)]), leaf_of(self.actor)
+        actor, leaf = Trunks([hidden_names(spec)], [("actor.out", 0)]), trainable(self.actor, self.actor.grad)
         self._sample = SmallMLP(leaf, acting, actor, relu, lambda *_: SquashedSample())
         self._output = SmallMLP(leaf, acting, actor, relu)
-        leaf, fields = leaf_of(self.critics), self.fields[self.acting_fields :]
+        leaf, fields = trainable(self.critics, self.critics.grad), self.fields[self.acting_fields :]
 
         def critics(names: Sequence[str]) -> SmallMLP:
             outputs = [(f"{name}.out", i) for i, name in enumerate(names)]
@@ -122,10 +122,3 @@ class SmallActorAndCritics(ActorAndCritics):
     def values(self, x: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
         """See `ActorAndCritics`."""
         return self._values[critics](torch.cat((x, action), -1), constant=constant)[0]
-
-
-def leaf_of(flat: Tensor) -> Tensor:
-    """The same memory, also that of the gradient, as a leaf of autograd's graph. `flat` itself is changed in place."""
-    leaf = flat.detach().requires_grad_()
-    leaf.grad = flat.grad
-    return leaf

@@ -31,6 +31,20 @@ State = dict[str, Tensor]
 Kernel = Callable[..., Any]
 
 
+def make_optimizer(kind: str, flat: Tensor, learning_rate: float, **settings: Any) -> Optimizer:
+    """Adam, AdamW or RMSprop for one flat tensor that has a gradient.
+
+    Adam has β 0.9 and 0.999, and ε 1e-8 outside the square root; AdamW also decays weights by 0.01; RMSprop has α 0.99.
+    `settings`: what torch's optimizer gets instead, such as `eps` and `amsgrad`.
+    """
+    avoid_compiler_import()
+    match kind:
+        case "rmsprop":
+            return RMSprop([flat], lr=learning_rate, **{"alpha": 0.99} | settings)
+        case _:
+            return (AdamW if kind == "adamw" else Adam)([flat], lr=learning_rate, fused=True, **settings)
+
+
 def avoid_compiler_import() -> None:
     """Let optimizers be made, saved and loaded without importing torch's compiler.
 

@@ -21,7 +21,7 @@ from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.gradient_descent import Metrics
 from learner.algorithms.kernels.networks import actor_and_critics
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from learner.algorithms.replay.off_policy import OffPolicy, Transitions
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import ContinuousConfig
@@ -76,11 +76,8 @@ class Continuous(Clones, OffPolicy):
         self._learning_starts = config.learning_starts
         self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
-        self.optimizers = {name: adam(part, config) for name, part in self.parts().items()}
-
-    def parts(self) -> dict[str, Tensor]:
-        """The flat tensors that an optimizer each changes, by the optimizer's name."""
-        return {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
+        trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
+        self.optimizers = {name: make_optimizer("adam", part, config.learning_rate) for name, part in trained.items()}
 
     def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> Metrics:
         """See `Clones`: the actor alone. It acts from the first env step."""
@@ -110,9 +107,14 @@ class Continuous(Clones, OffPolicy):
         return rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
 
     def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> Metrics:
-        """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss. Gradients are not clipped."""
-        found = self.differentiate(loss, self.parts()[f"{name}_optimizer"], {**numbers, f"{name}_loss": loss})
-        take_step(self.optimizers[f"{name}_optimizer"])
+        """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss.
+
+        Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the numbers and the gradient's
+        norm are finite, and steps torch's Adam. Gradients are not clipped.
+        """
+        optimizer = self.optimizers[f"{name}_optimizer"]
+        found = self.differentiate(loss, optimizer, {**numbers, f"{name}_loss": loss})
+        take_step(optimizer)
         del found["grad_norm"]
         return found
 
@@ -152,9 +154,3 @@ class Continuous(Clones, OffPolicy):
                 "updates_per_step": config.updates_per_step, "env_steps": start,
                 "made": self.gradient_steps - self.prior_gradient_steps,
             }  # fmt: skip
-
-
-def adam(flat: Tensor, config: Any) -> torch.optim.Adam:
-    """Adam for one flat tensor that has a gradient."""
-    avoid_compiler_import()
-    return torch.optim.Adam([flat], lr=config.learning_rate, fused=True)

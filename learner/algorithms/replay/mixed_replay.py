@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from learner.algorithms.replay.available_memory import GIB, available_bytes
-from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
+from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
 from protocol.arrays import Floats, Ints
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose
 from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf
 
 PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
 
@@ -39,43 +38,28 @@ class PriorTransitions(ReplayBuffer):
 class MixedReplay(ReplayBuffer):
     """Own transitions, and prior ones if there are any. A draw has its prior transitions at its end."""
 
-    def __init__(
-        self,
-        observation: tuple[Leaf, ...],
-        *,
-        size: int,
-        n_step: int,
-        gamma: float,
-        seed: int,
-        alpha: float | None = None,
-        action: ActionSpec = DISCRETE,
-        prior_share: float = 0.0,
-    ) -> None:
-        """`prior_share`: the share of each draw that is prior, once `add_prior` was called. Else as `ReplayBuffer`."""
-        super().__init__(observation, size=size, n_step=n_step, gamma=gamma, seed=seed, alpha=alpha, action=action)
-        self.prior: ReplayBuffer | None = None
-        self._observation, self._stored, self._seed, self._share = observation, action, seed, prior_share
-        self._remembered_prior: Any = None
+    prior: ReplayBuffer | None = None
+    _prior_share = 0.0
+    _remembered_prior: Any = None
 
-    def add_prior(self, batches: Iterable[Batch], slots: int) -> None:
-        """Store prior transitions. `slots`: how many observations they have. Raises `UsageError` if memory is too small."""
+    def add_prior(self, batches: Iterable[Batch], slots: int, share: float) -> None:
+        """Store prior transitions. `slots`: how many observations they have. `share`: of each draw, how much is prior.
+
+        Raises `UsageError` if memory is too small.
+        """
+        observation, _, _, action = self._content
         prior = PriorTransitions(
-            self._observation,
-            size=slots,
-            n_step=self._n_step,
-            gamma=self._gamma,
-            seed=self._seed,
-            action=self._stored,
+            observation, size=slots, n_step=self._n_step, gamma=self._gamma, seed=self._seed, action=action
         )
         for batch in batches:
             prior.add(batch)
-        self.prior = prior
+        self.prior, self._prior_share = prior, share
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
         """Draw transitions with replacement: all prior ones while there are no others. `beta`: as in `ReplayBuffer`."""
         if self.prior is None:
             return super().sample(count, beta)
-        prior = round(self._share * count) if len(self) else count
+        prior = round(self._prior_share * count) if len(self) else count
         parts = [] if prior == count else [super().sample(count - prior, beta)]
         if prior:
             drawn = self.prior.sample(prior)

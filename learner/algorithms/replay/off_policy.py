@@ -32,7 +32,7 @@ class Transitions(NamedTuple):
     action: Tensor
     """[B] int64, or [B, D′] in [-1, 1]"""
     reward: Tensor
-    """[B] Σ γⁱ r"""
+    """[B] Σ γⁱ r; with `normalize_rewards`, divided by the standard deviation of returns and clipped to ±10"""
     discount: Tensor
     """[B] γᵏ, or 0 if the task has terminated"""
     next_x: Tensor
@@ -74,7 +74,6 @@ class OffPolicy(GradientDescent):
             seed=seed,
             alpha=config.priority_alpha if config.replay == "prioritized" else None,
             action=policy.action,
-            prior_share=config.prior_share,
         )
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
         self.prior_gradient_steps = 0  # of these, the ones before the first rollouts
@@ -95,9 +94,8 @@ class OffPolicy(GradientDescent):
 
         Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
         """
-        config, learning_rate = self.config, self.learning_rate
         self.set_schedules()
-        beta = 1 - (1 - config.priority_beta) * self.remaining()
+        beta = 1 - (1 - self.config.priority_beta) * self.remaining()
         self.replay.add(batch)
         self.count(batch)
         self.statistics = self.normalizer.buffers()
@@ -105,7 +103,7 @@ class OffPolicy(GradientDescent):
         measured = list(self.steps(self.steps_due() if len(self.replay) else 0, pulse, beta))
         self.version += 1
         metrics = {
-            "train/learning_rate": learning_rate,
+            "train/learning_rate": self.learning_rate,
             "train/n_updates": float(self.gradient_steps),
             "replay/size": float(len(self.replay)),
             "replay/bytes": float(self.replay.bytes),
@@ -149,7 +147,7 @@ class OffPolicy(GradientDescent):
                 self.count(batch)
                 yield batch
 
-        self.replay.add_prior(counted(), observations)
+        self.replay.add_prior(counted(), observations, self.config.prior_share)
         self.statistics = self.normalizer.buffers()
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:

@@ -133,7 +133,7 @@ class ReplayBuffer:
         self._check_memory()
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
-        self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
+        self._n_step, self._gamma, self._alpha, self._seed = n_step, gamma, alpha, seed
         self.generator = generator(seed, self._purpose)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], as `_obs`; made when the first masks come

@@ -52,7 +52,7 @@ def test_an_update_is_one_step_on_all_valid_rows(monkeypatch: pytest.MonkeyPatch
     minibatches: list[Minibatch] = []
     step = algorithm.step
 
-    def recorded_step(minibatch: Minibatch) -> dict[str, float]:
+    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
         minibatches.append(minibatch)
         return step(minibatch)
 

@@ -79,7 +79,7 @@ def minibatch_of(algorithm: ActorCritic, rows: Batch) -> Minibatch:
 def gradient(algorithm: ActorCritic, rows: Minibatch) -> dict[str, float]:
     """Writes the gradient of the loss of a minibatch."""
     loss, numbers = algorithm.loss(algorithm.evaluate(rows))
-    return algorithm.differentiate(loss, algorithm.net.flat, numbers)
+    return algorithm.differentiate(loss, algorithm.optimizers["optimizer"], numbers)
 
 
 # -------------------------------------------------------------------- the distribution

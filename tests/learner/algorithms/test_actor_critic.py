@@ -112,7 +112,7 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec, critic:
     expected = algorithm.net.flat_grad.clone()
     rows = Minibatch(x, (), action, advantage, advantage, target)
     allowed = gradient_tolerance(algorithm, rows)
-    measured = algorithm.step(rows)
+    measured, _ = algorithm.step(rows)
     assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed)
     assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
 
@@ -126,7 +126,7 @@ def test_a_loss_of_ones_own_is_the_one_that_trains() -> None:
     before = own.net.flat.clone()
     x, zeros = torch.randn((30, 4), generator=torch.Generator().manual_seed(0)), torch.zeros(30)
     value = own.net.value(x).detach()
-    measured = own.step(Minibatch(x, (), zeros.long(), zeros, zeros, zeros))
+    measured, _ = own.step(Minibatch(x, (), zeros.long(), zeros, zeros, zeros))
     assert measured["penalty"] == 0.25
     assert measured["value"] == value.mean().item()
     acting = own.net.acting_size

@@ -108,7 +108,7 @@ def watch(algorithm: Impala, monkeypatch: pytest.MonkeyPatch) -> list[Minibatch]
     minibatches: list[Minibatch] = []
     step = algorithm.step
 
-    def recorded_step(minibatch: Minibatch) -> dict[str, float]:
+    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
         minibatches.append(minibatch)
         return step(minibatch)
 

@@ -20,14 +20,14 @@ SHARE = 0.25
 
 def mixed(own: int = 4, prior: int = 6, alpha: float | None = None, share: float = SHARE) -> tuple[MixedReplay, set[float]]:
     """A replay with so many rollouts of its own and of prior data; and the first observations of the prior ones."""
-    made = MixedReplay(OBS, size=1000, n_step=1, gamma=GAMMA, seed=0, alpha=alpha, prior_share=share)
+    made = MixedReplay(OBS, size=1000, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
     lanes = Lanes(1)
     before = Lanes(2)
     before_rows = [before.used(before.rollout(0)) for _ in range(prior)]
     for batch in before_rows:  # observations of prior data are negative
         batch.obs[0][...] *= -1
     if prior:
-        made.add_prior(before_rows, 500)
+        made.add_prior(before_rows, 500, share)
     for _ in range(own):
         made.add(lanes.used(lanes.rollout(0)))
     return made, {-began for began in before.rows}
@@ -119,6 +119,6 @@ def test_a_dataset_that_does_not_fit_memory_is_refused_as_such(monkeypatch: pyte
     """It takes its own size, once: no checkpoint copies it."""
     made, _ = mixed(prior=0)
     monkeypatch.setattr(mixed_replay, "available_bytes", lambda: memory_bytes(OBS, 10_000, False))
-    made.add_prior([], 10_000)
+    made.add_prior([], 10_000, 0.5)
     with pytest.raises(UsageError, match=r"^prior: 10001 observations of the dataset take .* record a smaller dataset$"):
-        made.add_prior([], 10_001)
+        made.add_prior([], 10_001, 0.5)

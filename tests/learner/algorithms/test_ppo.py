@@ -46,7 +46,7 @@ def test_minibatches_hold_each_valid_row_once_an_epoch_in_nearly_equal_parts(mon
     seen: list[Minibatch] = []
     step = algorithm.step
 
-    def recorded_step(minibatch: Minibatch) -> dict[str, float]:
+    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
         seen.append(minibatch)
         return step(minibatch)
 
@@ -149,7 +149,7 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None
     expected = algorithm.net.flat_grad.clone()
     rows = Minibatch(x, (), action, old, advantage, target)
     allowed = gradient_tolerance(algorithm, rows)
-    measured = algorithm.step(rows)
+    measured, _ = algorithm.step(rows)
     assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed)
     assert measured["clip_fraction"] > 0
     assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)

@@ -123,9 +123,9 @@ class GivesItsOwnStatistics(Sound):
 
 
 class MeasuresObservationsAfterATermination(Sound):
-    def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
-        super().count_update(batch, observations, epochs)
-        self.normalizer.update(observations.raw_features[:-1], np.ones_like(batch.valid))
+    def count_update(self, batch: Batch, epochs: int) -> None:
+        super().count_update(batch, epochs)
+        self.normalizer.update(features(self.policy, batch.obs)[:-1], np.ones_like(batch.valid))
         self.statistics = self.normalizer.buffers()
 
 
