@@ -202,11 +202,11 @@ def _named(leaf: Leaf) -> str:
     return f"obs {leaf.path}".strip()
 
 
-def describe_first_non_finite(array: Array) -> str:
-    """Where the first NaN or infinity of a [T, N, …] array is, as text for an error message."""
+def describe_first_non_finite(array: Array, first_step: int = 0) -> str:
+    """Where the first NaN or infinity of a [T, N, …] array is, as text for an error message. Row 0 is `first_step`."""
     t, n = np.argwhere(~np.isfinite(array))[0][:2]
     value = array[t, n][~np.isfinite(array[t, n])] if array.ndim > 2 else array[t, n : n + 1]
-    return f"expected finite values, got {value.flat[0]} at step {t}, copy {n}"
+    return f"expected finite values, got {value.flat[0]} at step {first_step + t}, copy {n}"
 
 
 class Batch(msgspec.Struct, frozen=True):

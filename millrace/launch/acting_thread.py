@@ -18,9 +18,8 @@ from protocol.policy.policy import Policy, make_policy
 from protocol.specs import ImagesDtype, PolicySpec, RunSpec
 from workers.collect.collector import Collector
 from workers.copies.env_loop import Pulse
-from workers.copies.split_vector_env import SplitVectorEnv
+from workers.copies.split_vector_env import SplitLane, SplitVectorEnv
 from workers.evaluate.evaluator import Evaluator
-from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervise.supervisor import Supervisor
 from workers.worker_thread import WorkerThread
 
@@ -28,7 +27,7 @@ NEVER_S = 1e9  # the timeout of an order that may take any time
 
 
 def acting_thread(
-    endpoint: Endpoint, lanes: SplitVectorEnv, evaluation_copies: SplitEvaluationCopies, device: Callable[[], str]
+    endpoint: Endpoint, lanes: SplitVectorEnv, evaluation_copies: SplitLane, device: Callable[[], str]
 ) -> Supervisor:
     """Start the thread. `device`: that of the policy."""
 

@@ -32,7 +32,6 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.specs import DescribeSpec
 from workers.copies.split_vector_env import SplitVectorEnv
-from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervise.supervisor import STOP_WITHIN_S
 
 
@@ -68,9 +67,7 @@ def train(
         lanes = SplitVectorEnv(
             env, config.lanes, before_wait, env.step_lanes, config.fact_names(), masked=known.spaces.masked
         )
-        evaluation_copies = SplitEvaluationCopies(lanes, config.lanes, config.eval_copies)
-
-        thread = acting_thread(endpoint, lanes, evaluation_copies, lambda: torch_device(config))
+        thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(config.eval_copies), lambda: torch_device(config))
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once

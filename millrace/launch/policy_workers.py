@@ -25,7 +25,6 @@ from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import WorkerFlags
 from millrace.launch.vector import listen
 from workers.copies.split_vector_env import SplitVectorEnv
-from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervise.supervisor import Supervisor
 
 
@@ -119,7 +118,7 @@ def _acting_player(
     stack.callback(env.close)
     before_wait = BeforeWaits(env, workers or 1, settings.no_workers_timeout_s)
     lanes = SplitVectorEnv(env, 0, before_wait, env.step_lanes, policy.facts, masked=policy.masked)
-    thread = acting_thread(endpoint, lanes, SplitEvaluationCopies(lanes, 0, which.copies), lambda: "cpu")
+    thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(which.copies), lambda: "cpu")
     stack.callback(thread.stop, 2.0)
     processes = acting_processes(thread, lanes, env, workers or 0)
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, settings, described)

@@ -24,6 +24,7 @@ from tests.support.collectors import collect, no_pulse, random_collector, random
 from tests.support.mask_envs import SIZES, InInfo, InObservation, Parts
 from workers.collect.collector import Collector, OpenEnvCopies
 from workers.copies.env_copies import VectorCopies
+from workers.copies.env_errors import CopyFailed
 from workers.copies.split_vector_env import SplitVectorEnv
 from workers.evaluate.evaluator import Evaluator
 
@@ -132,6 +133,46 @@ def test_a_wrong_mask_in_an_evaluation_is_one_line() -> None:
     run = masked_run("InInfo", fault="empty")
     with pytest.raises(EnvironmentFailed, match=r"copy 0, step \d+: action_mask: expected 7 zeros and ones"):
         Evaluator(run, random_policy(run.policy)).play(Evaluate(1, 1, 0, (1,), True, 99, False, False), print, no_pulse)
+
+
+def test_a_copy_that_was_cut_needs_no_mask_until_it_is_reset() -> None:
+    run = masked_run("InInfo")
+
+    def figures(evaluator: Evaluator, seeds: tuple[int, ...], most_steps: int) -> list[tuple[float, int]]:
+        order = Evaluate(1, 1, 0, seeds, True, most_steps, False, False)
+        return [(episode.reward, episode.length) for episode in evaluator.play(order, print, no_pulse).episodes]
+
+    used, fresh = (Evaluator(run, random_policy(run.policy)) for _ in range(2))
+    assert [length for _, length in figures(used, (1, 2, 3), 2)] == [2, 2, 2]
+    assert figures(used, (4,), 99) == figures(fresh, (4,), 99)
+
+
+class NoChoice(InInfo):
+    """Says that no action is allowed, and takes any."""
+
+    def given(self, bits: Any) -> Any:
+        return bits * np.int8(0)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return *self._next()[:1], 0.0, False, False, self._info
+
+
+def test_a_wrong_mask_of_a_split_vector_environment_is_of_a_copy_of_its_lane() -> None:
+    run = masked_run("InInfo", N=2)
+    vector = SyncVectorEnv([InInfo, InInfo, InInfo, NoChoice])
+    vector.reset()
+    env = SplitVectorEnv(vector, 2, masked=True)
+    with pytest.raises(EnvironmentFailed, match="lane 1, copy 1, first reset: action_mask: expected"):
+        collect(Collector(run, random_policy(run.policy), env.open_lane, env.step_all), run, lanes=range(2))
+
+
+def test_a_wrong_mask_of_the_evaluation_copies_of_a_vector_environment_is_of_a_copy_of_these() -> None:
+    vector = SyncVectorEnv([NoChoice] * 4)
+    vector.reset()
+    split = SplitVectorEnv(vector, 2, step_lanes=lambda lanes, actions: vector.step(actions), masked=True)
+    with pytest.raises(CopyFailed) as caught:
+        split.evaluation_lane(2).step(np.array([0]), no_pulse, [1])
+    assert caught.value.copy == 1
 
 
 def good() -> tuple[Rollout, RunSpec]:

@@ -322,6 +322,44 @@ def test_an_observation_that_is_not_finite_is_named() -> None:
         play(Evaluator(run, random_policy(run.policy)), order(1, 2))
 
 
+class Shows(Smooth):
+    """Shows zeros, and from this step on another number. Its episodes have two steps."""
+
+    def __init__(self, shown: float, at: int) -> None:
+        super().__init__(copies=True)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.shown, self.at = shown, at
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, *_ = super().step(action)
+        return observation, 0.0, self.steps == 2, False, {}
+
+    def show(self) -> Any:
+        return np.full(2, self.shown if self.steps >= self.at else 0.0)
+
+
+def run_of_shown(shown: float, at: int) -> RunSpec:
+    env = Shows(shown, at)
+    policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
+    return RunSpec(EnvSpec.of(lambda: Shows(shown, at)), policy, rollout_steps=4, copies=1, lanes=1, seed=1)
+
+
+def test_an_observation_from_which_no_policy_can_act_is_named_as_in_training() -> None:
+    run = run_of_shown(1e39, at=1)
+    says = "action of the policy: expected finite values, got nan at step 1, copy 0, from observations up to 1e[+]39; wrap"
+    with pytest.raises(EnvironmentFailed, match=f"while the policy was evaluated: {says}"):
+        play(Evaluator(run, random_policy(run.policy)), order(1, 2))
+    with pytest.raises(EnvironmentFailed, match=f"lane 0, {says}"):
+        Collector(run, random_policy(run.policy)).collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
+
+
+def test_no_row_is_sent_with_an_observation_that_is_not_finite() -> None:
+    run, sent = run_of_shown(np.nan, at=2), list[EpisodeRows]()
+    with pytest.raises(EnvironmentFailed, match="copy 0, step 1: observation: expected finite numbers"):
+        Evaluator(run, random_policy(run.policy)).play(order(1, rows=True), sent.append, no_pulse)
+    assert not sent
+
+
 def test_an_environment_of_other_spaces_is_refused() -> None:
     run = msgspec.structs.replace(run_of("CartPole-v1"), env=EnvSpec("Acrobot-v1"))
     with pytest.raises(UsageError, match=r"environment Acrobot-v1: its observations .* are not those of the policy"):

@@ -28,6 +28,17 @@ from workers.copies.env_results import leaf_writers
 from workers.copies.facts import Facts
 
 
+def check_acted(lane: int | None, name: str, array: Array, obs: Sequence[Array], first_step: int = 0) -> None:
+    """Raise if what the policy computed, [T, N, …], is not finite: finite observations `obs` are too large for float32.
+
+    `lane`: None in an evaluation. `first_step`: that of row 0.
+    """
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
+        line = f"{name} of the policy: {describe_first_non_finite(array, first_step)}, from observations up to {largest:g}"
+        raise environment_failed(lane, f"{line}; wrap the environment so that they are smaller")
+
+
 class CollectedLane:
     """A numbered group of N env copies that are stepped together."""
 
@@ -107,11 +118,8 @@ class CollectedLane:
 
     def check_acted(self, action: Array, log_prob: Array, obs: Sequence[Array]) -> None:
         """Raise if the policy computed no finite numbers from finite observations: some are too large for float32."""
-        for name, array in (("action", action), ("log_prob", log_prob)):
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
-                line = f"{name} of the policy: {describe_first_non_finite(array)}, from observations up to {largest:g}"
-                raise environment_failed(self.number, f"{line}; wrap the environment so that they are smaller")
+        check_acted(self.number, "action", action, obs)
+        check_acted(self.number, "log_prob", log_prob, obs)
 
     def finish(self, reward: Array, done: Bools, step_end_s: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """After T steps: which rows are valid [T, N], and the episodes that ended, oldest first.

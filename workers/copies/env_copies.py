@@ -25,9 +25,9 @@ from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import unpack
-from workers.activity import RESETTING, STEPPING, activity
+from workers.activity import EVALUATING, RESETTING, STEPPING, activity
 from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import EnvLoop, Infos, Pulse
+from workers.copies.env_loop import Autoreset, EnvLoop, Infos, Pulse
 from workers.copies.env_results import missing_leaf, read_leaves
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.copies.mask_reader import MaskReader
@@ -96,32 +96,40 @@ class LoopedCopies:
     ) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
-        `first`: which copy the first one is.
+        `first`: which copy the first one is. In an evaluation, no step resets a copy.
         """
-        self._facts = facts
-        self._loop = EnvLoop((partial(made_without_order_check, make) for make in makes), pulse, first=first)
-        self.observation_space = self._loop.envs[0].observation_space
-        self.action_space = self._loop.envs[0].action_space
+        self._facts, self._activity = facts, activity()
+        makes = (partial(made_without_order_check, make) for make in makes)
+        evaluates = first.evaluation
+        autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
+        self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=EVALUATING if evaluates else STEPPING)
+        self.envs, self.count = self._loop.envs, len(self._loop.envs)
+        self.observation_space, self.action_space = self.envs[0].observation_space, self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
         if masked:
             self.observation_space = without_mask(self.observation_space, self.action_space)
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._read = make_flatten(self.observation_space)
-        self._observations: list[Any] = [None] * len(self._loop.envs)
+        self._observations: list[Any] = [None] * self.count
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, with a seed for each."""
-        infos = self._loop.reset(range(len(self._observations)), seeds, self._observations, pulse)
+        """Start episodes in all copies, or in the first ones, with a seed for each."""
+        copies = range(len(seeds))
+        infos = self._loop.reset(copies, seeds, self._observations, pulse)
         leaves = self._leaves()
-        return leaves if self._masks is None else (*leaves, self._read_masks(self._masks, infos))
+        return leaves if self._masks is None else (*leaves, self._read_masks(self._masks, infos, copies))
 
-    def step(self, actions: Array, pulse: Pulse) -> StepResult:
-        """Step each copy, or reset it if its episode has ended."""
+    def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
+        """Step each copy, or reset it if its episode has ended. `copies`: only these, which have these actions.
+
+        The result of a copy that is not stepped is its last one.
+        """
+        copies = None if copies is not None and len(copies) == self.count else copies  # all are stepped faster
         loop = self._loop
-        infos = loop.step(actions, self._observations, pulse)
+        infos = loop.step(actions, self._observations, pulse, copies)
         leaves = self._leaves() if self._nested else (self._observations,)
         if self._masks is not None:
-            leaves = (*leaves, self._read_masks(self._masks, infos))
+            leaves = (*leaves, self._read_masks(self._masks, infos, copies))
         if not self._facts:
             return StepResult(leaves, loop.reward, loop.terminated, loop.truncated)
         facts = {n: facts_of_info(self._facts, info, n) for n, info in infos if loop.terminated[n] or loop.truncated[n]}
@@ -129,11 +137,19 @@ class LoopedCopies:
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of every copy; of its wrappers, the outermost one that has it gets it."""
-        for n, env in enumerate(self._loop.envs):
+        for n, env in enumerate(self.envs):
             set_attribute(n, env, name, unpack(packed))  # each its own value: they may change it
 
-    def _read_masks(self, masks: MaskReader, infos: Infos) -> Leaves:
-        return masks.read_loop(self._observations, infos, self._loop.terminated, self._loop.truncated)
+    def render(self, copy: int) -> Any:
+        """What this copy renders."""
+        try:
+            with self._activity.during(EVALUATING):
+                return self.envs[copy].render()
+        except BaseException as error:
+            raise CopyFailed(copy, "render") from error
+
+    def _read_masks(self, masks: MaskReader, infos: Infos, copies: Sequence[int] | None) -> Leaves:
+        return masks.read_loop(self._observations, infos, self._loop.terminated, self._loop.truncated, copies)
 
     def _leaves(self) -> Leaves:
         if self._nested:

@@ -52,10 +52,11 @@ class EnvLoop:
         *,
         ended: bool = False,
         first: EnvCopy = FIRST_COPY,
+        stepping: int = STEPPING,
     ) -> None:
         """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them.
 
-        `first` says which copy the first one is; the others follow it.
+        `first` says which copy the first one is; the others follow it. `stepping`: what the worker does during a step.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
         self._activity = activity()
@@ -80,6 +81,7 @@ class EnvLoop:
         self.truncated: list[Any] = [ended] * len(self.envs)
         """[N] of the last step"""
         self._step_functions = [env.step for env in self.envs]
+        self._stepping, self._all = stepping, range(len(self.envs))
         self._next_step, self._same_step = autoreset == "NextStep", autoreset == "SameStep"
 
     def reset(
@@ -105,8 +107,16 @@ class EnvLoop:
                 infos.append((n, _kept(info)))
         return infos
 
-    def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse) -> Infos:
-        """Step every copy with its action, or reset it. The rest of the result is in `reward`, `terminated`, `truncated`."""
+    def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse, copies: Sequence[int] | None = None) -> Infos:
+        """Step every copy, or these alone, each with its action, or reset it.
+
+        The rest of the result is in `reward`, `terminated`, `truncated`.
+        """
+        chosen: Sequence[int] = self._all
+        steps = self._step_functions
+        if copies is not None:
+            chosen, steps = copies, [steps[n] for n in copies]
+        stepping = self._stepping
         reward, terminated, truncated = self.reward, self.terminated, self.truncated
         next_step, same_step = self._next_step, self._same_step
         infos: Infos = []
@@ -114,15 +124,15 @@ class EnvLoop:
         # copy is reset, and every `PULSE_S`.
         numbers, seconds, begin, counted = self._activity.numbers, self._activity.seconds, self._activity.begin, 0
         seconds[SINCE_S] = now_s = perf_counter()
-        numbers[DOING] = STEPPING
+        numbers[DOING] = stepping
         pulse_due_s = now_s + PULSE_S
-        for n, (step, action) in enumerate(zip(self._step_functions, actions, strict=True)):
+        for n, step, action in zip(chosen, steps, actions, strict=True):
             resets = next_step and (terminated[n] or truncated[n])
             try:
                 if resets:
                     begin(RESETTING)
                     observation, info = self.envs[n].reset()
-                    begin(STEPPING)
+                    begin(stepping)
                     reward[n], terminated[n], truncated[n] = 0.0, False, False
                 else:
                     observation, reward[n], terminated[n], truncated[n], info = step(action)
@@ -132,7 +142,7 @@ class EnvLoop:
                         last = {"final_obs": deepcopy(observation), "final_info": _kept(info)}
                         begin(RESETTING)
                         observation, info = self.envs[n].reset()
-                        begin(STEPPING)
+                        begin(stepping)
                         info = last | info
                 into[n] = observation
             except BaseException as error:
@@ -141,14 +151,14 @@ class EnvLoop:
             if info:
                 infos.append((n, _kept(info)))  # before the next copy may change the same dict
             if (now_s := perf_counter()) > pulse_due_s:
-                numbers[ENV_CALLS] += n + 1 - counted
-                counted = n + 1
+                numbers[ENV_CALLS] += (done := chosen.index(n) + 1) - counted
+                counted = done
                 numbers[DOING] = WAITING
                 pulse()
                 seconds[SINCE_S] = now_s = perf_counter()
-                numbers[DOING] = STEPPING
+                numbers[DOING] = stepping
                 pulse_due_s = now_s + PULSE_S
-        numbers[ENV_CALLS] += len(reward) - counted
+        numbers[ENV_CALLS] += len(chosen) - counted
         seconds[SINCE_S] = now_s
         numbers[DOING] = WAITING
         self.steps += 1

@@ -62,11 +62,13 @@ class MaskReader:
         infos: Sequence[tuple[int, Mapping[str, Any]]],
         terminated: Sequence[Any],
         truncated: Sequence[Any],
+        stepped: Sequence[int] | None = None,
     ) -> list[Bools]:
-        """The masks of all copies of a loop."""
+        """The masks of all copies of a loop. `stepped`: only these got one, and the others need none."""
         by_copy = dict(infos)
+        of = range(len(observations)) if stepped is None else stepped
         return [
-            self.read(n, observation, by_copy.get(n, _NONE), terminated[n], truncated[n])
+            self.read(n, observation, by_copy.get(n, _NONE), terminated[n], truncated[n]) if n in of else self._all
             for n, observation in enumerate(observations)
         ]
 

@@ -6,7 +6,8 @@ own, and autoreset is NextStep for the vector environment as for the loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
@@ -63,7 +64,11 @@ class SplitVectorEnv:
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
-        return _LaneOfVectorEnv(self, slice(lane * run.copies, (lane + 1) * run.copies))
+        return SplitLane(self, lane * run.copies, run.copies)
+
+    def evaluation_lane(self, count: int) -> SplitLane:
+        """The last copies, for evaluation. They are lanes of one copy each, behind the others."""
+        return SplitLane(self, self.env.num_envs - count, count)
 
     def step_all(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
         """Step the copies of all lanes, with actions [L, N, *action]: `StepAll` of a `Collector`."""
@@ -77,7 +82,12 @@ class SplitVectorEnv:
             lane, copy = divmod(error.copy or 0, len(in_order) // self._lanes)
             raise environment_failed(lane, CopyFailed(copy, "step", error.line)) from error
 
-    def step_some(self, lanes: Sequence[int], copies: slice, actions: Array, pulse: Pulse) -> StepResult:
+    def step_evaluation(self, first: int, copies: Sequence[int], actions: Array, pulse: Pulse) -> None:
+        """Step these copies of those for evaluation, of which this is the first."""
+        lanes = [self._lanes + n for n in copies]
+        self._result = self.step_some(lanes, [first + n for n in copies], actions, pulse)
+
+    def step_some(self, lanes: Sequence[int], copies: slice | list[int], actions: Array, pulse: Pulse) -> StepResult:
         """Step these lanes, which have these copies, with their actions. The result has a row for every copy there is."""
         if self._lost:
             self._assign_again(pulse)
@@ -97,10 +107,7 @@ class SplitVectorEnv:
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
             waits = np.ones(self.env.num_envs, bool)  # copies that were not stepped have no new mask
-            if lanes[0] < self._lanes:
-                waits[copies] = False
-            else:  # lanes for evaluation have one copy each
-                waits[[copies.start + lane - self._lanes for lane in lanes]] = False
+            waits[copies] = False
             leaves = [*leaves, self._masks.read_all(observation, infos, terminated | waits, truncated)]
         return StepResult(leaves, reward, terminated, truncated, infos.get("worker_lost"), facts)
 
@@ -178,25 +185,43 @@ class SplitVectorEnv:
             raise
 
 
-class _LaneOfVectorEnv:
-    """The env copies of one lane."""
+class SplitLane:
+    """The env copies of one lane, or those for evaluation: a lost copy costs the episodes that are being played."""
 
-    def __init__(self, split: SplitVectorEnv, copies: slice) -> None:
-        self._split, self._copies = split, copies
+    def __init__(self, split: SplitVectorEnv, first: int, count: int) -> None:
+        self._split, self._first, self.count = split, first, count
+        self._copies = slice(first, first + count)
         self.observation_space = split.observation_space
         self.action_space = split.env.single_action_space
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, with a seed for each."""
-        return self._split.reset(self._copies, seeds, pulse)
+        """Start episodes in all copies, or in the first ones, with a seed for each."""
+        with self._own_numbers():
+            return self._split.reset(slice(self._first, self._first + len(seeds)), seeds, pulse)
 
-    def step(self, actions: Array, pulse: Pulse) -> StepResult:
-        """The result of the step that `SplitVectorEnv.step_all` made."""
+    def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
+        """The result of the step that `SplitVectorEnv.step_all` made; in an evaluation, of a step of these copies."""
+        if copies is not None:
+            with self._own_numbers():
+                self._split.step_evaluation(self._first, copies, actions, pulse)
         return self._split.result(self._copies)
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of these copies."""
         self._split.assign(self._copies, name, packed, pulse)
 
+    def render(self, copy: int) -> Any:
+        """Not supported: these copies were made without a render mode."""
+        raise ValueError("render: copies of a vector environment cannot be filmed; use millrace evaluate --video")
+
     def close(self) -> None:
         """Do nothing: the copies belong to the vector environment, and are reset when the lane starts anew."""
+
+    @contextmanager
+    def _own_numbers(self) -> Iterator[None]:
+        """Within it, an error of a copy of the vector environment becomes one of this lane's."""
+        try:
+            yield
+        except CopyFailed as error:
+            copy = None if error.copy is None else error.copy - self._first
+            raise CopyFailed(copy, error.doing, error.line) from error.__cause__

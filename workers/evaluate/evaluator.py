@@ -8,14 +8,16 @@ opened once, and reset with a seed before each episode.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from protocol.arrays import Array
+from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import action_converter_of, action_spec, observation_leaves
 from protocol.errors import UsageError
 from protocol.messages import Evaluate, Evaluated
@@ -27,19 +29,44 @@ from protocol.random_streams import Purpose, generator
 from protocol.rollout import LARGEST_REWARD, Episode, outside_of_space
 from protocol.specs import RunSpec
 from workers.collect.acting import acting_of
+from workers.collect.collected_lane import check_acted
+from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
-from workers.copies.env_results import leaf_writers, one_number
+from workers.copies.env_results import leaf_writers, write_numbers
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
-from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, LoopedEvaluationCopies
+
+
+class EvaluationCopies(EnvCopies, Protocol):
+    """Env copies of which those are stepped whose episodes run; no step resets a copy."""
+
+    count: int
+
+    def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
+        """Step these copies, with an action for each of them. The result has a row for every copy."""
+        ...
+
+    def render(self, copy: int) -> Any:
+        """What the environment renders. Raises `ValueError` if it cannot."""
+        ...
+
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
 """Makes this number of copies, with this render mode."""
 
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-    """Copies in this process."""
-    return LoopedEvaluationCopies(run.env, count, render_mode, pulse, run.facts, masked=run.masked)
+    """Copies in this process. Raises `UsageError` if the environment does not render in this mode, `rgb_array`."""
+    make = partial(run.env.for_evaluation().make, render_mode)
+    with warnings.catch_warnings():
+        if render_mode is not None:
+            warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
+        copies = LoopedCopies([make] * count, pulse, run.facts, masked=run.masked, first=EnvCopy(evaluation=True))
+    modes = copies.envs[0].metadata.get("render_modes", [])
+    if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
+        copies.close()
+        raise UsageError(f"environment {run.env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")
+    return copies
 
 
 class Evaluator:
@@ -68,9 +95,9 @@ class Evaluator:
         """
         began_s = perf_counter()
         try:
-            while True:
-                with suppress(CopiesLost):
-                    return self._play(order, send, pulse)
+            while (answer := self._play(order, send, pulse)) is None:
+                pass  # the episodes of lost copies are played again from their seeds
+            return answer
         except CopyFailed as error:
             self.close()
             raise environment_failed(None, error) from error
@@ -85,45 +112,56 @@ class Evaluator:
         while self._copies:
             self._copies.popitem()[1].close()
 
-    def _play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:
+    def _play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated | None:
+        """The answer; None if a worker was lost, and with it copies whose episodes had not ended."""
         k, policy = len(order.seeds), self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in self._stored)
+        numbers = np.zeros(k), np.zeros(k, bool), np.zeros(k, bool)
         state, drawn = zero_state(policy, 1, k), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
         returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
         no_facts = (math.nan,) * len(self._run.facts)
         facts = [no_facts] * k
         senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
+        running, t = list(range(k)), 0
         began_s = perf_counter()
-        for n, leaves in enumerate(copies.reset(order.seeds, pulse)):
-            self._store(obs, n, leaves, "first reset")
-            if senders:
-                self._observe(senders[n], obs, n, copies)
-        self._check_values(obs, "first reset")
-        running = list(range(k))
+        self._write(obs, running, copies.reset(order.seeds, pulse), "first reset")
+        for n, sender in enumerate(senders):
+            self._observe(sender, obs, n, copies)
         while running:
             pulse()
             with np.errstate(all="ignore"):
                 chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
-                # A new array at each step, because an environment may keep its action.
-                actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
-                actions[:k] = self._to_env_action(chosen)
+                taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=False)
+            self._check_acted(chosen, running, obs, t)
+            # The actions are a new array at each step, because an environment may keep its action.
+            try:
+                step = copies.step(taken[running], pulse, running)
+                if step.lost is not None and step.lost[running].any():
+                    return None
+                write_numbers(numbers, slice(None), (step.reward[:k], step.terminated[:k], step.truncated[:k]))
+                rewards: list[float] = numbers[0].tolist()
+                for n in running:
+                    if not abs(rewards[n]) <= LARGEST_REWARD:
+                        raise CopyFailed(n, line=f"reward: expected a finite float32, got {rewards[n]}")
+            except CopyFailed as error:
+                raise environment_failed(None, error, f"step {t}") from error
+            self._write(obs, running, step.leaves, f"step {t}")
             ended = set[int]()
-            for n, step in zip(running, copies.step(actions, running, pulse), strict=True):
-                reward = _finite_reward(step.reward, n, lengths[n])
-                self._store(obs, n, step.leaves, lengths[n])
-                returns[n] += reward
+            for n in running:
+                returns[n] += rewards[n]
                 lengths[n] += 1
-                over = bool(step.terminated or step.truncated)
+                terminated, truncated = bool(numbers[1][n]), bool(numbers[2][n])
+                over = terminated or truncated
                 cut[n] = not over and lengths[n] >= order.most_steps
                 if senders:
                     self._observe(senders[n], obs, n, copies)
-                    senders[n].step(chosen[n], reward, bool(step.terminated), bool(step.truncated) or cut[n])
+                    senders[n].step(chosen[n], rewards[n], terminated, truncated or cut[n])
                 if over or cut[n]:
                     ended.add(n)
-                    seconds[n], facts[n] = perf_counter() - began_s, step.facts or no_facts
-            self._check_values(obs, lengths[running[0]] - 1)  # all that run have made equally many steps
+                    seconds[n], facts[n] = perf_counter() - began_s, step.facts.get(n, no_facts)
             self.steps += len(running)
+            t += 1
             if ended:
                 running = [n for n in running if n not in ended]
         episodes = tuple(Episode(*figures) for figures in zip(returns, lengths, seconds, facts, strict=True))
@@ -145,31 +183,34 @@ class Evaluator:
             )
         return copies
 
-    def _store(self, obs: tuple[Array, ...], n: int, leaves: tuple[Any, ...], when: str | int) -> None:
-        """Write the observation of copy n to its place in the batch. Raises if it is not of its space.
+    def _write(self, obs: tuple[Array, ...], copies: Sequence[int], leaves: Leaves, when: str) -> None:
+        """Write the observations of these copies to their places in the batch. Raises if one is no value of its space."""
+        try:
+            for array, values, writer in zip(obs, leaves, self._writers, strict=True):
+                for n in copies:
+                    writer.write_one(array[0], n, values[n])
+        except CopyFailed as error:
+            raise environment_failed(None, error, when) from error
+        self._check_values(obs, when)
 
-        `when` is a text, or the number of the step.
-        """
-        for array, leaf, value, writer in zip(obs, self._stored, leaves, self._writers, strict=True):
-            if type(value) is np.ndarray and value.dtype == array.dtype and value.shape == leaf.shape:
-                array[0, n] = value
-                continue
-            try:
-                writer.write_one(array[0], n, value)
-            except CopyFailed as error:
-                raise environment_failed(None, error, _moment(when)) from error
-
-    def _check_values(self, obs: tuple[Array, ...], when: str | int) -> None:
+    def _check_values(self, obs: tuple[Array, ...], when: str) -> None:
         """Raise if an observation of the batch is not finite, or not a value of a space that counts its values."""
         for array, leaf in zip(obs, self._stored, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
-                where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
+                where = f"copy {n}, {when}: observation {leaf.path}".strip()
                 raise environment_failed(None, f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
             if leaf.kind != "box" and outside_of_space(array, leaf):
                 n, why = next((n, why) for n in range(array.shape[1]) if (why := outside_of_space(array[0, n], leaf)))
-                where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
+                where = f"copy {n}, {when}: observation {leaf.path}".strip()
                 raise environment_failed(None, f"{where}: {why}")
+
+    def _check_acted(self, chosen: Array, running: Sequence[int], obs: tuple[Array, ...], t: int) -> None:
+        """As in training. The action of a copy whose episode has ended does not count."""
+        if chosen.dtype.kind == "f":
+            acted = np.zeros_like(chosen)
+            acted[running] = chosen[running]
+            check_acted(None, "action", acted[None], obs, t)
 
     def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
         try:
@@ -178,21 +219,3 @@ class Evaluator:
             raise environment_failed(None, f"copy {n}, {error}") from error
         shown = obs[: len(self._run.policy.observation)]  # without the mask
         sender.observe([leaf[0, n] for leaf in shown], frame)
-
-
-def _moment(when: str | int) -> str:
-    return when if isinstance(when, str) else f"step {when}"
-
-
-def _finite_reward(reward: Any, n: int, t: int) -> float:
-    """The reward as a number. Raises `EnvironmentFailed` if it is none that a rollout could hold."""
-    try:
-        try:
-            number = float(reward)
-        except (TypeError, ValueError):
-            number = float(one_number("reward", n, reward))
-    except CopyFailed as error:
-        raise environment_failed(None, error, f"step {t}") from error
-    if not abs(number) <= LARGEST_REWARD:
-        raise environment_failed(None, f"copy {n}, step {t}: reward: expected a finite float32, got {number}")
-    return number
