@@ -46,7 +46,7 @@ from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import ImagesDtype, PolicySpec, RunSpec
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 
 PROCESSES = 2
 STEPS = 128  # T

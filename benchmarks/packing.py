@@ -34,7 +34,7 @@ from protocol.wire.socket_options import MAX_FRAME_BYTES
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 
 ATARI = RunSpec(
     EnvSpec("ALE/Pong-v5"),

@@ -30,7 +30,7 @@ from protocol.specs import RunSpec
 from tests.support.described import run_spec
 from tests.support.fake_ends import fake_rollout
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 
 
 def ppo(config: Config) -> PPOConfig:

@@ -32,7 +32,7 @@ LANES = "learner.rollouts.lanes"
 MEMBERSHIP = "learner.members.membership"
 PLACEMENT = "learner.members.lane_placement"
 SESSION = "workers.conversation.session"
-HELD = "workers.conversation.held_rollouts"
+HELD = "workers.conversation.held"
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ MUTATIONS = {
     "a rollout that has not arrived is forgotten": Mutation(
         HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"
     ),
-    "rollouts of a lane are not counted": Mutation(HELD, "lane.sequence += 1", "pass"),
+    "rollouts of a lane are not counted": Mutation(HELD, "self.sequence += kept", "pass"),
     "the lane of a lost worker is not placed anew": Mutation(PLACEMENT, "self._unplaced |= member.lanes", "pass"),
     "a silent worker is never removed": Mutation(MEMBERSHIP, "if now - member.alive_s > timeout_s]", "if False]"),
     "messages of an earlier session are accepted": Mutation(
@@ -128,8 +128,8 @@ MUTATIONS = {
     "a lost Release is never said again": Mutation(SESSION, "return current.release_unlisted(received)", "return []"),
     "a lane reopened on a new incarnation keeps the old lane's state": Mutation(
         HELD,
-        "lane = self._lanes[permit.lane] = _HeldLane(permit.incarnation)",
-        "lane = self._lanes[permit.lane] = lane or _HeldLane(0)\n            lane.incarnation = permit.incarnation",
+        "lane = self._lanes[number] = self._kind(incarnation)",
+        "lane = self._lanes[number] = lane or self._kind(0)\n            lane.incarnation = incarnation",
     ),
     "a lane keeps its incarnation": Mutation(LANES, "self.incarnation += 1", "self.incarnation += 0"),
 }

@@ -24,7 +24,7 @@ from tests.model.search import Search, explore
 from tests.model.settings import Settings
 from tests.model.training import Training
 from tests.model.world import World
-from workers.conversation.held_rollouts import HeldRollouts, _HeldLane
+from workers.conversation.held import HeldRollouts, RolloutLane
 from workers.conversation.session import Identity, Session, _SessionState
 
 SMALL = Training(workers=2, lanes=1, updates=1, faults=1)
@@ -93,8 +93,8 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         session,
         session._current,
         session._current.rollouts,
-        _HeldLane(0),
+        RolloutLane(0),
     ]
     types = TicketCoordinator, Membership, CollectingMember, TicketedLane, Ticket, LanePlacement, LaneQueue
-    assert [type(each) for each in objects] == [*types, Session, _SessionState, HeldRollouts, _HeldLane]
+    assert [type(each) for each in objects] == [*types, Session, _SessionState, HeldRollouts, RolloutLane]
     assert {type(each): set(vars(each)) for each in objects} == known

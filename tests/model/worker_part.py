@@ -14,7 +14,7 @@ from tests.model.message_content import incarnation, rollout_content, rollout_of
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
-from workers.conversation.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
+from workers.conversation.held import REMEMBERED_TICKETS, Assignment, HeldRollouts, RolloutLane
 from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task, _SessionState
 from workers.conversation.states import State
 
@@ -22,13 +22,13 @@ SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
     _SessionState: {"rollouts", "weights", "in_progress", "replies", "acknowledged_version"},
     HeldRollouts: {"_lanes"},
-    _HeldLane: {"incarnation", "sequence", "tickets", "kept", "finished"},
+    RolloutLane: {"incarnation", "sequence", "asked", "answered", "finished"},
 }
 NOT_SAVED: dict[type, set[str]] = {
     Session: {"_statistics", "_join_timeout_s", "_rejoin_timeout_s", "_joining_s", "_backoff_s", "_reason"},
     _SessionState: {"evaluations", "orders", "described"},
     HeldRollouts: set(),
-    _HeldLane: set(),
+    RolloutLane: set(),
 }
 PAUSE_S = 0.5  # between two Hellos: one in every tick
 
@@ -170,9 +170,9 @@ def saved(worker: Worker, now: float) -> Content:
     return nonce, flags, fields, (session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments))
 
 
-def _lane(number: int, lane: _HeldLane) -> Content:
-    tickets = tuple((ticket(each), version) for each, version in lane.tickets.items())
-    kept = tuple(rollout_content(rollout) for rollout in lane.kept.values())
+def _lane(number: int, lane: RolloutLane) -> Content:
+    tickets = tuple((ticket(each), version) for each, version in lane.asked.items())
+    kept = tuple(rollout_content(rollout) for rollout in lane.answered.values())
     finished = tuple(name(Kind.OLD_TICKET, each) for each in lane.finished)
     assert len(finished) <= REMEMBERED_TICKETS, "a worker remembers too many tickets"
     return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept, finished
@@ -202,9 +202,9 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     if of_session is not None:
         current.run, current.session, held.replies = settings.run, of_session.value, replies.value
     for lane, of_incarnation, sequence, tickets, kept, finished in lanes:
-        here = held.rollouts._lanes[lane] = _HeldLane(of_incarnation.value, sequence)
-        here.tickets = {each.value: lowest for each, lowest in tickets}
-        here.kept = {fields[2].value: rollout_of(fields) for fields in kept}
+        here = held.rollouts._lanes[lane] = RolloutLane(of_incarnation.value, sequence)
+        here.asked = {each.value: lowest for each, lowest in tickets}
+        here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
         here.finished.extend(each.value for each in finished)
     worker.session = current
     if work is not None:

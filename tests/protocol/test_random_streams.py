@@ -29,7 +29,7 @@ from protocol.specs import PolicySpec
 from tests.support.batches import BOX, DISCRETE, GAUSSIAN
 from tests.support.collectors import no_pulse, run_around, with_env
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.evaluate.evaluator import Evaluator
 
 DRAWS, STEPS = 64, 4_000

@@ -28,7 +28,7 @@ from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from protocol.wire import codec, socket_options
 from protocol.wire import compression as packing
-from workers.conversation import held_rollouts, session, states
+from workers.conversation import held, session, states
 
 DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
@@ -134,7 +134,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (packing, "MIN_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice as long as the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello messages, at most",
-    (held_rollouts, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
+    (held, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
     (ticket_coordinator, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
     (membership, "REMEMBERED"): "refused processes that the learner remembers, so that they do not come back",
     (membership, "MAX_MEMBERS"): "workers of one learner",
@@ -363,7 +363,7 @@ def test_every_record_that_travels_is_described() -> None:
 
 def test_every_limit_is_in_the_document() -> None:
     for module in (
-        bounds, space_spec, env_spec, codec, socket_options, packing, session, held_rollouts, ticket_coordinator, messages,
+        bounds, space_spec, env_spec, codec, socket_options, packing, session, held, ticket_coordinator, messages,
         rollout, specs,
     ):  # fmt: skip
         for name in re.findall(r"^((?:MAX|MOST)_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):

@@ -23,7 +23,7 @@ from protocol.policy.policy import Policy, make_policy
 from protocol.rollout import Episode, Rollout, validate
 from protocol.specs import PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.copies.env_copies import LoopedCopies, VectorCopies
 from workers.evaluate.evaluator import Evaluator
 

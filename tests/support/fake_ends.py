@@ -62,7 +62,7 @@ def fake_rollouts(task: Task) -> list[Rollout]:
 
 def held_count(session: Session) -> int:
     """Number of tickets and rollouts that a worker holds."""
-    return len(session._current.rollouts)
+    return sum(len(lane.asked) + len(lane.answered) for lane in session._current.rollouts._lanes.values())
 
 
 def fake_evaluated(task: EvaluationTask) -> Evaluated:

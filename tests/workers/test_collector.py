@@ -32,7 +32,7 @@ from tests.support.collectors import (
 )
 from tests.support.rounding import assert_within, log_prob_variance, tolerance_of
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.copies.env_copies import copy_seeds
 from workers.envs.toy import Countdown, Scripted
 

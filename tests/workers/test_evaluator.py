@@ -21,7 +21,7 @@ from protocol.policy.policy import Policy
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.collectors import no_pulse, random_policy, run_of
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.evaluate import episode_rows
 from workers.evaluate.evaluator import Evaluator
 

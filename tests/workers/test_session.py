@@ -40,7 +40,7 @@ from protocol.messages import (
 from protocol.specs import StepSpec
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 from workers.conversation.connection_rules import wait_limits_s
-from workers.conversation.held_rollouts import REMEMBERED_TICKETS
+from workers.conversation.held import KEPT_RESULTS, REMEMBERED_TICKETS
 from workers.conversation.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
@@ -353,6 +353,33 @@ def test_an_evaluation_comes_before_rollouts() -> None:
     answer = fake_evaluated(task)
     assert session.work_ended([answer]) == [Send(answer)]
     assert task_of(session).assignments[0].ticket == 0
+
+
+def test_an_evaluation_of_an_older_version_is_dropped() -> None:
+    session = ready(EVALUATE, weights(1))
+    assert session.next_work() is None
+    assert sent(session.tick(1.0), Heartbeat)[0].tickets == ()
+
+
+def test_the_number_of_kept_results_of_evaluations_is_bounded() -> None:
+    session = ready()
+    for ticket in range(KEPT_RESULTS + 1):
+        session.handle(msgspec.structs.replace(EVALUATE, ticket=ticket), 0.1)
+        task = session.next_work()
+        assert isinstance(task, EvaluationTask)
+        session.work_ended([fake_evaluated(task)])
+    assert list(session._current.evaluations.answered) == list(range(1, KEPT_RESULTS + 1))
+
+
+def test_the_oldest_order_of_all_lanes_is_executed_first() -> None:
+    session = joining()
+    session.handle(Welcome(SESSION, FIRST, StepSpec((EnvSpec("Any-v0"),), (0, 1), (1, 1), (), ())), 0.0)
+    later, earlier = (
+        Reset(SESSION, ticket, lane, 0, (0,), (None,), np.zeros(0, np.uint8)) for lane, ticket in ((0, 7), (1, 6))
+    )
+    session.handle(later, 0.1)
+    session.handle(earlier, 0.1)
+    assert session.next_work() == earlier
 
 
 def test_finished_with_nothing_puts_the_tickets_back() -> None:

@@ -18,7 +18,7 @@ from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.copies.split_vector_env import SplitVectorEnv
 
 LANES = 3

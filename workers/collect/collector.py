@@ -29,7 +29,7 @@ from protocol.specs import RunSpec
 from workers.activity import MAKING, activity
 from workers.collect.acting import RolloutActions, acting_of
 from workers.collect.collected_lane import CollectedLane
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse

@@ -2,7 +2,7 @@
 
 Rule: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
 because the next Heartbeat lists all tickets that this worker holds, and the learner sends again what is missing. What a
-worker holds is in the files beside this one that begin with `held_`.
+worker holds is in `held.py`.
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ from protocol.messages import (
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from workers.conversation.connection_rules import REJOIN_TIMEOUT_S
-from workers.conversation.held_evaluations import HeldEvaluations
-from workers.conversation.held_orders import HeldOrders
-from workers.conversation.held_rollouts import Assignment, HeldRollouts
+from workers.conversation.held import Assignment, HeldEvaluations, HeldOrders, HeldRollouts
 from workers.conversation.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
 from workers.exit_codes import EXIT_UNSUITABLE
 
@@ -174,7 +172,7 @@ class _SessionState:
 
     def unfinished(self) -> tuple[int, ...]:
         """Tickets that are not yet collected or executed: as many as a message may name."""
-        return (*self.rollouts.tickets(), *self.evaluations.tickets(), *self.orders.tickets())[:MAX_TICKETS]
+        return (*self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())[:MAX_TICKETS]
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
@@ -262,7 +260,7 @@ class Session:
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]
             case Evaluate() if isinstance(self.run, RunSpec):
-                again = [current.evaluations.take(message)]
+                again = [current.evaluations.take(message.ticket, message)]
             case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
                 again = [current.orders.take(message)]
             case Release(_, lanes):

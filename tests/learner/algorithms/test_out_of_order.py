@@ -15,7 +15,7 @@ from protocol.rollout import Batch, Rollout, stack_rollouts
 from protocol.specs import RunSpec
 from tests.support.collectors import random_weights, run_of
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 
 GAMMA, N_STEP = 0.9, 3
 ORDER = (0, 2, 1, 3, 4)  # 3 follows 1 and continues nothing; 4 continues 3

@@ -40,7 +40,7 @@ from tests.support.collectors import TOY, no_pulse, random_policy, run_of
 from tests.support.described import described
 from tests.support.saved_policies import load_policy
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 
 Array = np.ndarray[Any, Any]
 

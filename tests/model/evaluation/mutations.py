@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.model.mutations import COORDINATOR, SESSION, Mutation, play
+from tests.model.mutations import COORDINATOR, HELD, SESSION, Mutation, play
 
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
 TICKETS = "learner.rollouts.evaluation_tickets"
-HELD = "workers.conversation.held_evaluations"
 
 OF_THE_LEARNER = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),
@@ -38,17 +37,13 @@ OF_THE_LEARNER = {
     ),
 }
 OF_THE_WORKER = {
-    "an answer to an order to evaluate is not sent again": Mutation(
-        HELD, "return self._answers[order.ticket]", "return None"
-    ),
-    "an order to evaluate is executed when it is repeated": Mutation(HELD, "if order.ticket in self._answers:", "if False:"),
+    "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
+    "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
     "an evaluation under any weights": Mutation(HELD, "if order.version == version]", "if True]"),
     "an executed order to evaluate stays": Mutation(
-        HELD, "order = self._orders.pop(answer.ticket, None)", "order = self._orders.get(answer.ticket)"
+        HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
     ),
-    "an answer is kept although rows belong to it": Mutation(
-        HELD, "if not (order.send_rows or order.send_frames):", "if True:"
-    ),
+    "an answer is kept although rows belong to it": Mutation(HELD, "(order.send_rows or order.send_frames):", "False:"),
     "a worker that evaluates takes other work": Mutation(SESSION, "self._current.in_progress = work is not None", "pass"),
     "an evaluation of an earlier session goes on": Mutation(
         SESSION, "return self.state not in goes_on or work.session != self.session", "return False"

@@ -17,7 +17,7 @@ from tests.model.evaluation.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_W
 from tests.model.mutations import check_that_they_fit, find
 from tests.model.search import explore
 from tests.support.fake_ends import run_spec
-from workers.conversation.held_evaluations import HeldEvaluations
+from workers.conversation.held import HeldEvaluations
 
 LIST = "tests.model.evaluation.mutations"
 SMALL = [

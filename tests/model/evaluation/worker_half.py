@@ -20,7 +20,7 @@ from workers.conversation.session import EvaluationTask, Task
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
-SAVED = {"_orders", "_answers"}
+SAVED = {"asked", "answered"}
 """What of `HeldEvaluations` is saved: all."""
 
 
@@ -66,8 +66,8 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
     if worker.session is None:
         return content, None, None
     held = worker.session._current.evaluations
-    orders = tuple(content_of(order, worker.number) for _, order in sorted(held._orders.items()))
-    answers = tuple(content_of(answer, worker.number) for answer in held._answers.values())
+    orders = tuple(content_of(order, worker.number) for _, order in sorted(held.asked.items()))
+    answers = tuple(content_of(answer, worker.number) for answer in held.answered.values())
     played = tuple(
         (session(number), ticket(each)) for number, each in sorted(worker.played) if number == worker.session.session
     )
@@ -85,8 +85,8 @@ def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWor
         return worker
     orders, answers, played = held
     evaluations = worker.session._current.evaluations
-    evaluations._orders = {order.ticket: order for order in map(_order, orders)}
-    evaluations._answers = {
+    evaluations.asked = {order.ticket: order for order in map(_order, orders)}
+    evaluations.answered = {
         each.value: evaluated(of_session.value, each.value, returns) for _, of_session, each, returns in answers
     }
     worker.played = {(number.value, each.value) for number, each in played}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.model.mutations import SESSION, Mutation, play
+from tests.model.mutations import HELD, SESSION, Mutation, play
 
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 COORDINATOR = "learner.vector_env.order_coordinator"
 HUB = "learner.vector_env.step_hub"
 LOST = "learner.vector_env.lost_lanes"
-HELD = "workers.conversation.held_orders"
 
 OF_THE_LEARNER = {
     "a lost order is not sent again": Mutation(COORDINATOR, "out.append((member.peer, self.orders[ticket]))", "pass"),
@@ -41,12 +40,12 @@ OF_THE_LEARNER = {
 }
 OF_THE_WORKER = {
     "a repeated order is executed again": Mutation(HELD, "order.ticket > lane.newest:", "order.ticket >= lane.newest:"),
-    "an answer is not sent again": Mutation(HELD, "return lane.answer if lane.answer is not None and", "return None if"),
+    "an answer is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "two processes count their attempts to join alike": Mutation(
         SESSION, "self._attempt = identity.process_nonce", "self._attempt = 0"
     ),
-    "an executed order stays": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.answer = answer"),
-    "an answer is not kept": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.order = None"),
+    "an executed order stays": Mutation(HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"),
+    "an answer is not kept": Mutation(HELD, "self.answered[answer.ticket] = answer", "pass"),
     "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
     "an answered order stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
 }

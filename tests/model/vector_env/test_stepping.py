@@ -16,7 +16,7 @@ from tests.model.search import explore
 from tests.model.vector_env import learner_half, worker_half
 from tests.model.vector_env.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
 from tests.model.vector_env.stepping import Stepping
-from workers.conversation.held_orders import HeldOrders, _HeldLane
+from workers.conversation.held import HeldOrders, OrderLane
 
 LIST = "tests.model.vector_env.mutations"
 SMALL = [
@@ -53,7 +53,7 @@ def test_every_field_is_in_the_state_or_left_out_on_purpose() -> None:
     assert type(learner.coordinator) is OrderCoordinator
     assert set(vars(OrderedLane(0))) == {"number", "incarnation", "owner", "moving", "started"}  # no lane waits to move
     assert set(vars(HeldOrders())) == worker_half.SAVED
-    assert set(vars(_HeldLane(0, 0, None))) == {"incarnation", "newest", "order", "answer"}
+    assert set(vars(OrderLane(0))) == {"incarnation", "newest", "asked", "answered"}
 
 
 def test_a_mistake_is_found() -> None:

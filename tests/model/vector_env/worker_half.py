@@ -25,7 +25,7 @@ from tests.model.vector_env.order_content import (
     order_of,
 )
 from tests.model.worker_part import PAUSE_S
-from workers.conversation.held_orders import _HeldLane
+from workers.conversation.held import OrderLane
 from workers.conversation.session import CloseLanes, Effect, Identity, Leave, Send, Session, SharedOrders, StartSession
 from workers.conversation.states import State
 
@@ -152,9 +152,10 @@ def saved(worker: Worker, now: float) -> Content:
     return nonce, flags, fields, None if worker.work is None else content_of(worker.work, worker.number)
 
 
-def _lane(number: int, lane: _HeldLane) -> Content:
-    order = None if lane.order is None else order_content(lane.order)
-    kept = None if lane.answer is None else content_of(lane.answer, 0)
+def _lane(number: int, lane: OrderLane) -> Content:
+    order = next(map(order_content, lane.asked.values()), None)
+    kept = next((content_of(each, 0) for each in lane.answered.values()), None)
+    assert {*lane.asked, *lane.answered} == {lane.newest}, "a worker holds another order than the newest"
     return number, incarnation(number, lane.incarnation), ticket(lane.newest), order, kept
 
 
@@ -175,9 +176,11 @@ def loaded(content: Content, number: int, run: Stepping) -> Worker:
     if of_session is not None:
         current.run, current.session, held.replies = run.run, of_session.value, replies.value
     for lane, life, newest_of_lane, order, kept in lanes:
-        here = _HeldLane(life.value, newest_of_lane.value, None if order is None else order_of(current.session, order))
-        here.answer = None if kept is None else message_of(kept, number, run.run)
-        held.orders._lanes[lane] = here
+        here = held.orders._lanes[lane] = OrderLane(life.value, newest_of_lane.value)
+        if order is not None:
+            here.asked[here.newest] = order_of(current.session, order)
+        if kept is not None:
+            here.answered[here.newest] = message_of(kept, number, run.run)
     worker.copies = {lane: (life.value, state) for lane, life, state in copies}
     if newest is not None:
         worker.newest = current.session, newest.value

@@ -33,7 +33,7 @@ from tests.support.collectors import TOY, collect, evaluated, random_collector, 
 from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, core_tolerance, log_prob_tolerance
 from tests.support.sampled_rounding import in_float64, sampled
 from workers.collect.collector import Collector
-from workers.conversation.held_rollouts import Assignment
+from workers.conversation.held import Assignment
 from workers.envs.toy import Scripted
 from workers.evaluate.evaluator import Evaluator
 

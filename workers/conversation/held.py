@@ -1,0 +1,198 @@
+"""What a worker holds: what it is asked for and has not done, and the answers that the learner may not have received. Pure.
+
+Rule: what is asked has a ticket, and is done once. The answer is kept, and sent again when the learner asks again, because
+the answer was lost. How long it is kept bounds the memory of a worker:
+
+- a rollout: until the learner says that it has received it. So a worker holds at most what the learner has outstanding.
+- the result of an evaluation: until there are `KEPT_RESULTS` later ones. If its rows were sent too, it is not kept: rows are
+  large, and the evaluation can be executed again, with the same episodes.
+- the answer to an order (Reset, Step, Call) of a vector environment: until the next order of its lane.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from protocol.messages import Answer, Evaluate, Evaluated, LaneIncarnation, Order, Permit, Received, Rollout
+
+REMEMBERED_TICKETS = 64  # finished tickets of a lane, to recognize a late repeat of their Collect
+KEPT_RESULTS = 8  # a learner gives a worker at most two evaluations at a time, so only the last two results can be missing
+
+Asked = TypeVar("Asked")
+Answered = TypeVar("Answered", bound=Rollout | Evaluated | Answer)
+
+
+@dataclass
+class Held(Generic[Asked, Answered]):
+    """What is asked and not yet done, and the answers that are kept, by ticket."""
+
+    asked: dict[int, Asked] = field(default_factory=dict, init=False)
+    answered: dict[int, Answered] = field(default_factory=dict, init=False)  # oldest first
+
+    def take(self, ticket: int, asked: Asked) -> Answered | None:
+        """Take what is asked. Returns an answer to send again, if any."""
+        if ticket not in self.answered:
+            self.asked.setdefault(ticket, asked)
+        return self.answered.get(ticket)
+
+    def keep(self, answer: Answered) -> bool:
+        """Keep an answer; False if it is no longer asked for."""
+        if self.asked.pop(answer.ticket, None) is None:
+            return False
+        self.answered[answer.ticket] = answer
+        return True
+
+
+class HeldEvaluations(Held[Evaluate, Evaluated]):
+    """Evaluations. They belong to no lane, and each is executed under exactly the version that it names."""
+
+    def next(self, version: int) -> Evaluate | None:
+        """The oldest of this version, which is that of the weights held. Those of older versions are dropped."""
+        self.asked = {ticket: order for ticket, order in self.asked.items() if order.version >= version}
+        due = [ticket for ticket, order in self.asked.items() if order.version == version]
+        return self.asked[min(due)] if due else None
+
+    def keep(self, answer: Evaluated) -> bool:
+        """Keep a result, unless rows belong to it; False if it is no longer asked for."""
+        order = self.asked.get(answer.ticket)
+        kept = super().keep(answer)
+        if order is not None and (order.send_rows or order.send_frames):
+            del self.answered[answer.ticket]
+        if len(self.answered) > KEPT_RESULTS:
+            del self.answered[next(iter(self.answered))]
+        return kept
+
+
+@dataclass
+class _HeldLane(Held[Asked, Answered]):
+    incarnation: int
+
+
+Lane = TypeVar("Lane", bound=_HeldLane[Any, Any])
+
+
+class _HeldLanes(Generic[Lane]):
+    """What is held in one session, lane by lane. A later incarnation of a lane begins with nothing."""
+
+    _kind: type[Lane]
+
+    def __init__(self) -> None:
+        self._lanes: dict[int, Lane] = {}
+
+    def _opened(self, number: int, incarnation: int) -> Lane | None:
+        """The lane in this incarnation; None if it has a later one."""
+        lane = self._lanes.get(number)
+        if lane is None or incarnation > lane.incarnation:
+            lane = self._lanes[number] = self._kind(incarnation)
+        return lane if lane.incarnation == incarnation else None
+
+    def keep(self, answer: Rollout | Answer) -> bool:
+        """Keep an answer; False if its lane was released in the meantime, or it is no longer asked for."""
+        lane = self._lanes.get(answer.lane)
+        return lane is not None and lane.keep(answer)
+
+    def tickets(self) -> tuple[int, ...]:
+        """Tickets of what is not yet done."""
+        return tuple(ticket for lane in self._lanes.values() for ticket in lane.asked)
+
+    def lanes(self) -> tuple[LaneIncarnation, ...]:
+        """The lanes of this worker."""
+        return tuple(LaneIncarnation(number, lane.incarnation) for number, lane in self._lanes.items())
+
+    def release(self, lanes: Sequence[LaneIncarnation]) -> list[LaneIncarnation]:
+        """Drop these lanes. Returns those that were here, in this or an earlier incarnation."""
+        released = []
+        for old in lanes:
+            lane = self._lanes.get(old.lane)
+            if lane is not None and lane.incarnation <= old.incarnation:
+                del self._lanes[old.lane]
+                released.append(LaneIncarnation(old.lane, lane.incarnation))
+        return released
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """One rollout to collect."""
+
+    ticket: int
+    lane: int
+    incarnation: int
+    """If the worker has another incarnation of the lane, the lane starts on new env copies."""
+    sequence: int
+
+
+@dataclass
+class RolloutLane(_HeldLane[int, Rollout]):
+    """A ticket asks for a rollout; what is held of it is the lowest version to collect it under."""
+
+    sequence: int = 0  # of the next rollout
+    finished: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_TICKETS))
+
+    def keep(self, answer: Rollout) -> bool:
+        """Keep a collected rollout; False if its ticket was withdrawn in the meantime."""
+        kept = super().keep(answer)
+        self.sequence += kept
+        return kept
+
+
+class HeldRollouts(_HeldLanes[RolloutLane]):
+    """Tickets to collect, and rollouts that the learner has not confirmed."""
+
+    _kind = RolloutLane
+
+    def take(self, permit: Permit, version: int) -> Rollout | None:
+        """Take a ticket to collect under this version or a later one. Returns a rollout to send again, if any."""
+        lane = self._opened(permit.lane, permit.incarnation)
+        if lane is None or permit.ticket in lane.finished:
+            return None
+        return lane.take(permit.ticket, version)
+
+    def startable(self, version: int) -> tuple[Assignment, ...]:
+        """The oldest ticket of each lane that may be collected under this version, in the order of the lanes."""
+        assignments = []
+        for number, lane in sorted(self._lanes.items()):
+            startable = [ticket for ticket, lowest in lane.asked.items() if lowest <= version]
+            if startable:
+                assignments.append(Assignment(min(startable), number, lane.incarnation, lane.sequence))
+        return tuple(assignments)
+
+    def forget_received(self, received: Sequence[Received]) -> None:
+        """Drop the rollouts that the learner has received."""
+        for of_lane in received:
+            lane = self._lanes.get(of_lane.lane)
+            if lane is None or lane.incarnation != of_lane.incarnation:
+                continue
+            for ticket, rollout in list(lane.answered.items()):
+                if rollout.sequence < of_lane.next_sequence or rollout.sequence in of_lane.out_of_order:
+                    del lane.answered[ticket]
+                    lane.finished.append(ticket)
+
+
+@dataclass
+class OrderLane(_HeldLane[Order, Answer]):
+    """Only the newest order counts: tickets rise with every order of a lane."""
+
+    newest: int = -1  # ticket
+
+
+class HeldOrders(_HeldLanes[OrderLane]):
+    """Orders to execute, and the answers to the newest."""
+
+    _kind = OrderLane
+
+    def take(self, order: Order) -> Answer | None:
+        """Take an order that has arrived. Returns an answer to send again, if any."""
+        lane = self._opened(order.lane, order.incarnation)
+        if lane is None or order.ticket < lane.newest:
+            return None
+        if order.ticket > lane.newest:
+            lane = self._lanes[order.lane] = OrderLane(order.incarnation, order.ticket)
+        return lane.take(order.ticket, order)
+
+    def next(self) -> Order | None:
+        """The oldest order that is not yet executed."""
+        waiting = [order for lane in self._lanes.values() for order in lane.asked.values()]
+        return min(waiting, key=lambda order: order.ticket, default=None)
