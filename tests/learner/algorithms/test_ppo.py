@@ -74,12 +74,15 @@ def test_a_minibatch_of_one_row_is_learned_from() -> None:
 
 
 def test_target_kl_stops_before_the_step_that_would_go_on() -> None:
-    free, held = (ppo(PPOConfig(learning_rate=0.05, n_epochs=5, target_kl=limit)) for limit in (None, 1e-4))
+    free, held = (ppo(PPOConfig(learning_rate=0.05, n_epochs=5, batch_size=16, target_kl=limit)) for limit in (None, 1e-4))
     start = held.net.flat.clone()
-    free_metrics, held_metrics = (each.update(batch(each, 0), no_pulse) for each in (free, held))
+    pulses: list[int] = []
+    free_metrics = free.update(batch(free, 0), no_pulse)
+    held_metrics = held.update(batch(held, 0), lambda: pulses.append(1))
     assert free_metrics["train/n_updates"] == 5
     assert held_metrics["train/n_updates"] == 1
     assert int(held.state_dict()["optimizer"]["state"][0]["step"]) == 1  # the second minibatch saw how far the first went
+    assert len(pulses) == 3  # after all values, and after these two minibatches
     assert not torch.equal(held.net.flat, start)
 
 
