@@ -3,7 +3,8 @@
 numpy's assignment broadcasts an observation of another shape, reads None as NaN and text as a number, and cuts fractions off
 for a space of integers. Here every observation has the shape of its space, and its dtype is cast only within its kind; an
 integer keeps its value. This is checked at every step, in calls that treat all copies at once; the loop over the copies
-runs only to find which of them is wrong.
+runs only to find which of them is wrong. A reward or a flag is what numpy's assignment makes of it: None is NaN, which the
+check of a rollout's values refuses.
 """
 
 from __future__ import annotations
