@@ -314,7 +314,7 @@ class Worker:
                     self._start_session(run)
                 case CloseLanes(lanes):
                     if (owner := self._collector or self._stepper) is not None:
-                        owner.close([lane.lane for lane in lanes])
+                        owner.lanes.close([lane.lane for lane in lanes])
                 case Leave(exit_code, reason):
                     activity().leave(self._options.exit_code(exit_code, reason))
                     self._left = effect
@@ -376,7 +376,7 @@ class Worker:
 
     def _close_all(self) -> None:
         if (owner := self._collector or self._stepper) is not None:
-            owner.close_all()
+            owner.lanes.close_all()
         if self._evaluator is not None:
             self._evaluator.close()
 

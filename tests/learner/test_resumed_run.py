@@ -46,7 +46,7 @@ def record(run: RunSpec, algorithm: PPO, batches: int) -> list[Batch]:
     for sequence in range(batches):
         lanes = [Assignment(sequence * run.lanes + lane, lane, 0, sequence) for lane in range(run.lanes)]
         recorded.append(collector.collect(lanes, 0, 1, lambda: None))
-    collector.close_all()
+    collector.lanes.close_all()
     return [stack_rollouts(rollouts) for rollouts in recorded]
 
 

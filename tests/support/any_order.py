@@ -112,7 +112,7 @@ class AnyOrder(FakeLink):
     def _end(self, name: str) -> None:
         self.held = [(worker, order) for worker, order in self.held if worker != name]
         if (stepper := self._steppers.pop(name, None)) is not None:
-            stepper.close_all()
+            stepper.lanes.close_all()
 
     def execute(self) -> None:
         """Execute at least one order, if one waits."""

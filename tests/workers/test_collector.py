@@ -252,9 +252,9 @@ def test_lanes_are_closed_when_released_or_started_anew() -> None:
     assert said == []
     collect(collector, run, lanes=(1,), incarnation=1)
     assert said == ["b"]
-    collector.close([2, 7])
+    collector.lanes.close([2, 7])
     assert said == ["b", "c"]
-    collector.close_all()
+    collector.lanes.close_all()
     assert sorted(said) == ["a", "b", "c", "d"]
 
 
@@ -282,7 +282,7 @@ def test_a_pulse_may_abandon_the_collection() -> None:
 
 def test_a_lane_released_by_a_pulse_is_closed_after_the_collection() -> None:
     _, collector, said = closable()
-    collector.collect([Assignment(0, 0, 0, 0), Assignment(1, 1, 0, 0)], 0, 0, lambda: collector.close([1]))
+    collector.collect([Assignment(0, 0, 0, 0), Assignment(1, 1, 0, 0)], 0, 0, lambda: collector.lanes.close([1]))
     assert said == ["b"]
 
 
@@ -291,13 +291,13 @@ def test_a_lane_released_while_its_copies_are_made_is_closed_after_the_collectio
 
     def make(lane: int) -> Closable:
         if lane == 1:
-            collector.close([1])
+            collector.lanes.close([1])
         return Closable(said, "ab"[lane])
 
     collector = random_collector(run, lambda r, n, p: loop_over([partial(make, n)])(r, n, p))
     collect(collector, run, lanes=(0, 1))
     assert said == ["b"]
-    collector.close_all()
+    collector.lanes.close_all()
     assert said == ["b", "a"]
 
 

@@ -147,7 +147,7 @@ def test_copies_of_a_vector_environment(settings: dict[str, Any], made: list[Any
         stepper.execute(Reset(1, 1, lane, 0, tuple(range(copies)), (1,) * copies, options), no_pulse)
     assert [(copy.number, copy.lane, copy.copy, copy.evaluation) for copy in Asks.made] == made
     assert [copy.slot for copy in Asks.made] == list(range(len(made)))
-    stepper.close_all()
+    stepper.lanes.close_all()
     assert not taken
 
 

@@ -43,7 +43,7 @@ def test_private_attributes_are_not_given_to_a_learner_that_is_not_trusted(name:
         f"UsageError: {name!r} begins with an underscore: this worker gives private attributes only to"
     )
     assert "\n" not in answer.error
-    stepper.close_all()
+    stepper.lanes.close_all()
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_nor_by_a_method_that_takes_their_name(method: str, arguments: Any) -> N
     step = step_spec(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
     stepper = Stepper(step, allow_private_names=False)
     assert call(stepper, method, arguments).error.startswith("UsageError: '_k' begins with an underscore")
-    stepper.close_all()
+    stepper.lanes.close_all()
 
 
 def test_private_attributes_are_given_to_a_learner_that_may_run_code() -> None:
@@ -67,7 +67,7 @@ def test_private_attributes_are_given_to_a_learner_that_may_run_code() -> None:
     assert call(stepper, "_k", [4, 5], assign=True).error == ""
     answer = call(stepper, "_k", ((), {}))
     assert (answer.error, unpack(answer.results.data)) == ("", [4, 5])
-    stepper.close_all()
+    stepper.lanes.close_all()
 
 
 # ------------------------------------------------------------------------------------------------ what copies return
@@ -159,7 +159,7 @@ def test_an_environment_may_change_its_action() -> None:
         answer = stepper.execute(Step(1, t, 0, 0, (actions,)), lambda: None)
         assert isinstance(answer, Stepped)
         assert answer.reward.tolist() == [0.5, 0.5]
-    stepper.close_all()
+    stepper.lanes.close_all()
 
 
 class Buffered(Countdown):
@@ -232,8 +232,8 @@ def test_a_lane_that_is_released_during_a_step_is_closed_after_it(monkeypatch: p
     monkeypatch.setattr("workers.copies.env_loop.PULSE_S", -1.0)  # a pulse after each copy
     stepper, envs = Stepper(step_spec(VectorEnvSettings(OnlyWhileOpen, 2, lanes=1))), list[OnlyWhileOpen]()
     stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)
-    envs += [cast(OnlyWhileOpen, env.unwrapped) for env in stepper._lanes[0]._loop.envs]
-    answer = stepper.execute(Step(1, 2, 0, 0, (np.zeros(2, np.int64),)), lambda: stepper.close([0]))
+    envs += [cast(OnlyWhileOpen, env.unwrapped) for env in stepper.lanes[0]._loop.envs]
+    answer = stepper.execute(Step(1, 2, 0, 0, (np.zeros(2, np.int64),)), lambda: stepper.lanes.close([0]))
     assert isinstance(answer, Stepped)
     assert answer.reward.tolist() == [1.0, 1.0]
     assert [env.open for env in envs] == [False, False]
@@ -246,10 +246,10 @@ def test_a_lane_that_is_released_while_its_copies_are_made_is_closed_after_the_o
     monkeypatch.setattr(EnvLoop, "close", lambda loop: closed.append(loop))
     stepper = Stepper(step_spec(VectorEnvSettings(Countdown, 2, lanes=1)))
     reset = Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8))
-    answer = stepper.execute(reset, lambda: stepper.close([0]) if not closed else None)
+    answer = stepper.execute(reset, lambda: stepper.lanes.close([0]) if not closed else None)
     assert isinstance(answer, Stepped)
     assert len(closed) == 1
-    stepper.close_all()
+    stepper.lanes.close_all()
     assert len(closed) == 1
 
 

@@ -231,7 +231,7 @@ def test_only_the_time_in_which_a_joining_worker_listens_is_time_without_an_answ
 
     def slow_to_close(run: RunSpec) -> tuple[Collector, Evaluator]:
         collector, evaluator = make_local_collector(run)
-        monkeypatch.setattr(collector, "close", close)
+        monkeypatch.setattr(collector.lanes, "close", close)
         return collector, evaluator
 
     session = Session(replace(identity("w0"), process_nonce=0), 0.0, rejoin_timeout_s=150.0)

@@ -90,6 +90,10 @@ class CollectedLane:
             raise environment_failed(self.number, error, "first reset") from error
         self._start_s = [perf_counter()] * len(self._start_s)
 
+    def close(self) -> None:
+        """Close the copies. Raises nothing."""
+        self.copies.close()
+
     def joined(self, arrays: Iterable[Array]) -> list[Array]:
         """Views of arrays [rows, N, *leaf] for `write_observations`."""
         return [writer.joined(array) for writer, array in zip(self._writers, arrays, strict=True)]

@@ -7,7 +7,7 @@ The arrays of a rollout are new each time and are never written again, so they c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.env_results import write_numbers
 from workers.copies.envpool_copies import EnvpoolCopies
+from workers.copies.open_lanes import OpenLanes
 from workers.env_copy import make_copy
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
@@ -93,10 +94,8 @@ class Collector:
         self._acting = acting_of(run, policy)
         self._open_copies, self._step_all = open_copies, step_all
         self._to_env_action = action_converter_of(run.policy)
-        self._lanes: dict[int, CollectedLane] = {}
-        self._to_close: list[CollectedLane] = []  # released by a pulse, when their copies may be in the middle of a step
-        self._collecting = False
-        self._opening: int | None = None  # lane whose copies are being made, until it is released
+        self.lanes = OpenLanes[CollectedLane]()
+        """the lanes with a rollout, until they are closed"""
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Use these weights from now on."""
@@ -110,63 +109,47 @@ class Collector:
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect: expected one assignment for each lane, got {assignments}")
-        self._collecting = True
-        try:
-            lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
-            for lane in lanes:
-                lane.set_attributes(self.env_attributes, pulse)
-            rows = self._new_rows(lanes)
-            actions = self._acting.begin([lane.generator for lane in lanes])
+        with self.lanes.in_use():
             try:
-                self._act_and_step(rows, actions, lanes, pulse)
-            except (EnvironmentFailed, PolicyFailed, IndexError):
-                # An invalid observation or reward may have caused the error. Then `check_values` raises the clearer one.
-                done = len(rows.step_end_s)
-                for i, lane in enumerate(lanes):
-                    lane.check_values([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
+                return self._collect(assignments, version, session, pulse)
+            except BaseException:
+                self.lanes.close(assignment.lane for assignment in assignments)
                 raise
-            return [
-                self._rollout(rows, actions, i, lane, assignment, version, session)
-                for i, (lane, assignment) in enumerate(zip(lanes, assignments, strict=True))
-            ]
-        except BaseException:
-            self.close(assignment.lane for assignment in assignments)
-            raise
-        finally:
-            self._collecting = False
-            self.close(())
 
-    def close(self, lanes: Iterable[int]) -> None:
-        """Close these lanes, if they are here. When a pulse calls this, they are closed after the collection."""
+    def _collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
+        lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
         for lane in lanes:
-            if lane in self._lanes:
-                self._to_close.append(self._lanes.pop(lane))
-            elif lane == self._opening:
-                self._opening = None
-        while self._to_close and not self._collecting:
-            self._to_close.pop().copies.close()
-
-    def close_all(self) -> None:
-        """Close every lane."""
-        self.close(list(self._lanes))
+            lane.set_attributes(self.env_attributes, pulse)
+        rows = self._new_rows(lanes)
+        actions = self._acting.begin([lane.generator for lane in lanes])
+        try:
+            self._act_and_step(rows, actions, lanes, pulse)
+        except (EnvironmentFailed, PolicyFailed, IndexError):
+            # An invalid observation or reward may have caused the error. Then `check_values` raises the clearer one.
+            done = len(rows.step_end_s)
+            for i, lane in enumerate(lanes):
+                lane.check_values([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
+            raise
+        return [
+            self._rollout(rows, actions, i, lane, assignment, version, session)
+            for i, (lane, assignment) in enumerate(zip(lanes, assignments, strict=True))
+        ]
 
     def _lane_for(self, assignment: Assignment, pulse: Pulse) -> CollectedLane:
         """The lane in this incarnation. It is opened if it does not exist."""
-        lane = self._lanes.get(assignment.lane)
-        if lane is not None and lane.incarnation == assignment.incarnation:
+        number, incarnation = assignment.lane, assignment.incarnation
+        if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
+
+        def made() -> CollectedLane:
+            try:
+                copies = self._open_copies(self._run, number, pulse)
+            except CopyFailed as error:
+                raise environment_failed(number, error, "made") from error
+            return CollectedLane(self._run, number, incarnation, copies)
+
         began = perf_counter()
-        self.close([assignment.lane])
-        self._opening = assignment.lane
-        try:
-            copies = self._open_copies(self._run, assignment.lane, pulse)
-        except CopyFailed as error:
-            raise environment_failed(assignment.lane, error, "made") from error
-        lane = CollectedLane(self._run, assignment.lane, assignment.incarnation, copies)
-        if self._opening == assignment.lane:
-            self._lanes[assignment.lane] = lane
-        else:
-            self._to_close.append(lane)
+        lane = self.lanes.open(number, made)
         lane.set_attributes(self.env_attributes, pulse)
         lane.reset(pulse)
         self.stages["open"] += perf_counter() - began

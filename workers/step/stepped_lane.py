@@ -49,6 +49,8 @@ class SteppedLane:
         """Make the copies, and reset none. Raises `UsageError` when their spaces are not the vector environment's."""
         self.incarnation = incarnation
         self.rows = rows
+        self.executed = 0
+        """number of the newest order through shared memory that was executed"""
         first = spec.first_copy(lane)
         makes = [partial(_make_copy, spec, first + copy) for copy in range(spec.lanes[lane])]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.

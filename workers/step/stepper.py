@@ -7,8 +7,7 @@ then written there, too. Both ways step the same lanes.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from time import perf_counter
 from typing import Any
 
@@ -27,6 +26,7 @@ from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReas
 from workers.activity import STEPPING, activity
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Infos, Pulse
+from workers.copies.open_lanes import OpenLanes
 from workers.step.stepped_lane import Rows, SteppedLane, new_rows
 
 
@@ -45,10 +45,8 @@ class Stepper:
         self.stages: Stages = {"open": 0.0, "step": 0.0}
         """seconds spent making and resetting copies, and stepping them"""
         self._spec, self._allow_private_names = spec, allow_private_names
-        self._lanes: dict[int, SteppedLane] = {}
-        self._opening: int | None = None  # lane whose copies are being made, until it is released
-        self._running: SteppedLane | None = None  # its copies are in the middle of an order: a pulse must not close them
-        self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
+        self.lanes = OpenLanes[SteppedLane]()
+        """the lanes that an order has come for, until they are closed"""
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
         self._wake_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
         self._wake_out = None if shared_memory is None else WakePipe(write_fd=shared_memory.to_learner)
@@ -59,8 +57,8 @@ class Stepper:
     def execute(self, order: Order, pulse: Pulse) -> Answer:
         """The answer to the order. Raises `EnvironmentFailed`, and what `pulse` raises; the lane is then closed."""
         try:
-            lane = self._lane_for(order.lane, order.incarnation, pulse)
-            with self._runs(order.lane, lane):
+            with self.lanes.in_use():
+                lane = self._lane_for(order.lane, order.incarnation, pulse)
                 match order:
                     case Reset():
                         began = perf_counter()
@@ -71,10 +69,10 @@ class Stepper:
                     case Call():
                         return _call(order, lane, self._allow_private_names)
         except CopyFailed as error:
-            self.close([order.lane])
+            self.lanes.close([order.lane])
             raise environment_failed(order.lane, error) from error
         except BaseException:
-            self.close([order.lane])
+            self.lanes.close([order.lane])
             raise
         return _stepped(order, lane.rows, pack_infos(infos))
 
@@ -88,7 +86,7 @@ class Stepper:
         assert self._wake_in is not None
         until = perf_counter() + timeout_s
         while True:
-            stepped = [self._serve_lane(lane, pulse, session, send) for lane in list(self._lanes) if lane in self._lanes]
+            stepped = [self._serve_lane(lane, pulse, session, send) for lane in list(self.lanes) if lane in self.lanes]
             if any(stepped):
                 if perf_counter() > until:
                     return False
@@ -101,27 +99,27 @@ class Stepper:
     @property
     def uses_shared_memory(self) -> bool:
         """Whether `serve_shared_memory` has lanes to serve."""
-        return self._memory is not None and bool(self._lanes)
+        return self._memory is not None and bool(self.lanes)
 
     def _has_order(self) -> bool:
         assert self._memory is not None
-        return any(self._memory.ordered(lane) != executed for lane, executed in self._executed.items())
+        return any(self._memory.ordered(number) != lane.executed for number, lane in self.lanes.items())
 
     def _serve_lane(self, number: int, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
-        memory, lane = self._memory, self._lanes[number]
+        memory, lane = self._memory, self.lanes[number]
         assert memory is not None
         assert self._wake_out is not None
         order = memory.ordered(number)
-        if order == self._executed[number]:
+        if order == lane.executed:
             return False
-        self._executed[number] = order
+        lane.executed = order
         try:
-            with self._runs(number, lane):
+            with self.lanes.in_use():
                 infos = pack_infos(self._step(lane, memory.lanes[number].actions, pulse))
         except CopyFailed as error:
-            self.close([number])
+            self.lanes.close([number])
             raise environment_failed(number, error) from error
-        if number not in self._lanes:
+        if number not in self.lanes:
             return True  # it was released meanwhile, and another worker may answer for it
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
@@ -129,20 +127,9 @@ class Stepper:
         pending = memory.unanswered_orders()
         if not pending or not CAN_SPIN or memory.wakes(number):
             self._wake_out.wake()
-        finished_before = len(memory.lanes) - len(self._lanes) - pending
+        finished_before = len(memory.lanes) - len(self.lanes) - pending
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True
-
-    @contextmanager
-    def _runs(self, number: int, lane: SteppedLane) -> Iterator[None]:
-        """Within it, the copies of a lane run. If a pulse closes the lane, they are closed afterwards."""
-        self._running = lane
-        try:
-            yield
-        finally:
-            self._running = None
-            if self._lanes.get(number) is not lane:
-                lane.close()
 
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> Infos:
         began = perf_counter()
@@ -154,17 +141,12 @@ class Stepper:
 
     def _lane_for(self, number: int, incarnation: int, pulse: Pulse) -> SteppedLane:
         """The lane in this incarnation. It is made if it does not exist."""
-        lane = self._lanes.get(number)
-        if lane is not None and lane.incarnation == incarnation:
+        if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
         began = perf_counter()
-        self.close([number])
-        self._opening = number
-        lane = SteppedLane(self._spec, number, incarnation, self._rows(number), pulse)
-        if self._opening == number:  # otherwise it is closed after the order
-            self._lanes[number] = lane
-            if self._memory is not None:
-                self._executed[number] = self._memory.ordered(number)
+        lane = self.lanes.open(number, lambda: SteppedLane(self._spec, number, incarnation, self._rows(number), pulse))
+        if self._memory is not None:
+            lane.executed = self._memory.ordered(number)
         self.stages["open"] += perf_counter() - began
         return lane
 
@@ -173,20 +155,6 @@ class Stepper:
             return new_rows(self._spec, lane)
         memory = self._memory.lanes[lane]
         return Rows(memory.obs, memory.reward, memory.terminated, memory.truncated)
-
-    def close(self, lanes: Iterable[int]) -> None:
-        """Close these lanes, if they are here. One whose copies run is closed when they return."""
-        for number in lanes:
-            if number == self._opening:
-                self._opening = None
-            if (lane := self._lanes.pop(number, None)) is not None:
-                self._executed.pop(number, None)
-                if lane is not self._running:
-                    lane.close()
-
-    def close_all(self) -> None:
-        """Close every lane."""
-        self.close(list(self._lanes))
 
 
 def pack_infos(infos: Infos) -> bytes:

@@ -28,7 +28,7 @@ def collected(run: RunSpec) -> list[Rollout]:
     policy.load(*random_weights(run.policy))
     collector = Collector(run, policy)
     found = [collector.collect([Assignment(n, 0, 0, n)], 0, 1, lambda: None)[0] for n in range(len(ORDER))]
-    collector.close_all()
+    collector.lanes.close_all()
     return found
 
 

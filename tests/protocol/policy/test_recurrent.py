@@ -281,7 +281,7 @@ def learned(name: str, core: Core | None, updates: int) -> float:
         collector.load(*algorithm.weights())
         rollouts = collector.collect([Assignment(k, lane, 0, k) for lane in range(lanes)], k, 1, no_pulse)
         algorithm.update(stack_rollouts(rollouts), no_pulse)
-    collector.close_all()
+    collector.lanes.close_all()
     policy = make_policy(spec)
     policy.load(*algorithm.weights())
     greedy = float(np.mean([episode.reward for episode in evaluated(run, policy, 60, seed=3)]))

@@ -1,0 +1,74 @@
+"""The lanes whose env copies are open in this process.
+
+Rule: a lane that is closed while environment code runs, or while its own copies are made, is closed when that code has
+returned: its copies may be in the middle of a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Protocol, TypeVar
+
+
+class Lane(Protocol):
+    """Env copies that are stepped together."""
+
+    incarnation: int
+
+    def close(self) -> None:
+        """Close the copies. Raises nothing."""
+        ...
+
+
+L = TypeVar("L", bound=Lane)
+
+
+class OpenLanes(dict[int, L]):
+    """The open lanes, by number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._opening: int | None = None  # lane whose copies are being made, until it is closed
+        self._to_close: list[L] = []
+        self._in_use = False
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Within it, environment code runs. What is closed meanwhile is closed at its end."""
+        self._in_use = True
+        try:
+            yield
+        finally:
+            self._in_use = False
+            self.close(())
+
+    def here(self, number: int, incarnation: int) -> L | None:
+        """The lane, if it is open in this incarnation."""
+        lane = self.get(number)
+        return lane if lane is not None and lane.incarnation == incarnation else None
+
+    def open(self, number: int, make: Callable[[], L]) -> L:
+        """Make a lane, after its earlier incarnation was closed."""
+        self.close([number])
+        self._opening = number
+        lane = make()
+        if self._opening == number:
+            self[number] = lane
+        else:
+            self._to_close.append(lane)
+        return lane
+
+    def close(self, lanes: Iterable[int]) -> None:
+        """Close these lanes, if they are here: at once, or at the end of `in_use`."""
+        for number in lanes:
+            if number == self._opening:
+                self._opening = None
+            if (lane := self.pop(number, None)) is not None:
+                self._to_close.append(lane)
+        while self._to_close and not self._in_use:
+            self._to_close.pop().close()
+
+    def close_all(self) -> None:
+        """Close every lane."""
+        self.close(list(self))
