@@ -95,12 +95,13 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
-    monkeypatch.setattr(slots, "_of_processes", {})  # copies that a test does not close hold no slots of another test
+    own_slots: dict[int, slots.Slots] = {}
+    monkeypatch.setattr(slots, "_of_processes", own_slots)  # copies that a test does not close hold no slots of another test
     monkeypatch.setattr(env_copy, "_slots", {})
     env_copy._of_process.cache_clear()
     threads = set(threading.enumerate())
     yield
-    if (own := slots._of_processes.get(os.getpid())) is not None:
+    for own in own_slots.values():
         os.close(own.fd)
     deadline = time.monotonic() + LEAVE_WITHIN_S
     if _has_children(os.getpid()):  # psutil reads all of /proc
