@@ -120,11 +120,6 @@ class CollectedLane:
         if not np.isfinite(reward).all():
             raise environment_failed(self.number, f"reward: {describe_first_non_finite(reward)}")
 
-    def check_acted(self, action: Array, log_prob: Array, obs: Sequence[Array]) -> None:
-        """Raise if the policy computed no finite numbers from finite observations: some are too large for float32."""
-        check_acted(self.number, "action", action, obs)
-        check_acted(self.number, "log_prob", log_prob, obs)
-
     def finish(self, reward: Array, done: Bools, step_end_s: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """After T steps: which rows are valid [T, N], and the episodes that ended, oldest first.
 

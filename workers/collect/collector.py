@@ -28,7 +28,7 @@ from protocol.rollout import Rollout
 from protocol.specs import RunSpec
 from workers.activity import MAKING, activity
 from workers.collect.acting import RolloutActions, acting_of
-from workers.collect.collected_lane import CollectedLane
+from workers.collect.collected_lane import CollectedLane, check_acted
 from workers.conversation.held import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.copies.env_errors import CopyFailed, environment_failed
@@ -223,7 +223,8 @@ class Collector:
             reward = rows.reward[i].astype(np.float32)
         lane.check_values(obs, reward)
         acted = actions.columns(i)
-        lane.check_acted(acted.action, acted.log_prob, obs)
+        check_acted(lane.number, "action", acted.action, obs)
+        check_acted(lane.number, "log_prob", acted.log_prob, obs)
         lane.obs = tuple(array[-1].copy() for array in obs)
         before, lane.state = lane.state, rows.state[i].copy()
         self.steps += int(np.count_nonzero(valid))
