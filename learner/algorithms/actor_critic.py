@@ -239,17 +239,17 @@ class ActorCritic(Clones):
 
     def observations(self, batch: Batch) -> Observations:
         """The observations as the workers' policy saw them."""
-        raw, x, images = self.normalizer.inputs(batch.obs, self.statistics)
+        x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:  # the states before all T+1 steps; after a row that is not valid, an episode begins
             keep_state = np.concatenate([np.ones_like(batch.valid[:1]), batch.valid]).astype(np.float32)
             recurrent = RecurrentInput(self.tensor(batch.state), self.tensor(keep_state))
         features, *pixels = (flat_tensor(array, self.net.flat.device) for array in (x, *images))
-        return Observations(raw, features, tuple(pixels), recurrent)
+        return Observations(x.shape[:2], features, tuple(pixels), recurrent)
 
     def values(self, observations: Observations, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN] under the present weights."""
-        return observations.evaluate(len(observations.raw_features), lambda inputs, _: self.net.value(*inputs), pulse)
+        return observations.evaluate(observations.shape[0], lambda inputs, _: self.net.value(*inputs), pulse)
 
     def log_probs(self, observations: Observations, batch: Batch, pulse: Pulse) -> Floats:
         """Log π(action) [T, ΣN] under the present weights."""

@@ -76,7 +76,7 @@ class GradientDescent(Algorithm):
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Features [B, D] as the networks take them, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
-        _, x, images = self.normalizer.inputs(leaves, self.statistics)
+        x, images = self.normalizer.inputs(leaves, self.statistics)
         return self.tensor(x).to(self.net.flat.dtype), tuple(map(self.tensor, images))
 
     def tensor(self, array: Array) -> Tensor:
@@ -87,7 +87,8 @@ class GradientDescent(Algorithm):
         """Count a batch for the statistics. Those of observations take effect when `statistics` is set."""
         if self.config.normalize_rewards:
             self.rewards.count(batch)
-        self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+        if self.policy.normalize_observations:
+            self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
 
     def scaled(self, reward: Floats) -> Floats:
         """Rewards as the critic learns them."""

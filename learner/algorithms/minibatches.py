@@ -36,7 +36,7 @@ class NetworkInput(NamedTuple):
 class Observations(NamedTuple):
     """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted under."""
 
-    raw_features: Array  # [T+1, ΣN, D] float32 or float64, not normalized
+    shape: tuple[int, ...]  # (T+1, ΣN)
     features: Tensor  # [(T+1) · ΣN, D] float32, normalized
     images: tuple[Tensor, ...]  # [(T+1) · ΣN, *leaf] uint8 each
     recurrent: RecurrentInput | None  # for all T+1 steps; None without a core
@@ -54,7 +54,7 @@ class Observations(NamedTuple):
 
         `function` returns one number for each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
         """
-        found = torch.empty(steps * self.raw_features.shape[1], device=self.features.device)
+        found = torch.empty(steps * self.shape[1], device=self.features.device)
         for columns, rows in self._chunks(steps):
             found[rows] = function(self.network_input(steps, columns, rows), rows)
             pulse()
@@ -65,7 +65,7 @@ class Observations(NamedTuple):
 
         A chunk holds consecutive rows; with a recurrent core it holds whole columns.
         """
-        columns = self.raw_features.shape[1]
+        columns = self.shape[1]
         if self.recurrent is None:
             for at in range(0, steps * columns, CHUNK_ROWS):
                 yield slice(None), slice(at, min(at + CHUNK_ROWS, steps * columns))

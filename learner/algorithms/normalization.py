@@ -80,14 +80,14 @@ class ObservationNormalizer:
         self._moments = RunningMoments((len(leaves),), np.where(self._is_float64, ROUNDING_64, ROUNDING_32))
         assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
 
-    def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, Array, list[Array]]:
+    def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
         """Features [..., D] of leaves [..., *leaf], the same as a network takes them, and the images among the leaves.
 
         `published`: `buffers` as workers act with them, which may be older than what was counted.
         """
         raw = features(self._spec, leaves)
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
-        return raw, x, [array for leaf, array in zip(self._spec.observation, leaves, strict=True) if leaf.is_image]
+        return x, [array for leaf, array in zip(self._spec.observation, leaves, strict=True) if leaf.is_image]
 
     def update(self, raw: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
