@@ -24,7 +24,6 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.05
 LOG_WAITING_EVERY_S = 10.0
-LAST_MESSAGES_WAIT_S = 0.1  # the reason of a worker that declines may arrive after its process has ended
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def described_by_workers(
     )
     members = coordinator.membership.members
     callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), lambda event: None)
-    server_settings = ServerSettings(last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_joins=False)
+    server_settings = ServerSettings(log_joins=False)
     server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)
     began_s = member_s = logged_s = clock()
     try:

@@ -50,6 +50,7 @@ AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its proc
 TURN_S = 0.2  # of reading messages, at most, before the caller may go on
 SHORT_TURN_S = 0.003  # at least so much, also in a short turn
 FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
+LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way
 STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
 
 
@@ -95,8 +96,6 @@ class ServerSettings:
 
     grace_s: float = AWAY_S
     """For how long, after the learner was away, no worker is removed as silent."""
-    last_messages_wait_s: float = 0.0
-    """How long to wait for the last messages of a process that has ended."""
     log_tracebacks: bool = True
     """Whether the traceback of an environment is logged; if not, the hub raises it."""
     log_joins: bool = True
@@ -140,7 +139,7 @@ class MemberServer:
         worked_s = self._clock() - self.listened_s
         self.receive(timeout_s, min(TURN_S, max(SHORT_TURN_S, worked_s)) if short else TURN_S)
         self._revoke_keys()
-        self._remove_ended_processes(self._settings.last_messages_wait_s)
+        self._remove_ended_processes(LAST_MESSAGES_WAIT_S)
         now = self._clock()
         self._record_activities(now)
         if now - self.listened_s > timeout_s + AWAY_S:
@@ -260,10 +259,11 @@ class MemberServer:
             self.send(self._coordinator.revoke(peer, why))
 
     def _remove_ended_processes(self, last_messages_wait_s: float) -> None:
-        """Remove the workers whose processes have ended."""
-        for worker_exit in self._processes.ended():
-            if last_messages_wait_s:
-                self.receive(last_messages_wait_s)
+        """Remove the workers whose processes have ended, after what they sent last: it may say why."""
+        ended = list(self._processes.ended())
+        if ended:
+            self.receive(last_messages_wait_s)
+        for worker_exit in ended:
             self.send(self._coordinator.process_ended(worker_exit))
 
     def _record_activities(self, now: float) -> None:

@@ -35,7 +35,6 @@ LISTEN_EVERY_S = 0.5  # interval of answers to heartbeats while steps go through
 PATIENCE_S = 10.0  # how long a lost lane waits for a restarted worker (at most half the timeout) before it goes to a worker
 # that already has lanes
 BUSY_S = 1.0  # how long closing waits for a step under way: the step may hang, and its result is not used
-LAST_MESSAGES_WAIT_S = 0.1  # messages that a process sent before it ended may still be on their way
 
 
 class LocalWorkers(Protocol):
@@ -134,7 +133,7 @@ class StepHub:
         self._listen_due_s = 0.0
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
-        settings = ServerSettings(grace_s=worker_timeout_s, last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_tracebacks=False)
+        settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         callbacks = ServerCallbacks(self._coordinator.receive, self._status, self._on_event, self._wake_sleeping)
         processes = ProcessCallbacks(self._local_workers.poll, self._local_workers.activities)
         self._server = MemberServer(link, self._coordinator, callbacks, processes, settings, clock)

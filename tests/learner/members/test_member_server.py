@@ -91,7 +91,7 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
 
 
 def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:
-    served = Served(ServerSettings(last_messages_wait_s=POLL_S))
+    served = Served()
     served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
     waiting = served.link.poll
 
