@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from learner.policy_player import saved_policy
 from millrace.arguments import checked
+from protocol.array_checks import wrong_values
 from protocol.arrays import Array, Bools, Floats
 from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError, check_at_least
@@ -25,7 +26,6 @@ from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
-from protocol.rollout import outside_of_space
 from protocol.specs import Leaf, PolicySpec
 
 Observation: TypeAlias = Any
@@ -216,18 +216,15 @@ def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:
 
 def _checked(value: Any, leaf: Leaf) -> Array:
     """An array [*leaf] or [n, *leaf] of the dtype of its space. Raises `UsageError`."""
-    what = f"observation {leaf.path}".strip()
     try:
         given = np.asarray(value)
     except (ValueError, TypeError):  # rows of different lengths; a tensor on a GPU
         given = np.asarray(None)
     expected = f"{leaf.dtype}{list(leaf.shape)}, or [n, …] of them"
     if leaf.shape not in (given.shape, given.shape[1:]) or not np.can_cast(given.dtype, leaf.dtype, "same_kind"):
-        raise UsageError(f"{what}: expected {expected}, got {given.dtype}{list(given.shape)}")
+        raise UsageError(f"{leaf.name}: expected {expected}, got {given.dtype}{list(given.shape)}")
     with np.errstate(over="ignore"):
         array = given.astype(leaf.dtype, copy=False)
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise UsageError(f"{what}: expected finite numbers, got {array.tolist()}"[:500])
-    if why := outside_of_space(array, leaf):
-        raise UsageError(f"{what}: {why}")
+    if why := wrong_values(array, leaf, axes=()):
+        raise UsageError(f"{leaf.name}: {why}")
     return array

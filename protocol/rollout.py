@@ -20,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
+from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.arrays import Array, Bools, Floats
 from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
 from protocol.policy.masks import no_choice, not_allowed
-from protocol.specs import ActionSpec, Leaf, RunSpec
+from protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
 
@@ -93,44 +94,27 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
     T, N = run.rollout_steps, run.copies
     action = run.policy.action
-    expected: list[tuple[str, Array, tuple[int, ...], str]] = [
-        ("action", rollout.action, (T, N, *action.shape), action.stored_dtype),
-        ("log_prob", rollout.log_prob, (T, N), "float32"),
-        ("reward", rollout.reward, (T, N), "float32"),
-        ("terminated", rollout.terminated, (T, N), "bool"),
-        ("truncated", rollout.truncated, (T, N), "bool"),
-        ("valid", rollout.valid, (T, N), "bool"),
-        ("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # [step, copy, …], as errors name it
+    expected = [
+        Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),
+        Expected("log_prob", rollout.log_prob, (T, N), "float32"),
+        Expected("reward", rollout.reward, (T, N), "float32"),
+        Expected("terminated", rollout.terminated, (T, N), "bool"),
+        Expected("truncated", rollout.truncated, (T, N), "bool"),
+        Expected("valid", rollout.valid, (T, N), "bool"),
+        Expected("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # its row is step 0
     ]
-    if len(rollout.obs) != len(run.policy.observation):
-        raise BadRollout(f"obs: expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
-    for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
-        expected.append((_named(leaf), array, (T + 1, N, *leaf.shape), leaf.dtype))
     if (rollout.mask is not None) != run.masked:
         raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")
     if rollout.mask is not None:
-        expected.append(("mask", rollout.mask, (T + 1, N, sum(action.sizes)), "bool"))
+        expected.append(Expected("mask", rollout.mask, (T + 1, N, sum(action.sizes)), "bool"))
     if len(rollout.extras) != len(run.extras):
         raise BadRollout(f"extras: expected {len(run.extras)} arrays, got {len(rollout.extras)}")
     for extra, array in zip(run.extras, rollout.extras, strict=True):
-        expected.append((f"extra {extra.name}", array, (T, N, *extra.shape), extra.dtype))
-    for name, array, shape, dtype in expected:
-        if array.shape != shape or array.dtype != np.dtype(dtype):
-            raise BadRollout(
-                f"{name}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}; "
-                "is its environment the same version?"
-            )
-        if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
-            raise BadRollout(f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}")
-        if array.dtype.kind == "f" and np.count_nonzero(np.isfinite(array)) != array.size:
-            raise BadRollout(f"{name}: {describe_first_non_finite(array)}")
+        expected.append(Expected(f"extra {extra.name}", array, (T, N, *extra.shape), extra.dtype))
+    if why := wrong_observation(rollout.obs, run.policy.observation, (T + 1, N)) or wrong_arrays(expected):
+        raise BadRollout(why)
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
-    for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
-        if why := outside_of_space(array, leaf):
-            raise BadRollout(f"{_named(leaf)}: {why}")
-    if why := outside_of_choices(rollout.action, action):
-        raise BadRollout(f"action: {why}")
     if rollout.mask is not None:
         _check_mask(rollout.mask, rollout, action)
     ended = rollout.terminated | rollout.truncated
@@ -168,45 +152,6 @@ def wrong_facts(episode: Episode, count: int) -> str:
     if any(map(math.isinf, episode.facts)):
         return f"expected finite facts, got {episode.facts}"
     return ""
-
-
-def outside_of_space(array: Array, leaf: Leaf) -> str:
-    """What is wrong with values [..., *leaf] of an observation; empty if its space has them, as far as it counts them."""
-    if not_of_space(array, leaf).any():
-        return f"expected values of its space, got {array.min()} to {array.max()}"
-    return ""
-
-
-def not_of_space(array: Array, leaf: Leaf) -> Bools:
-    """Where values [..., *leaf] of an observation are not those of its space; nowhere if that is a Box."""
-    match leaf.kind:
-        case "box":
-            return np.zeros((), bool)
-        case "multibinary":
-            return np.asarray(array != array.astype(bool))
-        case "discrete" | "multidiscrete":
-            counts = array - np.reshape(leaf.start, leaf.shape)
-            return np.asarray((counts < 0) | (counts >= np.reshape(leaf.sizes, leaf.shape)))
-
-
-def outside_of_choices(array: Array, action: ActionSpec) -> str:
-    """What is wrong with stored actions [..., *action]; empty if they are choices of its space, or numbers of a box."""
-    choices = np.reshape(action.sizes, action.shape) if action.sizes else 2
-    # `count_nonzero` takes a third of the time of `any`
-    if action.kind != "box" and np.count_nonzero((array < 0) | (array >= choices)):
-        return f"expected 0 to {max(action.sizes, default=2) - 1}, got {array.min()} to {array.max()}"
-    return ""
-
-
-def _named(leaf: Leaf) -> str:
-    return f"obs {leaf.path}".strip()
-
-
-def describe_first_non_finite(array: Array, first_step: int = 0) -> str:
-    """Where the first NaN or infinity of a [T, N, …] array is, as text for an error message. Row 0 is `first_step`."""
-    t, n = np.argwhere(~np.isfinite(array))[0][:2]
-    value = array[t, n][~np.isfinite(array[t, n])] if array.ndim > 2 else array[t, n : n + 1]
-    return f"expected finite values, got {value.flat[0]} at step {first_step + t}, copy {n}"
 
 
 class Batch(msgspec.Struct, frozen=True):

@@ -28,6 +28,11 @@ class Leaf(msgspec.Struct, frozen=True):
     """the smallest value of each entry (discrete, multidiscrete)"""
 
     @property
+    def name(self) -> str:
+        """As errors name it."""
+        return f"observation {self.path}".strip()
+
+    @property
     def is_image(self) -> bool:
         """A three-dimensional array of bytes is an image: it goes through a convolutional network.
 

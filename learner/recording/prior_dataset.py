@@ -1,7 +1,8 @@
 """Reads a Minari dataset as batches from which an algorithm can learn. Minari is an optional dependency.
 
 Rule: a dataset is used only if its observations and actions are those of the run's policy, and if all of its numbers are
-finite. Each episode becomes one batch with a single column, so its rows follow the row format and no row is left out.
+finite and of their spaces. Each episode becomes one batch with a single column, so its rows follow the row format and no row
+is left out.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from protocol.array_checks import wrong_values
 from protocol.arrays import Array
 from protocol.bounds import one_line
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, stored_actions_of
@@ -58,10 +60,10 @@ class PriorDataset:
         where = f"prior {self._id}: episode {number}"
         if any(len(leaf) != T + 1 for leaf in obs) or len(action) != T:
             raise UsageError(f"{where}: expected {T + 1} observations and {T} actions, got {len(obs[0])} and {len(action)}")
-        for name, array in (("reward", reward), ("action", action), *(("observation", leaf) for leaf in obs)):
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                step = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise UsageError(f"{where}: {name}: expected finite values, got another in step {step}")
+        leaves = [(leaf.name, array, leaf) for leaf, array in zip(self._policy.observation, obs, strict=True)]
+        for name, array, space in [("reward", reward, None), ("action", action, self._policy.action), *leaves]:
+            if why := wrong_values(array, space, axes=("step",)):
+                raise UsageError(f"{where}: {name}: {why}")
         if (terminated | truncated)[:-1].any():
             raise UsageError(
                 f"{where}: expected an end in its last step alone, got one in step {int((terminated | truncated).argmax())}"

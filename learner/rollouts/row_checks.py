@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows
-from protocol.rollout import outside_of_choices, outside_of_space
 from protocol.specs import PolicySpec
 
 
@@ -22,31 +22,18 @@ def reason_to_reject(
     L = len(rows.reward) if rows.reward.ndim == 1 else 0
     if not 1 <= L <= most_steps - rows.first_step:
         return f"expected 1 to {most_steps - rows.first_step} rows, got reward {list(rows.reward.shape)}"
-    if len(rows.obs) != len(policy.observation):
-        return f"observation: expected {len(policy.observation)} arrays, got {len(rows.obs)}"
     action = policy.action
-    expected: list[tuple[str, Array, tuple[int, ...], str]] = [
-        ("action", rows.action, (L, *action.shape), action.stored_dtype),
-        ("reward", rows.reward, (L,), "float64"),
-        ("terminated", rows.terminated, (L,), "bool"),
-        ("truncated", rows.truncated, (L,), "bool"),
+    expected = [
+        Expected("action", rows.action, (L, *action.shape), action.stored_dtype, action),
+        Expected("reward", rows.reward, (L,), "float64"),
+        Expected("terminated", rows.terminated, (L,), "bool"),
+        Expected("truncated", rows.truncated, (L,), "bool"),
     ]
-    for array, leaf in zip(rows.obs, policy.observation, strict=True):
-        expected.append((f"observation {leaf.path}".strip(), array, (L + 1, *leaf.shape), leaf.dtype))
-    for name, array, shape, dtype in expected:
-        if array.shape != shape or array.dtype != np.dtype(dtype):
-            return f"{name}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}"
-        if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
-            return f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}"
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            return f"{name}: expected finite values"
-    for array, leaf in zip(rows.obs, policy.observation, strict=True):
-        if why := outside_of_space(array, leaf):
-            return f"observation {leaf.path}: {why}"
-    if why := outside_of_choices(rows.action, action):
-        return f"action: {why}"
-    if not np.isfinite(rows.reward).all() or (rows.terminated | rows.truncated)[:-1].any():
-        return "expected finite rewards, and an end only in the last row"
+    axes = ("row",)
+    if why := wrong_observation(rows.obs, policy.observation, (L + 1,), axes) or wrong_arrays(expected, axes):
+        return why
+    if (rows.terminated | rows.truncated)[:-1].any():
+        return "expected an end only in the last row"
     return _wrong_frames(rows.frames, rows.first_step + L + 1, L, [one.frames for one in before[:1]], with_frames)
 
 

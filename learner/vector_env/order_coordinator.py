@@ -9,15 +9,14 @@ messages, where they are too long for the shared memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from learner.members.events import EnvironmentRaised, Failed
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable, TimedOut
+from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.bounds import one_line
 from protocol.errors import BadMessage
 from protocol.messages import (
@@ -264,19 +263,19 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
         if not answer.error and isinstance(order, Call):
             _check_results(answer, order)
         return
+    if why := wrong_rows(answer, spec, axes=None):
+        raise BadMessage(why)
+
+
+def wrong_rows(answer: Stepped, spec: StepSpec, axes: Sequence[str] | None) -> str:
+    """What is wrong with the arrays of an answer, or with their values if `axes` are given; empty if nothing is."""
     N = spec.lanes[answer.lane]
-    if len(answer.obs) != len(spec.observation):
-        raise BadMessage(f"obs: expected {len(spec.observation)} arrays, got {len(answer.obs)}")
-    expected = [
-        *((f"obs {leaf.path}".strip(), leaf.dtype, leaf.shape) for leaf in spec.observation),
-        ("reward", "float64", ()), ("terminated", "bool", ()), ("truncated", "bool", ()),
-    ]  # fmt: skip
-    found = [*answer.obs, answer.reward, answer.terminated, answer.truncated]
-    for (name, dtype, shape), array in zip(expected, found, strict=True):
-        if array.shape != (N, *shape) or array.dtype != np.dtype(dtype):
-            raise BadMessage(f"{name}: expected {dtype}{[N, *shape]}, got {array.dtype}{list(array.shape)}")
-        if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
-            raise BadMessage(f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}")
+    numbers = [
+        Expected("reward", answer.reward, (N,), "float64"),
+        Expected("terminated", answer.terminated, (N,), "bool"),
+        Expected("truncated", answer.truncated, (N,), "bool"),
+    ]
+    return wrong_observation(answer.obs, spec.observation, (N,), axes) or wrong_arrays(numbers, axes)
 
 
 def _check_results(answer: Returned, order: Call) -> None:

@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from protocol.array_checks import wrong_values
 from protocol.arrays import Array, Bools, Floats
 from protocol.errors import PolicyFailed, UsageError, first_line
 from protocol.own_module import own_callable
 from protocol.policy.layout import named_views, parameter_layout
 from protocol.policy.masks import not_allowed
-from protocol.rollout import outside_of_choices
 from protocol.specs import ExtraArray, OwnPolicySpec, PolicySpec
 
 LOG_PROB = ExtraArray("log_prob", (), "float32")
@@ -92,7 +92,7 @@ class OwnPolicy:
         stored = self._array(
             action, (copies, *self._spec.action.shape), self._spec.action.stored_dtype, f"{name}: the action"
         )
-        if why := outside_of_choices(stored, self._spec.action):
+        if why := wrong_values(stored, self._spec.action, ("copy",)):
             raise self._wrong(f"{name}: the action: {why}")
         if mask is not None and (wrong := not_allowed(stored, mask, self._spec.action)).any():
             n = int(np.flatnonzero(wrong)[0])
@@ -118,9 +118,8 @@ class OwnPolicy:
         if array.shape != shape or not np.can_cast(array.dtype, dtype, "same_kind"):
             raise self._wrong(f"{what}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}")
         array = array.astype(dtype, copy=False)
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            copy = np.argwhere(~np.isfinite(array))[0][0]
-            raise self._wrong(f"{what}: expected finite numbers, got {array[copy].tolist()} for copy {copy}"[:500])
+        if why := wrong_values(array, axes=("copy",)):
+            raise self._wrong(f"{what}: {why}")
         return array
 
     def _guarded(self, what: str, call: Callable[[], Any]) -> Any:

@@ -129,7 +129,7 @@ MUTANTS = [
         "wrong dtype", "worker.hpp",
         ".described(\"<f8\", 2, {N})",
         ".described(\"<i8\", 2, {N})",
-        "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "reward int64",
+        "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "reward: expected float64",
     ),
     Mutant(
         "wrong frame", "worker.hpp",

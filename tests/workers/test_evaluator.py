@@ -216,10 +216,10 @@ def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]
 @pytest.mark.parametrize(
     ("bad", "says"),
     [
-        ("reward", "copy 0, step 0: reward: expected a finite float32, got nan"),
+        ("reward", "while the policy was evaluated: reward: expected finite values, got nan at step 0, copy 0"),
         ("text", "copy 0, step 0: reward: expected a number, got 'one'"),
         ("shape", r"copy 0, step 0: observation: expected int64\[\] as its space says, got int64\[2\]"),
-        ("outside", "copy 0, step 0: observation: expected values of its space, got 7 to 7"),
+        ("outside", "while the policy was evaluated: observation: expected 0 to 4, got 7 at step 1, copy 0"),
     ],
 )
 def test_an_unusable_value_is_named(bad: str, says: str) -> None:
@@ -318,7 +318,7 @@ def test_an_observation_that_is_not_finite_is_named() -> None:
     run = run_of("CartPole-v1")
     spec = EnvSpec.of(lambda: Drifts(gymnasium.make("CartPole-v1")))
     run = msgspec.structs.replace(run, env=spec)
-    with pytest.raises(EnvironmentFailed, match="copy 0, step 0: observation: expected finite numbers"):
+    with pytest.raises(EnvironmentFailed, match="observation: expected finite values, got inf at step 1, copy 0"):
         play(Evaluator(run, random_policy(run.policy)), order(1, 2))
 
 
@@ -355,7 +355,7 @@ def test_an_observation_from_which_no_policy_can_act_is_named_as_in_training() -
 
 def test_no_row_is_sent_with_an_observation_that_is_not_finite() -> None:
     run, sent = run_of_shown(np.nan, at=2), list[EpisodeRows]()
-    with pytest.raises(EnvironmentFailed, match="copy 0, step 1: observation: expected finite numbers"):
+    with pytest.raises(EnvironmentFailed, match="observation: expected finite values, got nan at step 2, copy 0"):
         Evaluator(run, random_policy(run.policy)).play(order(1, rows=True), sent.append, no_pulse)
     assert not sent
 

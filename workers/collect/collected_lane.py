@@ -7,36 +7,23 @@ raises `EnvironmentFailed` for an environment that raises, for observations that
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from time import perf_counter
 
 import numpy as np
 
 from protocol.arrays import Array, Bools
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
 from protocol.policy.masks import stored_leaves
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
-from protocol.rollout import Episode, describe_first_non_finite, not_of_space
-from protocol.specs import Leaf, RunSpec
+from protocol.rollout import Episode
+from protocol.specs import RunSpec
 from protocol.wire.plain_values import pack, unpack
-from workers.copies.env_copies import EnvCopies, Leaves, copy_seeds
+from workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
-from workers.copies.env_results import leaf_writers
+from workers.copies.env_results import ObservationWriter
 from workers.copies.facts import Facts
-
-
-def check_acted(lane: int | None, name: str, array: Array, obs: Sequence[Array], first_step: int = 0) -> None:
-    """Raise if what the policy computed, [T, N, …], is not finite: finite observations `obs` are too large for float32.
-
-    `lane`: None in an evaluation. `first_step`: that of row 0.
-    """
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
-        line = f"{name} of the policy: {describe_first_non_finite(array, first_step)}, from observations up to {largest:g}"
-        raise environment_failed(lane, f"{line}; wrap the environment so that they are smaller")
 
 
 class CollectedLane:
@@ -58,8 +45,7 @@ class CollectedLane:
         self._attributes = b""  # that were set in the copies
         self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended in this rollout
         self._no_facts = (math.nan,) * len(run.facts)
-        self._stored = stored_leaves(run)
-        self._writers = leaf_writers(self._stored, run.copies)
+        self.writer = ObservationWriter(stored_leaves(run), run.copies)
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
         """Set these attributes in all copies unless they are set. Raises `EnvironmentFailed` if a copy has none."""
@@ -77,15 +63,10 @@ class CollectedLane:
 
     def reset(self, pulse: Pulse) -> None:
         """Start episodes in all copies. Raises `UsageError` when their spaces are not those of the run."""
-        policy, observation, action = self._run.policy, self.copies.observation_space, self.copies.action_space
-        if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
-            raise UsageError(
-                f"environment {self._run.env.id}: its observations {observation} and actions {action} are not what "
-                "the learner has; install the same version of it on both machines"
-            )
+        check_spaces(self._run, self.copies)
         try:
             leaves = self.copies.reset(self._seeds, pulse)
-            self.write_observations(self.joined([array[None] for array in self.obs]), 0, leaves)
+            self.writer.write(self.writer.joined(array[None] for array in self.obs), 0, leaves)
         except CopyFailed as error:
             raise environment_failed(self.number, error, "first reset") from error
         self._start_s = [perf_counter()] * len(self._start_s)
@@ -94,31 +75,10 @@ class CollectedLane:
         """Close the copies. Raises nothing."""
         self.copies.close()
 
-    def joined(self, arrays: Iterable[Array]) -> list[Array]:
-        """Views of arrays [rows, N, *leaf] for `write_observations`."""
-        return [writer.joined(array) for writer, array in zip(self._writers, arrays, strict=True)]
-
-    def write_observations(self, joined: Iterable[Array], t: int, leaves: Leaves) -> None:
-        """Write observations into row `t` of the arrays. Raises `CopyFailed`, an error of one copy."""
-        for writer, array, values in zip(self._writers, joined, leaves, strict=True):
-            writer.write(array[t], values)
-
     def keep_facts(self, t: int, facts: Facts) -> None:
         """Keep the facts of the episodes that ended in row `t` for `finish`."""
         for n, of_copy in facts.items():
             self._facts[t, n] = of_copy
-
-    def check_values(self, obs: Sequence[Array], reward: Array) -> None:
-        """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""
-        for leaf, array in zip(self._stored, obs, strict=True):
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise environment_failed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
-            if (wrong := not_of_space(array, leaf)).any():
-                t, n = np.argwhere(wrong)[0][:2]
-                line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
-                raise environment_failed(self.number, line)
-        if not np.isfinite(reward).all():
-            raise environment_failed(self.number, f"reward: {describe_first_non_finite(reward)}")
 
     def finish(self, reward: Array, done: Bools, step_end_s: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """After T steps: which rows are valid [T, N], and the episodes that ended, oldest first.
@@ -151,7 +111,3 @@ class CollectedLane:
                 add(n, len(step_end_s))
         self._facts.clear()
         return valid, tuple(episodes)
-
-
-def _name(leaf: Leaf) -> str:
-    return f"observation {leaf.path}".strip()

@@ -28,7 +28,7 @@ from protocol.rollout import Rollout
 from protocol.specs import RunSpec
 from workers.activity import MAKING, activity
 from workers.collect.acting import RolloutActions, acting_of
-from workers.collect.collected_lane import CollectedLane, check_acted
+from workers.collect.collected_lane import CollectedLane
 from workers.conversation.held import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.copies.env_errors import CopyFailed, environment_failed
@@ -36,6 +36,7 @@ from workers.copies.env_loop import Pulse
 from workers.copies.env_results import write_numbers
 from workers.copies.envpool_copies import EnvpoolCopies
 from workers.copies.open_lanes import OpenLanes
+from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.env_copy import make_copy
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
@@ -91,6 +92,7 @@ class Collector:
         self.env_attributes = b""
         """attributes that each env copy gets before its next rollout (`Weights.env_attributes`)"""
         self._run = run
+        self._stored = stored_leaves(run)
         self._acting = acting_of(run, policy)
         self._open_copies, self._step_all = open_copies, step_all
         self._to_env_action = action_converter_of(run.policy)
@@ -125,10 +127,11 @@ class Collector:
         try:
             self._act_and_step(rows, actions, lanes, pulse)
         except (EnvironmentFailed, PolicyFailed, IndexError):
-            # An invalid observation or reward may have caused the error. Then `check_values` raises the clearer one.
+            # An invalid observation or reward may have caused the error. Then these checks raise the clearer one.
             done = len(rows.step_end_s)
             for i, lane in enumerate(lanes):
-                lane.check_values([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
+                check_observed(lane.number, self._stored, [array[i, : done + 1] for array in rows.obs])
+                check_rewards(lane.number, rows.reward[i, :done])
             raise
         return [
             self._rollout(rows, actions, i, lane, assignment, version, session)
@@ -157,7 +160,7 @@ class Collector:
 
     def _new_rows(self, lanes: Sequence[CollectedLane]) -> _Rows:
         L, T, N = len(lanes), self._run.rollout_steps, self._run.copies
-        obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in stored_leaves(self._run))
+        obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in self._stored)
         for i, lane in enumerate(lanes):
             for array, leaf in zip(obs, lane.obs, strict=True):
                 array[i, 0] = leaf
@@ -177,7 +180,7 @@ class Collector:
         lane_numbers = [lane.number for lane in lanes]
         stages = self.stages
         views = [  # of every lane
-            (i, lane, (rows.reward[i], rows.terminated[i], rows.truncated[i]), lane.joined(array[i] for array in rows.obs))
+            (lane, (rows.reward[i], rows.terminated[i], rows.truncated[i]), lane.writer.joined(leaf[i] for leaf in rows.obs))
             for i, lane in enumerate(lanes)
         ]
         for t in range(self._run.rollout_steps):
@@ -187,11 +190,11 @@ class Collector:
                 taken = self._to_env_action(actions.act(t, [leaf[:, t] for leaf in rows.obs], rows.state))
             acted = perf_counter()
             self._step_all(lane_numbers, taken, pulse)
-            for i, lane, numbers, obs in views:
+            for i, (lane, numbers, obs) in enumerate(views):
                 try:
                     row = lane.copies.step(taken[i], pulse)
                     write_numbers(numbers, t, (row.reward, row.terminated, row.truncated))
-                    lane.write_observations(obs, t + 1, row.leaves)
+                    lane.writer.write(obs, t + 1, row.leaves)
                 except CopyFailed as error:
                     raise environment_failed(lane.number, error, f"step {t}") from error
                 if row.facts:
@@ -219,9 +222,8 @@ class Collector:
         """The rollout of lane `i`, made of views of the rows."""
         valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.step_end_s)
         obs = tuple(array[i] for array in rows.obs)
-        with np.errstate(over="ignore"):
-            reward = rows.reward[i].astype(np.float32)
-        lane.check_values(obs, reward)
+        check_observed(lane.number, self._stored, obs)
+        reward = check_rewards(lane.number, rows.reward[i])
         acted = actions.columns(i)
         check_acted(lane.number, "action", acted.action, obs)
         check_acted(lane.number, "log_prob", acted.log_prob, obs)

@@ -20,10 +20,11 @@ from gymnasium.wrappers import OrderEnforcing
 from protocol.arrays import Array
 from protocol.envs.action_masks import without_mask
 from protocol.envs.env_copy import FIRST_COPY, EnvCopy
-from protocol.envs.spaces import make_flatten
+from protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
+from protocol.specs import RunSpec
 from protocol.wire.plain_values import unpack
 from workers.activity import EVALUATING, RESETTING, STEPPING, activity
 from workers.copies.env_errors import CopyFailed
@@ -75,6 +76,16 @@ class EnvCopies(Protocol):
     def close(self) -> None:
         """Close the copies. Raises nothing."""
         ...
+
+
+def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
+    """Raise `UsageError` unless the copies have the spaces of the run's policy."""
+    observation, action, policy = copies.observation_space, copies.action_space, run.policy
+    if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
+        raise UsageError(
+            f"environment {run.env.id}: its observations {observation} and actions {action} are not those of the policy; "
+            "install the version of the environment that the policy was made for"
+        )
 
 
 def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]:

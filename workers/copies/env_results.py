@@ -61,7 +61,7 @@ class LeafWriter:
             pass
         row = joined.reshape(self._shape)
         if len(values) != len(row):
-            raise CopyFailed(None, line=f"{_name(self._leaf)}: expected those of {len(row)} copies, got {len(values)}")
+            raise CopyFailed(None, line=f"{self._leaf.name}: expected those of {len(row)} copies, got {len(values)}")
         for n, value in enumerate(values):
             self.write_one(row, n, value)
 
@@ -88,7 +88,29 @@ class LeafWriter:
         got = f"got {array.dtype}{list(array.shape)}"
         if self._is_whole and array.shape == self._leaf.shape and array.dtype.kind in "iu":
             got += f" with the value {array[array.astype(self._dtype) != array].flat[0]}"
-        raise CopyFailed(n, line=f"{_name(self._leaf)}: {expected}, {got}; fix the environment or its observation_space")
+        raise CopyFailed(n, line=f"{self._leaf.name}: {expected}, {got}; fix the environment or its observation_space")
+
+
+class ObservationWriter:
+    """Writes the observations of N copies, which have these leaves. Each method raises `CopyFailed`."""
+
+    def __init__(self, leaves: Iterable[Leaf], copies: int) -> None:
+        self._writers = [LeafWriter(leaf, copies) for leaf in leaves]
+
+    def joined(self, arrays: Iterable[Array]) -> list[Array]:
+        """Views of arrays [*rows, N, *leaf] for `write`."""
+        return [writer.joined(array) for writer, array in zip(self._writers, arrays, strict=True)]
+
+    def write(self, joined: Iterable[Array], t: int, leaves: Iterable[Any]) -> None:
+        """Write those of all copies into row `t` of `joined` arrays."""
+        for writer, array, values in zip(self._writers, joined, leaves, strict=True):
+            writer.write(array[t], values)
+
+    def write_some(self, arrays: Iterable[Array], copies: Sequence[int], leaves: Iterable[Any]) -> None:
+        """Write those of these copies into arrays [N, *leaf]. `leaves`: values that have theirs at their numbers."""
+        for writer, array, values in zip(self._writers, arrays, leaves, strict=True):
+            for n in copies:
+                writer.write_one(array, n, values[n])
 
 
 def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any]) -> tuple[Sequence[Any], ...]:
@@ -142,12 +164,3 @@ def one_number(name: str, n: int, value: Any) -> Any:
     if advice and "mo_gymnasium" in sys.modules:
         advice += ", as --wrapper mo_gymnasium.wrappers:LinearReward does"
     raise CopyFailed(n, line=f"{name}: expected a number, got an array of shape {array.shape}{advice}")
-
-
-def leaf_writers(leaves: Iterable[Leaf], copies: int) -> list[LeafWriter]:
-    """A writer for each leaf."""
-    return [LeafWriter(leaf, copies) for leaf in leaves]
-
-
-def _name(leaf: Leaf) -> str:
-    return f"observation {leaf.path}".strip()

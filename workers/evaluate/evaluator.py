@@ -18,7 +18,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.envs.env_copy import EnvCopy
-from protocol.envs.spaces import action_converter_of, action_spec, observation_leaves
+from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError
 from protocol.messages import Evaluate, Evaluated
 from protocol.policy.masks import stored_leaves
@@ -26,14 +26,14 @@ from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
-from protocol.rollout import LARGEST_REWARD, Episode, outside_of_space
+from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from workers.collect.acting import acting_of
-from workers.collect.collected_lane import check_acted
-from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult
+from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
-from workers.copies.env_results import leaf_writers, write_numbers
+from workers.copies.env_results import ObservationWriter, write_numbers
+from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
 
 
@@ -83,7 +83,7 @@ class Evaluator:
         self._run, self._open_copies = run, open_copies
         self._acting = acting_of(run, policy)
         self._stored = stored_leaves(run)
-        self._writers = leaf_writers(self._stored, 1)
+        self._writer = ObservationWriter(self._stored, 1)
         self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
@@ -125,7 +125,7 @@ class Evaluator:
         senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
         running, t = list(range(k)), 0
         began_s = perf_counter()
-        self._write(obs, running, copies.reset(order.seeds, pulse), "first reset")
+        self._write(obs, running, copies.reset(order.seeds, pulse), 0, "first reset")
         for n, sender in enumerate(senders):
             self._observe(sender, obs, n, copies)
         while running:
@@ -140,13 +140,11 @@ class Evaluator:
                 if step.lost is not None and step.lost[running].any():
                     return None
                 write_numbers(numbers, slice(None), (step.reward[:k], step.terminated[:k], step.truncated[:k]))
-                rewards: list[float] = numbers[0].tolist()
-                for n in running:
-                    if not abs(rewards[n]) <= LARGEST_REWARD:
-                        raise CopyFailed(n, line=f"reward: expected a finite float32, got {rewards[n]}")
             except CopyFailed as error:
                 raise environment_failed(None, error, f"step {t}") from error
-            self._write(obs, running, step.leaves, f"step {t}")
+            check_rewards(None, numbers[0][None], t)
+            rewards: list[float] = numbers[0].tolist()
+            self._write(obs, running, step.leaves, t + 1, f"step {t}")
             ended = set[int]()
             for n in running:
                 returns[n] += rewards[n]
@@ -175,35 +173,16 @@ class Evaluator:
         if copies is not None:
             self._copies.pop(render_mode).close()
         copies = self._copies[render_mode] = self._open_copies(self._run, count, render_mode, pulse)
-        observation, action, policy = copies.observation_space, copies.action_space, self._run.policy
-        if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
-            raise UsageError(
-                f"environment {self._run.env.id}: its observations {observation} and actions {action} are not those of the "
-                "policy; install the version of it that the policy was trained on"
-            )
+        check_spaces(self._run, copies)
         return copies
 
-    def _write(self, obs: tuple[Array, ...], copies: Sequence[int], leaves: Leaves, when: str) -> None:
-        """Write the observations of these copies to their places in the batch. Raises if one is no value of its space."""
+    def _write(self, obs: tuple[Array, ...], copies: Sequence[int], leaves: Leaves, t: int, doing: str) -> None:
+        """Write the observations of these copies to their places in the batch: number `t` of their episodes."""
         try:
-            for array, values, writer in zip(obs, leaves, self._writers, strict=True):
-                for n in copies:
-                    writer.write_one(array[0], n, values[n])
+            self._writer.write_some([array[0] for array in obs], copies, leaves)
         except CopyFailed as error:
-            raise environment_failed(None, error, when) from error
-        self._check_values(obs, when)
-
-    def _check_values(self, obs: tuple[Array, ...], when: str) -> None:
-        """Raise if an observation of the batch is not finite, or not a value of a space that counts its values."""
-        for array, leaf in zip(obs, self._stored, strict=True):
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
-                where = f"copy {n}, {when}: observation {leaf.path}".strip()
-                raise environment_failed(None, f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
-            if leaf.kind != "box" and outside_of_space(array, leaf):
-                n, why = next((n, why) for n in range(array.shape[1]) if (why := outside_of_space(array[0, n], leaf)))
-                where = f"copy {n}, {when}: observation {leaf.path}".strip()
-                raise environment_failed(None, f"{where}: {why}")
+            raise environment_failed(None, error, doing) from error
+        check_observed(None, self._stored, obs, t)
 
     def _check_acted(self, chosen: Array, running: Sequence[int], obs: tuple[Array, ...], t: int) -> None:
         """As in training. The action of a copy whose episode has ended does not count."""

@@ -23,7 +23,7 @@ from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop, Infos, Pulse
-from workers.copies.env_results import leaf_writers, read_leaves, write_numbers
+from workers.copies.env_results import ObservationWriter, read_leaves, write_numbers
 
 
 class Rows(NamedTuple):
@@ -61,8 +61,8 @@ class SteppedLane:
         self._nested_observations = _is_nested(env.observation_space)
         self._read = make_flatten(env.observation_space)
         self._observations: list[Any] = [None] * len(self._loop.envs)  # as the copies returned them last
-        self._writers = leaf_writers(spec.observation, len(self._loop.envs))
-        self._joined = [writer.joined(array) for writer, array in zip(self._writers, rows.obs, strict=True)]
+        self._writer = ObservationWriter(spec.observation, len(self._loop.envs))
+        self._joined = self._writer.joined(array[None] for array in rows.obs)
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> Infos:
         """Start episodes in these copies, with a seed for each. `options`: a list with those of each, or those of all."""
@@ -70,8 +70,7 @@ class SteppedLane:
         infos = self._loop.reset(copies, seeds, self._observations, pulse, each)
         for n in copies:  # only these: a copy may overwrite the observation that it returned before
             leaves = read_leaves(self._read, [self._observations[n]])
-            for writer, row, (value,) in zip(self._writers, self.rows.obs, leaves, strict=True):
-                writer.write_one(row, n, value)
+            self._writer.write_some(self.rows.obs, [n], [{n: value} for (value,) in leaves])
         self._write_numbers()
         return infos
 
@@ -82,8 +81,7 @@ class SteppedLane:
         infos = self._loop.step(each, self._observations, pulse)
         try:
             leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
-            for writer, row, values in zip(self._writers, self._joined, leaves, strict=True):
-                writer.write(row, values)
+            self._writer.write(self._joined, 0, leaves)
             self._write_numbers()
         except CopyFailed as error:
             raise CopyFailed(error.copy, f"step {step}", error.line) from error

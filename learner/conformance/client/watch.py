@@ -15,7 +15,7 @@ from learner.conformance.client import rules
 from learner.conformance.client.lane_rows import LaneRows
 from learner.conformance.client.rules import Rule
 from learner.conformance.client.script import Broken, brief
-from protocol.arrays import Array
+from learner.vector_env.order_coordinator import wrong_rows
 from protocol.errors import BadRollout
 from protocol.messages import (
     Call,
@@ -38,7 +38,7 @@ from protocol.messages import (
     Weights,
 )
 from protocol.rollout import validate
-from protocol.specs import DescribeSpec, Leaf, RunSpec, StepSpec
+from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds
@@ -289,28 +289,12 @@ def same_arrays(one: Rollout, other: Rollout) -> bool:
 
 def check_stepped(message: Stepped, spec: StepSpec) -> None:
     """Raise `Broken` if the arrays are not those of the lane."""
-    N = spec.lanes[message.lane]
-    if len(message.obs) != len(spec.observation):
-        raise Broken(rules.STEPPED_ARRAYS, f"{len(spec.observation)} arrays in obs", f"{len(message.obs)}")
-    expected: list[tuple[str, Array, tuple[int, ...], str]] = [
-        ("reward", message.reward, (N,), "float64"),
-        ("terminated", message.terminated, (N,), "bool"),
-        ("truncated", message.truncated, (N,), "bool"),
-    ]
-    expected += [
-        (f"obs {leaf.path}".strip(), array, (N, *leaf.shape), leaf.dtype)
-        for leaf, array in zip(spec.observation, message.obs, strict=True)
-    ]
-    for name, array, shape, dtype in expected:
-        if array.shape != shape or array.dtype != np.dtype(dtype):
-            raise Broken(rules.STEPPED_ARRAYS, f"{name} {dtype}{list(shape)}", f"{name} {array.dtype}{list(array.shape)}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise Broken(rules.IN_SPACE, f"finite values in {name}", f"{array[~np.isfinite(array)][0]}")
+    if why := wrong_rows(message, spec, axes=None):
+        raise Broken(rules.STEPPED_ARRAYS, "arrays of the lane", why)
+    if why := wrong_rows(message, spec, axes=("copy",)):
+        raise Broken(rules.IN_SPACE, "values of their spaces", why)
     if message.infos.dtype != np.uint8 or message.infos.ndim != 1:
         raise Broken(rules.STEPPED_ARRAYS, "infos uint8[bytes]", f"infos {message.infos.dtype}{list(message.infos.shape)}")
-    for leaf, array in zip(spec.observation, message.obs, strict=True):
-        if why := outside(array, leaf):
-            raise Broken(rules.IN_SPACE, f"values of its space in obs {leaf.path}".strip(), why)
 
 
 def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
@@ -319,13 +303,3 @@ def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
     """
     first = {after for _, after in around}
     return len(around) >= 3 and len(first) > 1 and all(last == after for last, after in around)
-
-
-def outside(array: Array, leaf: Leaf) -> str:
-    """What is wrong with the values of a leaf that counts; empty if nothing is."""
-    if not leaf.sizes:
-        return ""
-    counts = array - np.reshape(leaf.start, leaf.shape)
-    if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
-        return f"{array.min()} to {array.max()}"
-    return ""

@@ -142,11 +142,12 @@ def test_a_dataset_that_is_not_there_is_refused_with_those_that_are(store: Store
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"rewards": np.array([0.0, np.nan, 0.0])}, "episode 0: reward: expected finite values, got another in step 1"),
+        ({"rewards": np.array([0.0, np.nan, 0.0])}, "episode 0: reward: expected finite values, got nan at step 1"),
         (
             {"observations": np.full((4, 2), np.inf, np.float32)},
-            "episode 0: observation: expected finite values, got another in step 0",
+            "episode 0: observation: expected finite values, got inf at step 0",
         ),
+        ({"actions": np.array([0, 1, 2])}, "episode 0: action: expected 0 to 1, got 2 at step 2"),
         (
             {"terminations": np.array([True, False, True])},
             "episode 0: expected an end in its last step alone, got one in step 0",

@@ -181,9 +181,9 @@ def _with(array: Array, at: tuple[int, ...], value: object) -> Array:
 
 def test_a_rollout_that_breaks_the_law_is_refused_in_one_line() -> None:
     assert altered(obs=lambda obs: (obs[0].astype(np.float64),)) == (
-        "obs: expected float32[7, 3, 3], got float64[7, 3, 3]; is its environment the same version?"
+        "observation: expected float32[7, 3, 3], got float64[7, 3, 3]; is its environment the same version?"
     )
-    assert altered(obs=lambda obs: ()) == "obs: expected 1 arrays, got 0"
+    assert altered(obs=lambda obs: ()) == "observation: expected 1 arrays, got 0"
     assert altered(reward=lambda a: a[:-1]).startswith("reward: expected float32[6, 3], got float32[5, 3]")
     assert altered(reward=lambda a: _with(a, (2, 1), np.nan)) == "reward: expected finite values, got nan at step 2, copy 1"
     assert (
@@ -191,10 +191,11 @@ def test_a_rollout_that_breaks_the_law_is_refused_in_one_line() -> None:
         == "log_prob: expected finite values, got -inf at step 0, copy 2"
     )
     assert (
-        altered(obs=lambda o: (_with(o[0], (6, 0, 1), np.inf),)) == "obs: expected finite values, got inf at step 6, copy 0"
+        altered(obs=lambda o: (_with(o[0], (6, 0, 1), np.inf),))
+        == "observation: expected finite values, got inf at step 6, copy 0"
     )
-    assert altered(action=lambda a: _with(a, (0, 0), 3)).startswith("action: expected 0 to 2, got 0 to 3")
-    assert altered(action=lambda a: _with(a, (0, 0), -1)).startswith("action: expected 0 to 2, got -1")
+    assert altered(action=lambda a: _with(a, (0, 0), 3)).startswith("action: expected 0 to 2, got 3 at step 0, copy 0")
+    assert altered(action=lambda a: _with(a, (0, 0), -1)).startswith("action: expected 0 to 2, got -1 at step 0, copy 0")
     assert altered(lane=lambda _: 8) == "lane: expected 0 to 7, got 8"
     assert altered(valid=lambda a: _with(a, (4, 1), True)) == "valid: expected False at step 4, copy 1, got True"
     assert altered(truncated=lambda a: _with(a, (3, 0), False)) == "valid: expected True at step 4, copy 0, got False"
@@ -206,9 +207,9 @@ def test_a_rollout_that_breaks_the_law_is_refused_in_one_line() -> None:
 def test_values_that_are_not_of_the_space_are_refused() -> None:
     """Else the learner's one-hot features would be indexed out of their bounds."""
     low = altered(observation="discrete", obs=lambda o: (o[0] - 100,))
-    assert low.startswith("obs: expected ")
-    assert altered(observation="discrete", obs=lambda o: (o[0] + 100,)).startswith("obs: expected ")
-    assert altered(observation="multidiscrete", obs=lambda o: (o[0] + 100,)).startswith("obs: expected ")
+    assert low.startswith("observation: expected ")
+    assert altered(observation="discrete", obs=lambda o: (o[0] + 100,)).startswith("observation: expected ")
+    assert altered(observation="multidiscrete", obs=lambda o: (o[0] + 100,)).startswith("observation: expected ")
     assert altered(action_space="multibinary", action=lambda a: a + 2).startswith("action: expected 0 to 1, got ")
 
     def with_episode(episode: Episode) -> str:

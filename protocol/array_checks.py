@@ -1,0 +1,86 @@
+"""Checks of arrays from elsewhere: of shape and dtype, and that their values are finite and of their space. Pure.
+
+Each check returns what is wrong, as one line; an empty one if nothing is. A line names the first wrong value and its place:
+`axes` names the leading dimensions of an array, so that ("step", "copy") leads to "at step 3, copy 1".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from protocol.arrays import Array, Bools
+from protocol.specs import ActionSpec, Leaf
+
+STEP_AND_COPY = ("step", "copy")
+
+
+class Expected(NamedTuple):
+    """An array, and what is expected of it."""
+
+    name: str
+    array: Array
+    shape: tuple[int, ...]
+    dtype: str
+    space: Leaf | ActionSpec | None = None
+    """None: any finite numbers. Of an action, which is stored: choices from 0."""
+
+
+def wrong_arrays(expected: Iterable[Expected], axes: Sequence[str] | None = STEP_AND_COPY) -> str:
+    """What is wrong with the first of these arrays that is wrong. `axes` None: whatever values it has."""
+    for name, array, shape, dtype, space in expected:
+        if why := _misfit(array, shape, dtype) or (axes is not None and wrong_values(array, space, axes)):
+            return f"{name}: {why}"
+    return ""
+
+
+def wrong_observation(
+    arrays: Sequence[Array], leaves: Sequence[Leaf], rows: tuple[int, ...], axes: Sequence[str] | None = STEP_AND_COPY
+) -> str:
+    """What is wrong with the arrays [*rows, *leaf] of an observation, one for each leaf."""
+    if len(arrays) != len(leaves):
+        return f"observation: expected {len(leaves)} arrays, got {len(arrays)}"
+    each = zip(leaves, arrays, strict=True)
+    return wrong_arrays((Expected(leaf.name, array, (*rows, *leaf.shape), leaf.dtype, leaf) for leaf, array in each), axes)
+
+
+def wrong_values(
+    array: Array, space: Leaf | ActionSpec | None = None, axes: Sequence[str] = STEP_AND_COPY, first: int = 0
+) -> str:
+    """What is wrong with values [..., *shape]: one is not finite, or is not of its `space`, if that counts its values.
+
+    The bounds of a Box are not checked: many environments leave theirs. `first`: the number of row 0.
+    """
+    # `count_nonzero` takes a third of the time of `all` and `any`.
+    if array.dtype.kind == "f" and np.count_nonzero(finite := np.isfinite(array)) != array.size:
+        return f"expected finite values, got {_first(array, ~finite, axes, first)}"
+    if space is None or space.kind == "box" or array.dtype.kind == "b":
+        return ""
+    sizes = np.reshape(space.sizes, space.shape) if space.sizes else np.full(space.shape, 2)  # of MultiBinary
+    start = np.reshape(space.start, space.shape) if space.start and isinstance(space, Leaf) else np.zeros_like(sizes)
+    counts = array - start
+    wrong = (counts < 0) | (counts >= sizes)
+    if not np.count_nonzero(wrong):
+        return ""
+    low, count = (np.broadcast_to(of_entry, array.shape)[wrong][0] for of_entry in (start, sizes))
+    return f"expected {low} to {low + count - 1}, got {_first(array, wrong, axes, first)}"
+
+
+def _misfit(array: Array, shape: tuple[int, ...], dtype: str) -> str:
+    """What is wrong with the shape and the dtype of an array, or with the bytes of its flags."""
+    if array.shape != shape or array.dtype != np.dtype(dtype):
+        got = f"{array.dtype}{list(array.shape)}"
+        return f"expected {dtype}{list(shape)}, got {got}; is its environment the same version?"
+    if array.dtype.kind == "b" and array.size and (largest := array.view(np.uint8).max()) > 1:
+        return f"expected bytes 0 and 1, got {largest}"
+    return ""
+
+
+def _first(array: Array, wrong: Bools, axes: Sequence[str], first: int) -> str:
+    """The first wrong value and its place."""
+    index = np.argwhere(wrong)[0]
+    value, index[:1] = array[tuple(index)], index[:1] + first
+    place = ", ".join(f"{axis} {number}" for axis, number in zip(axes, index, strict=False))
+    return f"{value} at {place}" if place else f"{value}"
