@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -28,7 +29,7 @@ from learner.conformance.client.script import (
     StartClient,
     Wait,
 )
-from learner.conformance.client.watch import Watch
+from learner.conformance.client.watch import Watch, check_stepped
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.messages import (
@@ -43,6 +44,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
+from protocol.specs import Leaf, StepSpec
 from protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
 from tests.support.fake_ends import fake_rollout, run_spec
@@ -280,3 +282,24 @@ def test_no_two_checks_of_a_profile_have_one_name() -> None:
     for checks in PROFILES.values():
         names = [check.name for check in checks]
         assert len(names) == len(set(names)) >= 40
+
+
+@pytest.mark.parametrize(
+    ("changed", "rule", "got"),
+    [
+        ({"reward": np.zeros(2, np.float32)}, rules.STEPPED_ARRAYS, "reward: expected float64[2], got float32[2]"),
+        ({"obs": (np.array([0, 2], np.int8),)}, rules.IN_SPACE, "observation: expected 0 to 1, got 2 at copy 1"),
+        ({"reward": np.array([np.nan, 0.0])}, rules.IN_SPACE, "reward: expected finite values, got nan at copy 0"),
+    ],
+)
+def test_results_of_a_step_have_the_arrays_of_their_lane_and_values_of_their_spaces(
+    changed: dict[str, Any], rule: Rule, got: str
+) -> None:
+    spec = StepSpec((EnvSpec("own"),), (0, 0), (2,), (Leaf("", "multibinary", (), "int8"),), ())
+    flags, infos = np.zeros(2, bool), np.zeros(0, np.uint8)
+    right = Stepped(1, 1, 0, 0, (np.ones(2, np.int8),), np.zeros(2), flags, flags, infos)
+    check_stepped(right, spec)
+    with pytest.raises(Broken) as broken:
+        check_stepped(msgspec.structs.replace(right, **changed), spec)
+    assert broken.value.rule is rule
+    assert got in broken.value.got
