@@ -9,14 +9,13 @@ messages, where they are too long for the shared memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from learner.members.events import EnvironmentRaised, Failed
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable, TimedOut
-from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.bounds import one_line
 from protocol.errors import BadMessage
 from protocol.messages import (
@@ -43,6 +42,7 @@ from protocol.messages import (
     WorkerExit,
 )
 from protocol.specs import StepSpec
+from protocol.stepped import wrong_rows
 from protocol.wire.plain_values import unpack
 
 MakeOrder = Callable[[int, int, LaneIncarnation], Order]
@@ -265,17 +265,6 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
         return
     if why := wrong_rows(answer, spec, axes=None):
         raise BadMessage(why)
-
-
-def wrong_rows(answer: Stepped, spec: StepSpec, axes: Sequence[str] | None) -> str:
-    """What is wrong with the arrays of an answer, or with their values if `axes` are given; empty if nothing is."""
-    N = spec.lanes[answer.lane]
-    numbers = [
-        Expected("reward", answer.reward, (N,), "float64"),
-        Expected("terminated", answer.terminated, (N,), "bool"),
-        Expected("truncated", answer.truncated, (N,), "bool"),
-    ]
-    return wrong_observation(answer.obs, spec.observation, (N,), axes) or wrong_arrays(numbers, axes)
 
 
 def _check_results(answer: Returned, order: Call) -> None:

@@ -15,7 +15,6 @@ from learner.conformance.client import rules
 from learner.conformance.client.lane_rows import LaneRows
 from learner.conformance.client.rules import Rule
 from learner.conformance.client.script import Broken, brief
-from learner.vector_env.order_coordinator import wrong_rows
 from protocol.errors import BadRollout
 from protocol.messages import (
     Call,
@@ -39,6 +38,7 @@ from protocol.messages import (
 )
 from protocol.rollout import validate
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
+from protocol.stepped import wrong_rows
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds

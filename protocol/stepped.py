@@ -1,0 +1,20 @@
+"""The arrays of a `Stepped`: a row for every copy of a lane of a vector environment. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from protocol.array_checks import Expected, wrong_arrays, wrong_observation
+from protocol.messages import Stepped
+from protocol.specs import StepSpec
+
+
+def wrong_rows(answer: Stepped, spec: StepSpec, axes: Sequence[str] | None) -> str:
+    """What is wrong with the arrays of an answer, or with their values if `axes` are given; empty if nothing is."""
+    N = spec.lanes[answer.lane]
+    numbers = [
+        Expected("reward", answer.reward, (N,), "float64"),
+        Expected("terminated", answer.terminated, (N,), "bool"),
+        Expected("truncated", answer.truncated, (N,), "bool"),
+    ]
+    return wrong_observation(answer.obs, spec.observation, (N,), axes) or wrong_arrays(numbers, axes)
