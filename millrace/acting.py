@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from learner.policy_player import saved_policy
 from millrace.arguments import checked
-from protocol.array_checks import wrong_values
 from protocol.arrays import Array, Bools, Floats
 from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError, check_at_least
@@ -26,6 +25,7 @@ from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
+from protocol.rows.array_checks import wrong_values
 from protocol.specs import Leaf, PolicySpec
 
 Observation: TypeAlias = Any

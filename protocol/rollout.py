@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.arrays import Array, Bools, Floats
 from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
 from protocol.policy.masks import no_choice, not_allowed
+from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from protocol.array_checks import wrong_values
 from protocol.arrays import Array
 from protocol.bounds import one_line
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, stored_actions_of
 from protocol.errors import UsageError, first_line
 from protocol.rollout import Batch
+from protocol.rows.array_checks import wrong_values
 from protocol.specs import PolicySpec
 
 NO_LANE = -1  # `Batch.lane` of prior data

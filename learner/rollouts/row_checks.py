@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows
+from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.specs import PolicySpec
 
 

@@ -41,8 +41,8 @@ from protocol.messages import (
     ToLearner,
     WorkerExit,
 )
+from protocol.rows.stepped import wrong_rows
 from protocol.specs import StepSpec
-from protocol.stepped import wrong_rows
 from protocol.wire.plain_values import unpack
 
 MakeOrder = Callable[[int, int, LaneIncarnation], Order]

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.array_checks import wrong_values
 from protocol.arrays import Array
+from protocol.rows.array_checks import wrong_values
 from protocol.specs import Leaf
 from workers.copies.env_errors import environment_failed
 

@@ -37,8 +37,8 @@ from protocol.messages import (
     Weights,
 )
 from protocol.rollout import validate
+from protocol.rows.stepped import wrong_rows
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from protocol.stepped import wrong_rows
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds

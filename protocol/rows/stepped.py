@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from protocol.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.messages import Stepped
+from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
 from protocol.specs import StepSpec
 
 

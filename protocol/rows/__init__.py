@@ -1,0 +1,1 @@
+"""What the arrays of rows must be."""
