@@ -24,7 +24,7 @@ from protocol.bounds import (
     Stages,
     Text,
     Tickets,
-    Version,
+    Versions,
     Whole,
 )
 from protocol.message_base import Message
@@ -80,7 +80,7 @@ class Rejoin(Message, frozen=True):
 
 
 class Weights(Message, frozen=True):
-    """The newest weights. They carry no session, so that one encoding serves all workers."""
+    """Weights that an order names. They carry no session, so that one encoding serves all workers."""
 
     version: Natural
     parameters: Array
@@ -100,6 +100,8 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     ticket: Natural
     lane: Natural
     incarnation: Natural
+    sequence: Natural
+    """number of the rollout: they are collected in this order, from 0 in every incarnation"""
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
@@ -114,7 +116,7 @@ class Received(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Collect(Message, frozen=True):
-    """Permission for one rollout on each of these lanes, under weights at least as new as `version`."""
+    """Permission for one rollout on each of these lanes, under weights of this version."""
 
     session: Natural
     version: Natural
@@ -143,8 +145,8 @@ class Heartbeat(Message, frozen=True):
     session: Natural
     replies: Natural
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost"""
-    version: Version
-    """version of the newest weights held; -1 before the first"""
+    versions: Versions
+    """versions of the weights held: the newest that has come, and those that unfinished tickets name"""
     tickets: Tickets
     """tickets that are held and not finished"""
     steps: Natural

@@ -1,7 +1,7 @@
 """Runs a session: connects it with the link, the collector or stepper, and signals. All decisions are the session's.
 
 Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
-while it works and acts under the newest weights that it holds. Every failure of the environment is reported to the learner.
+while it works. Every failure of the environment is reported to the learner.
 A connection that only looks open is given up for another.
 In a vector environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
 """

@@ -40,9 +40,10 @@ class RolloutService:
     def publish(
         self, version: int, parameters: Floats, buffers: Floats, *, deal: bool = True, env_attributes: Array | None = None
     ) -> None:
-        """Send new weights to all workers and deal the tickets that they allow. The arrays must not change afterwards.
+        """Set the newest weights. The arrays must not change afterwards.
 
-        `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first. `env_attributes`:
+        `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first,
+        or because others may follow. `env_attributes`:
         attributes that each env copy gets before its next rollout, packed. Raises `RunError` if a parameter is too large for
         the dtype in which weights are sent.
         """
@@ -124,7 +125,6 @@ def rollout_service(
     ledger, incarnations = (None, ()) if past is None else past
     coordinator = TicketCoordinator(
         run,
-        rollouts_per_update=config.lanes,
         max_lag=config.max_lag,
         worker_timeout_s=config.worker_timeout_s,
         first_session=int.from_bytes(os.urandom(6), "little"),

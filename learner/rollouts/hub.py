@@ -146,15 +146,17 @@ class Hub:
     def publish(
         self, version: int, parameters: Array, buffers: Array, *, deal: bool = True, env_attributes: Array | None = None
     ) -> None:
-        """Broadcast new weights and deal the tickets that they allow. The arrays must not change afterwards.
+        """Set the newest weights. The arrays must not change afterwards.
 
-        `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first.
+        `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first.
         Raises `RunError` if a parameter is too large for `weights_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
         self._time.learned(self._clock())
         self._weight_age.published(version, self._clock())
-        self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal, env_attributes=env_attributes))
+        self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes)
+        if deal:
+            self._server.send(self.coordinator.begin_update())
 
     def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.
@@ -166,10 +168,10 @@ class Hub:
         steps = self._worker_steps()
         self._time.turn("gathering", started_s)
         self._stall_watch.begin(started_s)
+        self._server.send(self.coordinator.begin_update())
         self._turn(0.0)
         while True:
             taken = self.coordinator.take()
-            self._server.send(self.coordinator.deal())
             if taken is not None:
                 self._time.turn("learning", self._clock())
                 self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
@@ -177,7 +179,7 @@ class Hub:
                 return taken
             self._turn(POLL_S)
             now = self._clock()
-            if not self._goes_on(now, len(self.coordinator.ready)):
+            if not self._goes_on(now, self.coordinator.rollouts_waiting()):
                 stall_timeout_s = self.settings.stall_timeout_s
                 raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting(now)}")
             if now - started_s >= LONG_S:
@@ -322,9 +324,9 @@ class Hub:
             why = f"worker {name_for_people(peer)}: rollout of ticket {message.ticket}: {error}"
             self._server.warn_limited(peer, why)
             return self.coordinator.reject_rollout(peer, message, why, now)
-        ready = len(self.coordinator.ready)
+        waiting = self.coordinator.rollouts_waiting()
         out = self.coordinator.receive(peer, message, now)
-        if len(self.coordinator.ready) > ready:  # of a ticket that this worker held
+        if self.coordinator.rollouts_waiting() > waiting:  # of a ticket that this worker held
             self._weight_age.arrived(name_for_people(peer), message.version, now)
             self._failures.collected(message.lane)
         return out

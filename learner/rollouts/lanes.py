@@ -1,4 +1,4 @@
-"""The coordinator's records of lanes, tickets and accepted rollouts, and the order in which lanes get tickets. Pure.
+"""The coordinator's records of lanes, tickets and accepted rollouts. Pure.
 
 Rule: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
 from 0 again.
@@ -6,8 +6,6 @@ from 0 again.
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from learner.members.lane_placement import PlacedLane
@@ -18,10 +16,10 @@ from protocol.rollout import Rollout
 class TicketedLane(PlacedLane):
     """A lane on which workers collect rollouts."""
 
-    progress: int = 0
-    """Number of tickets used or outstanding."""
-    started: bool = False
-    """Whether a ticket of this incarnation was dealt."""
+    due: list[int] = field(default_factory=list)
+    """Open rounds without a ticket, in order."""
+    dealt: int = 0
+    """Number of tickets of this incarnation that were dealt: the sequence number of the next rollout."""
     outstanding: set[int] = field(default_factory=set)
     """Tickets that the lane's worker holds."""
     next_sequence: int = 0
@@ -39,14 +37,17 @@ class TicketedLane(PlacedLane):
     def restart(self) -> None:
         """The lane left its worker. Its incarnation rises only if a ticket of this one was dealt."""
         super().restart()
-        if self.started:
+        if self.dealt:
             self.incarnation += 1
-            self.started, self.next_sequence, self.out_of_order = False, 0, set()
+            self.dealt, self.next_sequence, self.out_of_order = 0, 0, set()
 
-    def expects(self, sequence: int) -> bool:
-        """Whether an outstanding rollout can have this sequence number."""
-        end = self.next_sequence + len(self.out_of_order) + len(self.outstanding)
-        return self.next_sequence <= sequence < end and sequence not in self.out_of_order
+    def deal(self, number: int, round_number: int, version: int) -> Ticket:
+        """A ticket for the next rollout, for the lane's owner."""
+        assert self.owner is not None
+        ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner)
+        self.outstanding.add(number)
+        self.dealt += 1
+        return ticket
 
     def use(self, incarnation: int, sequence: int) -> bool:
         """An update uses this rollout. Returns whether it continues the one that was used before it."""
@@ -69,8 +70,11 @@ class Ticket:
     number: int
     lane: int
     incarnation: int
+    sequence: int
+    """Number of its rollout in this incarnation."""
+    round: int
     version: int
-    """Version of the newest weights when the ticket was dealt."""
+    """Version of the weights that act."""
     peer: bytes
 
 
@@ -84,35 +88,3 @@ class AcceptedRollout:
     fresh: bool = True
     """Whether nothing carries over to it from an earlier rollout: it does not continue the one of its lane that was used
     last, because the lane was started anew, the learner was, or a rollout between the two was dropped or comes later."""
-
-
-class LaneQueue:
-    """Selects the lane for the next ticket: the least advanced; in a tie, the one with the lowest number.
-
-    An entry of the heap may be out of date; then the heap also holds a newer one of the same lane.
-    """
-
-    def __init__(self, lanes: Sequence[TicketedLane]) -> None:
-        self._lanes = lanes
-        self._heap = [(lane.progress, lane.number) for lane in lanes]
-        heapq.heapify(self._heap)
-
-    def first(self) -> TicketedLane:
-        """The least advanced lane."""
-        while True:
-            progress, number = self._heap[0]
-            if self._lanes[number].progress == progress:
-                return self._lanes[number]
-            heapq.heappop(self._heap)
-
-    def advance(self, lane: TicketedLane) -> None:
-        """The lane was dealt a ticket."""
-        self._move(lane, 1)
-
-    def set_back(self, lane: TicketedLane) -> None:
-        """Take back one advance: a ticket of the lane was lost, or its rollout was dropped."""
-        self._move(lane, -1)
-
-    def _move(self, lane: TicketedLane, by: int) -> None:
-        lane.progress += by
-        heapq.heappush(self._heap, (lane.progress, lane.number))

@@ -1,32 +1,31 @@
 """The learner's half of the conversation. Pure: messages and `now` in, messages out; no socket, clock, thread or torch.
 
-Rule: a ticket is the permission for one rollout on one lane, and is dealt to the least advanced lane while
+Rule: a ticket is the permission for one rollout: of this lane, in this round, under this version. `rounds.py` says which
+rounds are open, and each lane gets a ticket for every one of them. A lane has one owner at a time and moves only between
+rollouts. Its new owner starts it afresh: its incarnation rises. When a worker is lost, its lanes go to other workers, and
+the rounds of its tickets are dealt again. There is no other failure handling. Weights are sent to a worker after the first
+order that names them. If a Heartbeat shows that a message was lost on the way, the message is sent again. Every ticket and
+every transition is counted in the ledger.
 
-    used + outstanding < rollouts_per_update * (version + 1 + max_lag)
-
-`used` and `version` are counted from the first version that this learner publishes, because a resumed run may have other
-lanes. A lane has one owner at a time and moves only between rollouts. Its new owner starts it afresh: its incarnation rises.
-When a worker is lost, its lanes go to other workers, and new tickets are dealt in place of its tickets. There is no other
-failure handling. If a Heartbeat shows that a message was lost on the way, the message is sent again. Every ticket and every
-transition is counted in the ledger.
-
-An evaluation belongs to one version: while it is pending, no ticket for a rollout is dealt, and no weights are published.
+An evaluation is of the newest version: while it is pending, no ticket for a rollout is dealt, and no weights are published.
 """
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import msgspec
 
-from learner.members.events import EnvironmentRaised, Event, PolicyRaised, RolloutDropped
+from learner.members.events import EnvironmentRaised, Event, PolicyRaised
 from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
 from learner.rollouts.evaluation_tickets import EvaluationPlan, EvaluationTickets, OnRows, PlayedEpisode
-from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
+from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.rounds import Rounds
 from protocol.bounds import one_line
 from protocol.messages import (
     Alive,
@@ -35,6 +34,7 @@ from protocol.messages import (
     Described,
     Drain,
     EpisodeRows,
+    Evaluate,
     Evaluated,
     Failure,
     Goodbye,
@@ -62,18 +62,15 @@ STRIKES = 3  # rollouts or messages that could not be used, after which a worker
 class CollectingMember(Member):
     """A worker as the learner of a run sees it."""
 
-    acknowledged: int = -1
-    """Newest version that the worker is known to have."""
-    sending: int | None = None
-    """Version of the weights that were sent and are not acknowledged."""
-    sending_since: int = 0
-    """Value of `replies` when those weights were sent."""
+    versions: dict[int, int] = field(default_factory=dict)
+    """Versions of the weights that were sent to the worker; for each, the value of `replies` when it was sent last."""
     strikes: int = 0
     """Number of the worker's rollouts and messages that could not be used."""
 
     def status(self, now: float) -> WorkerStatus:
         """The worker's row of `millrace status`."""
-        return msgspec.structs.replace(super().status(now), version=self.acknowledged, strikes=self.strikes)
+        held = () if self.heartbeat is None else self.heartbeat.versions
+        return msgspec.structs.replace(super().status(now), version=max(held, default=-1), strikes=self.strikes)
 
 
 class TicketCoordinator:
@@ -83,7 +80,6 @@ class TicketCoordinator:
         self,
         run: RunSpec,
         *,
-        rollouts_per_update: int,
         max_lag: int,
         worker_timeout_s: float,
         first_session: int,
@@ -96,8 +92,6 @@ class TicketCoordinator:
         `incarnations`: the first of each lane; there may be more or fewer of them than lanes.
         """
         self.run = run
-        self.rollouts_per_update = rollouts_per_update
-        self.max_lag = max_lag
         self.ledger = ledger or Ledger()
         self.version = version
         self.worker_timeout_s = worker_timeout_s
@@ -107,15 +101,15 @@ class TicketCoordinator:
         self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(run.lanes)]
         self._absent = list(incarnations[run.lanes :])  # incarnations of lanes that the run had, and may have again
         self.tickets: dict[int, Ticket] = {}
-        self.ready: list[AcceptedRollout] = []
+        self.ready: dict[int, dict[int, AcceptedRollout]] = {}
+        """the rollouts that have come and were not taken, by round and by lane"""
         self.evaluation = EvaluationTickets(run.policy, len(run.facts))
         self.max_env_copies = 0
         """most env copies on all workers, with those of evaluations; 0: no limit"""
-        self._held_back = False  # whether to deal no ticket for a rollout, because an evaluation is about to begin
-        self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
-        self._oldest_ready = version  # no rollout that is ready is older
-        self._weights: Weights | None = None
-        self._first_version, self._used_before = 0, 0  # the first version published, and the tickets used before it
+        self._placement = LanePlacement(self.lanes, _by_joining)
+        self._rounds = Rounds(max_lag)
+        self._to_deal = set[int]()  # lanes with rounds that are to be dealt
+        self._weights: dict[int, Weights] = {}  # by version: the newest, and those that act in open rounds
 
     @property
     def members(self) -> dict[bytes, CollectingMember]:
@@ -183,9 +177,8 @@ class TicketCoordinator:
             return [(peer, Rejoin(rollout.session))]
         out = self._strike(member, why, now)
         if rollout.ticket in member.tickets:
-            lane = self.lanes[self.tickets[rollout.ticket].lane]
-            if lane.expects(rollout.sequence):
-                lane.arrived(rollout.sequence)
+            ticket = self.tickets[rollout.ticket]
+            self.lanes[ticket.lane].arrived(ticket.sequence)  # so that its worker drops it
             self._lose(member, rollout.ticket)
         return out + self._deal()
 
@@ -214,32 +207,30 @@ class TicketCoordinator:
 
     # ---------------------------------------------------------------- the learner's side
 
-    def publish(
-        self, version: int, parameters: Array, buffers: Array, *, deal: bool = True, env_attributes: Array | None = None
-    ) -> list[Outgoing]:
-        """Set the newest weights. Send them to the workers that can take them now; deal the tickets that they allow.
-
-        `deal` False: deal none before `deal` is called, because these weights are evaluated first.
-        """
+    def publish(self, version: int, parameters: Array, buffers: Array, *, env_attributes: Array | None = None) -> None:
+        """Set the newest weights. Orders name them from now on: call `begin_update`, or `begin_evaluation`."""
         assert not self.evaluation.pending, "an evaluation is pending"
-        self._held_back = not deal
-        if self._weights is None:
-            self._first_version, self._used_before = version, self.ledger.used
         self.version = version
-        self._weights = Weights(version, parameters, buffers, env_attributes)
-        out = [out for member in self.membership.active() for out in self._send_newest_weights(member)]
-        return out + self._deal()
+        self._weights[version] = Weights(version, parameters, buffers, env_attributes)
+        self._weights = {v: each for v, each in self._weights.items() if v == version or self._rounds.acts(v)}
+
+    def begin_update(self) -> list[Outgoing]:
+        """The next update begins, unless it has begun, with the newest weights: deal the rounds that it opens."""
+        for number in self._rounds.begin(self.version):
+            for lane in self.lanes:
+                lane.due.append(number)
+        self._to_deal |= {lane.number for lane in self.lanes if lane.due}
+        return self._deal()
 
     def take(self) -> list[AcceptedRollout] | None:
-        """The rollouts of the next update, in lane order, or None while there are too few. Stale ones are dropped."""
-        if self.version - self._oldest_ready > self.max_lag:
-            self._drop_stale()
-        if len(self.ready) < self.rollouts_per_update:
+        """The rollouts of the next update, in lane order, or None while there are too few."""
+        if len(self.ready.get(self._rounds.next, ())) < len(self.lanes):
             return None
-        taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
+        taken = [rollout for _, rollout in sorted(self.ready.pop(self._rounds.next).items())]
+        self._rounds.end()
         self.ledger.used += len(taken)
         self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
-        return [self._marked(arrived) for arrived in sorted(taken, key=lambda each: each.rollout.lane)]
+        return [self._marked(arrived) for arrived in taken]
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """Count rollouts that `take` returned as lost: no update was made of them."""
@@ -248,11 +239,6 @@ class TicketCoordinator:
         env_steps = sum(arrived.rollout.env_steps for arrived in taken)
         self.ledger.transitions_used -= env_steps
         self.ledger.transitions_late += env_steps
-
-    def deal(self) -> list[Outgoing]:
-        """Deal the tickets that may be dealt, as after stale rollouts were dropped, or after an evaluation."""
-        self._held_back = False
-        return self._deal()
 
     def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None) -> list[Outgoing]:
         """Begin to evaluate the newest weights. `self.evaluation` says when it is done."""
@@ -263,13 +249,17 @@ class TicketCoordinator:
         """End the evaluation, also one that is not done. Returns its episodes, in the order of their seeds."""
         return self.evaluation.end()
 
+    def rollouts_waiting(self) -> int:
+        """Number of rollouts that have come and were not taken."""
+        return sum(map(len, self.ready.values()))
+
     def drain(self, reason: str) -> list[Outgoing]:
         """Ask every worker to leave; deal no more tickets."""
         return self.membership.drain(reason)
 
     def incarnations(self) -> list[int]:
         """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
-        return [*(lane.incarnation + lane.started for lane in self.lanes), *self._absent]
+        return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
 
     # ---------------------------------------------------------------- inside
 
@@ -283,7 +273,7 @@ class TicketCoordinator:
         if member is None:
             return welcome
         self._placement.joined()
-        return welcome + self._send_newest_weights(member) + self._deal()
+        return welcome + self._deal()
 
     def _strike(self, member: CollectingMember, why: str, now: float) -> list[Outgoing]:
         """Count something that could not be used; after too many the worker is refused."""
@@ -295,31 +285,17 @@ class TicketCoordinator:
         """After an answer of an evaluation was taken; `why` it could not be used, if so."""
         return (self._strike(member, why, now) if why else []) + self._deal()
 
-    def _drop_stale(self) -> None:
-        stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version > self.max_lag]
-        self.ready = [arrived for arrived in self.ready if self.version - arrived.rollout.version <= self.max_lag]
-        self._oldest_ready = min((arrived.rollout.version for arrived in self.ready), default=self.version)
-        for rollout in stale:
-            self.ledger.stale += 1
-            self.ledger.transitions_stale += rollout.env_steps
-            self._queue.set_back(self.lanes[rollout.lane])
-            self.events.append(RolloutDropped(rollout.lane, self.version - rollout.version, rollout.env_steps))
-
     def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
-        self._acknowledge(member, min(rollout.version, self.version))
         ticket = self.tickets.get(rollout.ticket)
         if ticket is None:
             self.ledger.transitions_duplicate += rollout.env_steps
-            return self._send_newest_weights(member)
-        if (
-            ticket.peer != member.peer
-            or ticket.lane != rollout.lane
-            or not ticket.version <= rollout.version <= self.version
-            or not self.lanes[ticket.lane].expects(rollout.sequence)
-        ):
+            return []
+        expected = ticket.peer, ticket.lane, ticket.version, ticket.sequence
+        if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:
             self.ledger.transitions_received -= rollout.env_steps  # `reject_rollout` counts it
-            why = f"ticket {ticket.number}: expected lane {ticket.lane} under version {ticket.version} or newer, "
-            why += f"got lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
+            expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
+            got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
+            why = f"ticket {ticket.number}: expected {expects}, got {got}"
             return self.reject_rollout(member.peer, rollout, why, member.heard_s)
         del self.tickets[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
@@ -327,9 +303,8 @@ class TicketCoordinator:
         lane.arrived(rollout.sequence)
         self._placement.ticket_ended(member)
         member.stepped = True
-        self.ready.append(AcceptedRollout(rollout, ticket.incarnation))
-        self._oldest_ready = min(self._oldest_ready, rollout.version)
-        return self._send_newest_weights(member) + self._deal()
+        self.ready.setdefault(ticket.round, {})[lane.number] = AcceptedRollout(rollout, ticket.incarnation)
+        return self._deal()
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         """Answer a heartbeat. If it shows that messages were lost on the way, send them again."""
@@ -338,45 +313,47 @@ class TicketCoordinator:
         peer = member.peer
         if member.state is MemberState.DRAINING:
             return [(peer, Drain(one_line(self.membership.draining or "")))]
-        self._acknowledge(member, min(heartbeat.version, self.version))
-        seen = min(heartbeat.replies, member.replies)
-        if member.sending is not None and seen > member.sending_since:
-            member.sending = None
-        out = self._send_newest_weights(member)
+        out = self._lost_weights(member, heartbeat)
         out += self._collect(member, lost)
-        out += self.evaluation.send_again(member, heartbeat)
+        out += self._with_weights(self.evaluation.send_again(member, heartbeat))
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()
 
-    def _acknowledge(self, member: CollectingMember, version: int) -> None:
-        member.acknowledged = max(member.acknowledged, version)
-        if member.sending is not None and version >= member.sending:
-            member.sending = None
+    def _lost_weights(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
+        """The weights that this worker's tickets name and that were lost on the way, as its heartbeat shows."""
+        named = {self.tickets[number].version for number in heartbeat.tickets if number in member.tickets}
+        if member.peer in self.evaluation.holders:
+            named.add(self.version)
+        lost = [v for v in sorted(named - {*heartbeat.versions}) if member.versions.get(v, -1) < heartbeat.replies]
+        member.versions |= dict.fromkeys(lost, member.replies)
+        return [(member.peer, self._weights[version]) for version in lost]
 
-    def _send_newest_weights(self, member: CollectingMember) -> list[Outgoing]:
-        """The newest weights, unless the worker has them or older ones are still on their way."""
-        newest = self._weights
-        if newest is None or member.sending is not None or member.acknowledged >= newest.version:
-            return []
-        if member.state is not MemberState.ACTIVE:
-            return []
-        member.sending, member.sending_since = newest.version, member.replies
-        return [(member.peer, newest)]
+    def _with_weights(self, orders: list[Outgoing]) -> list[Outgoing]:
+        """These messages; after each order that names a version that its worker does not hold, these weights."""
+        out: list[Outgoing] = []
+        for peer, message in orders:
+            out.append((peer, message))
+            member = self.members[peer]
+            if isinstance(message, Collect | Evaluate) and message.version not in member.versions:
+                out.append((peer, self._weights[message.version]))
+                needed = {version: sent_at for version, sent_at in member.versions.items() if version in self._weights}
+                member.versions = needed | {message.version: member.replies}
+        return out
 
     def _received(self, lanes: set[int]) -> tuple[Received, ...]:
         mine = [self.lanes[number] for number in lanes]
         return tuple(Received(lane.number, lane.incarnation, lane.next_sequence, tuple(lane.out_of_order)) for lane in mine)
 
     def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Outgoing]:
-        """Collect messages for these outstanding tickets: one for each version that they were dealt under."""
+        """Collect messages for these outstanding tickets: one for each version that they name."""
         out: list[Outgoing] = []
         for version in sorted({self.tickets[number].version for number in tickets}):
             chosen = [self.tickets[number] for number in tickets if self.tickets[number].version == version]
-            permits = tuple(Permit(ticket.number, ticket.lane, ticket.incarnation) for ticket in chosen)
+            permits = tuple(Permit(each.number, each.lane, each.incarnation, each.sequence) for each in chosen)
             member.tickets |= {ticket.number: member.replies for ticket in chosen}
             out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
-        return out
+        return self._with_weights(out)
 
     def _removed(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
@@ -390,34 +367,29 @@ class TicketCoordinator:
         del member.tickets[number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(number)
-        self._queue.set_back(lane)
+        insort(lane.due, ticket.round)
+        self._to_deal.add(lane.number)
         self._placement.ticket_ended(member)
         self.ledger.lost += 1
 
     def _deal(self) -> list[Outgoing]:
-        """Give lanes without an owner to workers, balance the lanes, and deal tickets to the least advanced lanes."""
-        if self._weights is None or self.membership.draining is not None or not self.members:
+        """Give lanes without an owner to workers, balance the lanes, and deal the tickets of open rounds."""
+        if not self._weights or self.membership.draining is not None or not self.members:
             return []
         out = self._placement.place(self.members.values())
         if self.evaluation.pending:
-            return out + self.evaluation.deal(self._evaluators())
-        if self._held_back:
-            return out
-        allowed = self.rollouts_per_update * (self.version - self._first_version + 1 + self.max_lag)
-        room = allowed - (self.ledger.used - self._used_before) - self.ledger.outstanding
+            return out + self._with_weights(self.evaluation.deal(self._evaluators()))
         dealt: dict[bytes, list[int]] = {}
-        while room > 0:
-            lane = self._queue.first()
+        for lane in [self.lanes[number] for number in sorted(self._to_deal)]:
             if lane.owner is None or lane.moving:
-                break  # the least advanced lane comes first: in a synchronous run no other may take its place
-            number = self.ledger.issued
-            self.tickets[number] = Ticket(number, lane.number, lane.incarnation, self.version, lane.owner)
-            lane.outstanding.add(number)
-            self._queue.advance(lane)
-            lane.started = True
-            dealt.setdefault(lane.owner, []).append(number)
-            self.ledger.issued += 1
-            room -= 1
+                continue
+            for round_number in lane.due:
+                ticket = lane.deal(self.ledger.issued, round_number, self._rounds.version(round_number))
+                self.tickets[ticket.number] = ticket
+                dealt.setdefault(lane.owner, []).append(ticket.number)
+                self.ledger.issued += 1
+            lane.due.clear()
+            self._to_deal.remove(lane.number)
         for peer, numbers in dealt.items():
             out += self._collect(self.members[peer], numbers)
         return out

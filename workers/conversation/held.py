@@ -12,9 +12,9 @@ the answer was lost. How long it is kept bounds the memory of a worker:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from protocol.messages import Answer, Evaluate, Evaluated, LaneIncarnation, Order, Permit, Received, Rollout
 
@@ -47,13 +47,18 @@ class Held(Generic[Asked, Answered]):
 
 
 class HeldEvaluations(Held[Evaluate, Evaluated]):
-    """Evaluations. They belong to no lane, and each is executed under exactly the version that it names."""
+    """Evaluations. They belong to no lane."""
 
-    def next(self, version: int) -> Evaluate | None:
-        """The oldest of this version, which is that of the weights held. Those of older versions are dropped."""
-        self.asked = {ticket: order for ticket, order in self.asked.items() if order.version >= version}
-        due = [ticket for ticket, order in self.asked.items() if order.version == version]
+    def next(self, versions: Collection[int]) -> Evaluate | None:
+        """The oldest of those whose weights are held. Those of a version that is not the newest held are over: dropped."""
+        newest = max(versions, default=-1)
+        self.asked = {ticket: order for ticket, order in self.asked.items() if order.version >= newest}
+        due = [ticket for ticket, order in self.asked.items() if order.version == newest]
         return self.asked[min(due)] if due else None
+
+    def versions(self) -> set[int]:
+        """The versions that are asked for."""
+        return {order.version for order in self.asked.values()}
 
     def keep(self, answer: Evaluated) -> bool:
         """Keep a result, unless rows belong to it; False if it is no longer asked for."""
@@ -124,9 +129,17 @@ class Assignment:
     sequence: int
 
 
+class Permitted(NamedTuple):
+    """A rollout that may be collected."""
+
+    sequence: int
+    version: int
+    """of the weights to act under"""
+
+
 @dataclass
-class RolloutLane(_HeldLane[int, Rollout]):
-    """A ticket asks for a rollout; what is held of it is the lowest version to collect it under."""
+class RolloutLane(_HeldLane[Permitted, Rollout]):
+    """A ticket asks for a rollout. They are collected in the order of their sequence."""
 
     sequence: int = 0  # of the next rollout
     finished: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_TICKETS))
@@ -144,20 +157,29 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
     _kind = RolloutLane
 
     def take(self, permit: Permit, version: int) -> Rollout | None:
-        """Take a ticket to collect under this version or a later one. Returns a rollout to send again, if any."""
+        """Take a ticket to collect under this version. Returns a rollout to send again, if any."""
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or permit.ticket in lane.finished:
             return None
-        return lane.take(permit.ticket, version)
+        return lane.take(permit.ticket, Permitted(permit.sequence, version))
 
-    def startable(self, version: int) -> tuple[Assignment, ...]:
-        """The oldest ticket of each lane that may be collected under this version, in the order of the lanes."""
-        assignments = []
+    def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
+        """The next rollouts of the lanes whose weights are held: the lowest version of them, and those under it.
+
+        They are in the order of the lanes. If nothing can be collected, there are none.
+        """
+        startable: dict[int, list[Assignment]] = {}
         for number, lane in sorted(self._lanes.items()):
-            startable = [ticket for ticket, lowest in lane.asked.items() if lowest <= version]
-            if startable:
-                assignments.append(Assignment(min(startable), number, lane.incarnation, lane.sequence))
-        return tuple(assignments)
+            for ticket, (sequence, version) in lane.asked.items():
+                if sequence == lane.sequence and version in versions:
+                    assignment = Assignment(ticket, number, lane.incarnation, sequence)
+                    startable.setdefault(version, []).append(assignment)
+        version = min(startable, default=-1)
+        return version, tuple(startable.get(version, ()))
+
+    def versions(self) -> set[int]:
+        """The versions that are asked for."""
+        return {permitted.version for lane in self._lanes.values() for permitted in lane.asked.values()}
 
     def forget_received(self, received: Sequence[Received]) -> None:
         """Drop the rollouts that the learner has received."""

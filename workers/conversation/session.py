@@ -1,8 +1,8 @@
 """The worker's half of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
-Rule: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
-because the next Heartbeat lists all tickets that this worker holds, and the learner sends again what is missing. What a
-worker holds is in `held.py`.
+Rule: a rollout and an evaluation start only under the weights that they name. A message that is lost does no harm, because
+the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends again what is missing. What a
+worker holds is in `held.py`; of weights, it holds the newest and those that unfinished tickets name.
 """
 
 from __future__ import annotations
@@ -160,15 +160,9 @@ class _SessionState:
     evaluations: HeldEvaluations = field(default_factory=HeldEvaluations)
     orders: HeldOrders = field(default_factory=HeldOrders)
     described: Described | None = None  # sent with every Heartbeat, because one may be lost
-    weights: Weights | None = None
+    weights: dict[int, Weights] = field(default_factory=dict)  # by version
     in_progress: bool = False  # whether a piece of work is
     replies: int = 0  # number of the last HeartbeatReply
-    acknowledged_version: int = -1  # newest version that a message of this worker has named
-
-    @property
-    def version(self) -> int:
-        """Version of the weights; -1 before the first."""
-        return -1 if self.weights is None else self.weights.version
 
     def unfinished(self) -> tuple[int, ...]:
         """Tickets that are not yet collected or executed: as many as a message may name."""
@@ -179,13 +173,16 @@ class _SessionState:
         return (*self.rollouts.lanes(), *self.orders.lanes())
 
     def next_work(self, session: int) -> Work | None:
-        """The next piece of work: an evaluation of the weights held, else rollouts to collect together, else an order."""
-        if self.weights is not None:
-            if (evaluation := self.evaluations.next(self.version)) is not None:
-                return EvaluationTask(self.weights, evaluation)
-            if assignments := self.rollouts.startable(self.version):
-                return Task(session, self.weights, assignments)
-        return self.orders.next()
+        """The next piece of work: an evaluation, else rollouts to collect together, else an order."""
+        if (evaluation := self.evaluations.next(self.weights)) is not None:
+            return EvaluationTask(self.weights[evaluation.version], evaluation)
+        version, assignments = self.rollouts.startable(self.weights)
+        return Task(session, self.weights[version], assignments) if assignments else self.orders.next()
+
+    def drop_weights(self) -> None:
+        """Drop the weights that are neither the newest nor asked for."""
+        asked = {*self.rollouts.versions(), *self.evaluations.versions(), max(self.weights, default=-1)}
+        self.weights = {version: weights for version, weights in self.weights.items() if version in asked}
 
     def keep(self, answer: Rollout | Evaluated | Answer) -> bool:
         """Keep what work has led to; False if it is no longer wanted, for example because its lane was released."""
@@ -199,6 +196,7 @@ class _SessionState:
     def release(self, lanes: Sequence[LaneIncarnation]) -> list[Effect]:
         """Drop these lanes."""
         released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
+        self.drop_weights()
         return [CloseLanes(released)] if released else []
 
     def release_unlisted(self, received: Sequence[Received]) -> list[Effect]:
@@ -254,8 +252,8 @@ class Session:
         current = self._current
         again: list[Rollout | Evaluated | Answer | None] = []
         match message:
-            case Weights(version) if version > current.version:
-                current.weights = message
+            case Weights(version):
+                current.weights.setdefault(version, message)
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]
@@ -272,7 +270,7 @@ class Session:
         return [Send(answer) for answer in again if answer is not None]
 
     def tick(self, now: float) -> list[Effect]:
-        """Do what is due: Hello, Heartbeat (also to acknowledge new weights), or giving up on a silent learner."""
+        """Do what is due: Hello, Heartbeat, or giving up on a silent learner."""
         match self.state:
             case State.LEFT:
                 return []
@@ -291,18 +289,15 @@ class Session:
 
     def heartbeat_if_due(self, now: float) -> list[Effect]:
         """A Heartbeat, if one is due. It changes nothing else, so it may be sent at any moment."""
-        if self.run is None or self.state not in (State.READY, State.DRAINING):
-            return []
-        if now < self.due_s and self._current.acknowledged_version == self._current.version:
+        if self.run is None or self.state not in (State.READY, State.DRAINING) or now < self.due_s:
             return []
         self.due_s = now + self.run.heartbeat_s
         self._unanswered_s = min(self._unanswered_s, now)
         current, statistics = self._current, self._statistics
-        current.acknowledged_version = current.version
         heartbeat = Heartbeat(
             session=self.session,
             replies=current.replies,
-            version=current.version,
+            versions=tuple(sorted(current.weights)),
             tickets=current.unfinished(),
             steps=statistics.steps,
             stages=dict(statistics.stages),
@@ -358,8 +353,7 @@ class Session:
         current = self._current
         # The session may have ended, or the lane may have been released, in the meantime.
         kept = [each for each in answers if each.session == self.session and current.keep(each)]
-        versions = [each.version for each in kept if isinstance(each, Rollout)]
-        current.acknowledged_version = max([current.acknowledged_version, *versions])
+        current.drop_weights()
         current.in_progress = False
         return [*map(Send, kept), *self._leave_if_drained()]
 

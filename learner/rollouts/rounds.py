@@ -1,0 +1,37 @@
+"""Which weights act in which round. Pure.
+
+Rule: update u takes round u, which is one rollout of every lane. All of them act under one version: the newest one when
+update u - L began, or when the first update began if u < L, where L is `max_lag`. So nobody's speed decides what a run
+computes. Once update u has begun, the rounds up to u + L may be collected.
+"""
+
+from __future__ import annotations
+
+
+class Rounds:
+    """The rounds of one learner, counted from 0."""
+
+    def __init__(self, max_lag: int) -> None:
+        self.next = 0
+        """the round of the next update"""
+        self._max_lag = max_lag
+        self._versions: dict[int, int] = {}  # of each round that may be collected and was not taken
+
+    def begin(self, newest: int) -> range:
+        """The next update begins, while this version is the newest. Returns the rounds that it opens, once."""
+        opened = range(self.next + len(self._versions), self.next + 1 + self._max_lag)
+        self._versions |= dict.fromkeys(opened, newest)
+        return opened
+
+    def end(self) -> None:
+        """The next update has taken its round."""
+        del self._versions[self.next]
+        self.next += 1
+
+    def version(self, number: int) -> int:
+        """The version that acts in this round, which is open."""
+        return self._versions[number]
+
+    def acts(self, version: int) -> bool:
+        """Whether this version acts in a round that is open."""
+        return version in self._versions.values()
