@@ -72,7 +72,7 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     me = psutil.Process()
     run = run_spec(workers)
     link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
-    coordinator = TicketCoordinator(run, rollouts_per_update=workers, max_lag=0, worker_timeout_s=10, first_session=1)
+    coordinator = TicketCoordinator(run, max_lag=0, worker_timeout_s=10, first_session=1)
     hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0))
     parameters = np.zeros(acting_size(POLICY), np.float32)
     buffers = np.zeros(buffer_size(POLICY), np.float32)
@@ -103,7 +103,7 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     received_bytes = link.received.bytes - bytes_before
     growth_mb = _resident_mb(me) - warm_mb
     counts = coordinator.ledger.counts()
-    lost = counts["lost"] + counts["stale"] + sum(counts[f"transitions_{why}"] for why in ("duplicate", "late", "invalid"))
+    lost = counts["lost"] + sum(counts[f"transitions_{why}"] for why in ("duplicate", "late", "invalid"))
     lost += counts["messages_bad"] + abs(counts["issued"] - counts["used"] - counts["outstanding"])
     for _ in range(2):  # so that the weights measured last arrive
         hub.gather()

@@ -50,9 +50,7 @@ def play(max_lag: int, seconds: float) -> Played:
     """What workers and learner do with tickets under this `max_lag`."""
     run = run_spec(LANES)
     rollout = canned(run)
-    coordinator = TicketCoordinator(
-        run, rollouts_per_update=LANES, max_lag=max_lag, worker_timeout_s=1e9, first_session=1, version=0
-    )
+    coordinator = TicketCoordinator(run, max_lag=max_lag, worker_timeout_s=1e9, first_session=1, version=0)
     spans: list[Span] = []
     lags: list[int] = []
     events: list[tuple[float, int]] = []  # when a row's rollout or update ends

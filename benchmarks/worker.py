@@ -52,7 +52,7 @@ def start_one(env: EnvSpec, *, supervised: bool = False) -> tuple[float, float]:
     acting, _ = parameter_layout(run.policy)
     with tempfile.TemporaryDirectory() as folder:
         link = LearnerLink(f"ipc://{folder}/learner")
-        coordinator = TicketCoordinator(run, rollouts_per_update=1, max_lag=0, worker_timeout_s=60, first_session=1)
+        coordinator = TicketCoordinator(run, max_lag=0, worker_timeout_s=60, first_session=1)
         hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()

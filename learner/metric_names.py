@@ -43,20 +43,17 @@ METRICS: dict[str, dict[str, Meaning]] = {
     "Lag": {
         "lag/mean": Meaning(VERSIONS, "Mean lag of the rollouts of the last update."),
         "lag/max": Meaning(VERSIONS, "Largest lag of these rollouts."),
-        "drop/stale": Meaning(TICKETS, "The same as `ledger/stale`."),
     },
     "Tickets and transitions": {
         "ledger/issued": Meaning(TICKETS, "Tickets that were given to workers."),
         "ledger/used": Meaning(TICKETS, "Tickets whose rollout an update used."),
         "ledger/outstanding": Meaning(TICKETS, "Tickets that are neither used nor given up."),
-        "ledger/stale": Meaning(TICKETS, "Tickets whose rollout had a larger lag than `--max-lag`. It was dropped."),
         "ledger/lost": Meaning(
             TICKETS, "Tickets whose worker was lost or left or sent an unusable rollout, or whose update failed."
         ),
         "ledger/transitions_received": Meaning(TRANSITIONS, "Env steps that reached the learner."),
         "ledger/transitions_used": Meaning(TRANSITIONS, "Env steps that updates used."),
         "ledger/transitions_waiting": Meaning(TRANSITIONS, "Env steps that wait for an update."),
-        "ledger/transitions_stale": Meaning(TRANSITIONS, "Env steps of rollouts that were dropped as stale."),
         "ledger/transitions_duplicate": Meaning(TRANSITIONS, "Env steps that arrived a second time. They were dropped."),
         "ledger/transitions_late": Meaning(
             TRANSITIONS, "Env steps from a worker that had been given up, or of an update that failed. They were dropped."

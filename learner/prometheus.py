@@ -45,8 +45,8 @@ SCRAPE_TIMEOUT_S = 5.0  # a scraper that is silent for longer loses its connecti
 LAGS = (0, 1, 2, 4, 8, 16, 32)
 """upper bounds of the histogram's buckets, in versions"""
 STAGES = {"learner": ("wait", "update", "evaluate", "other"), "worker": ("wait", "open", "act", "step", "evaluate")}
-TICKET_ENDS = ("used", "stale", "lost")
-TRANSITION_ENDS = ("used", "stale", "duplicate", "late", "invalid")
+TICKET_ENDS = ("used", "lost")
+TRANSITION_ENDS = ("used", "duplicate", "late", "invalid")
 STATES = ("active", "spare", "draining")
 
 

@@ -325,7 +325,7 @@ class RolloutService:
         write(Path(path), state, arrays)
 
     def ledger(self) -> dict[str, int]:
-        """What became of every ticket and every transition: `used`, `stale`, `lost` and so on.
+        """What became of every ticket and every transition: `used`, `lost` and so on.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:

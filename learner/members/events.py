@@ -94,17 +94,7 @@ class RejoinRequested:
     late: int
 
 
-@dataclass(frozen=True)
-class RolloutDropped:
-    """A rollout was dropped because its weights were older than max_lag allows."""
-
-    json_name: ClassVar[str] = "stale"
-    lane: int
-    lag: int
-    transitions: int
-
-
-Event = WorkerJoined | WorkerLeft | WorkerRefused | Failed | RejoinRequested | RolloutDropped
+Event = WorkerJoined | WorkerLeft | WorkerRefused | Failed | RejoinRequested
 
 
 def describe(event: Event) -> str:
@@ -133,8 +123,6 @@ def _line(event: Event) -> str:
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"
-        case RolloutDropped(lane, lag, transitions):
-            return f"a rollout of lane {lane} was dropped: {lag} versions old, {transitions} transitions"
 
 
 def _dealt_again(tickets: int) -> str:

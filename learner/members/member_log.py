@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from learner.members.events import Event, RejoinRequested, RolloutDropped
+from learner.members.events import Event, RejoinRequested
 from protocol.bounds import MAX_TEXT, one_line
 from protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
 from protocol.wire.learner_link import LearnerLink
@@ -43,9 +43,6 @@ class MemberLog:
         `cause` is the peer whose message caused the event; None if no message did. Requests to join again are limited
         more: after a restart of the learner they come in floods.
         """
-        if isinstance(event, RolloutDropped):
-            log.log(level, "%s", lines, extra={"event": event})
-            return
         source = self._source(cause)
         kept_back: int | None = 0
         if isinstance(event, RejoinRequested):

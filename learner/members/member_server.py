@@ -24,7 +24,6 @@ from learner.members.events import (
     Event,
     PolicyRaised,
     RejoinRequested,
-    RolloutDropped,
     WorkerJoined,
     WorkerLeft,
     WorkerRefused,
@@ -283,7 +282,7 @@ class MemberServer:
 
     def _log_events(self, cause: bytes | None) -> None:
         for event in self._membership.take_events():
-            line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested | RolloutDropped)
+            line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested)
             match event:
                 case WorkerRefused(_, why):
                     self._last_turned_away = f"was refused: {one_line(why)}"

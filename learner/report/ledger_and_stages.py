@@ -8,8 +8,8 @@ from learner.report.charts import COLORS, MINUS
 from learner.report.html_parts import color_dot, section, time_text
 from learner.report.runs import ReportData
 
-TICKETS = ("issued", ("used", "outstanding", "stale", "lost"))
-TRANSITIONS = ("received", ("used", "waiting", "stale", "duplicate", "late", "invalid"))
+TICKETS = ("issued", ("used", "outstanding", "lost"))
+TRANSITIONS = ("received", ("used", "waiting", "duplicate", "late", "invalid"))
 PROCESSES = {"learner": "The learner", "worker": "All workers together"}
 
 

@@ -87,4 +87,4 @@ class AcceptedRollout:
     """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
     fresh: bool = True
     """Whether nothing carries over to it from an earlier rollout: it does not continue the one of its lane that was used
-    last, because the lane was started anew, the learner was, or a rollout between the two was dropped or comes later."""
+    last, because the lane was started anew, the learner was, or the rollout between the two was rejected."""

@@ -1,7 +1,7 @@
 """The ledger: what became of every ticket, and of every transition that reached the learner. Plain counts.
 
-    tickets       issued   = used + outstanding + stale + lost
-    transitions   received = used + waiting + stale + duplicate + late + invalid
+    tickets       issued   = used + outstanding + lost
+    transitions   received = used + waiting + duplicate + late + invalid
 
 Both equations hold at every moment. `outstanding` tickets are with a worker, or their rollouts wait to be used (`waiting`).
 """
@@ -17,14 +17,11 @@ class Ledger(msgspec.Struct, kw_only=True):
     issued: int = 0
     used: int = 0
     """tickets whose rollout an update used"""
-    stale: int = 0
-    """tickets whose rollout was acted under weights older than max_lag allows: it was dropped, and a new ticket dealt"""
     lost: int = 0
     """tickets whose worker was lost, left or sent an unusable rollout (a new ticket was dealt), or whose update failed"""
 
     transitions_received: int = 0
     transitions_used: int = 0
-    transitions_stale: int = 0
     transitions_duplicate: int = 0
     """transitions of rollouts that arrived a second time"""
     transitions_late: int = 0
@@ -40,12 +37,12 @@ class Ledger(msgspec.Struct, kw_only=True):
     @property
     def outstanding(self) -> int:
         """Tickets that are neither used nor given up."""
-        return self.issued - self.used - self.stale - self.lost
+        return self.issued - self.used - self.lost
 
     @property
     def transitions_waiting(self) -> int:
         """Transitions that have arrived and are neither used nor dropped."""
-        dropped = self.transitions_stale + self.transitions_duplicate + self.transitions_late + self.transitions_invalid
+        dropped = self.transitions_duplicate + self.transitions_late + self.transitions_invalid
         return self.transitions_received - self.transitions_used - dropped
 
     def end_outstanding(self) -> None:

@@ -1,7 +1,7 @@
 """The log as JSON, one event per line (`--log-json`).
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
-"left", "turned", "broke", "policy_broke", "died", "told", "stale" (`learner.members.events`, whose fields stand beside
+"left", "turned", "broke", "policy_broke", "died", "told" (`learner.members.events`, whose fields stand beside
 it), "progress", or "said" for any other line of the log.
 """
 

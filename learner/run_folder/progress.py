@@ -124,7 +124,6 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
             ENV_STEPS_KEY: self.env_steps,
             "lag/mean": self.lag_mean,
             "lag/max": self.lag_max,
-            "drop/stale": self.ledger.get("stale", 0),
         }
         row |= fact_metrics("rollout", self.facts)
         row |= {f"ledger/{name}": count for name, count in self.ledger.items()}

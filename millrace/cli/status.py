@@ -30,7 +30,6 @@ from workers.conversation.connection_rules import checked_token
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {
     "lost": "tickets of workers that were lost",
-    "stale": "rollouts too old",
     "transitions_duplicate": "transitions sent twice",
     "transitions_late": "transitions of sessions that had ended",
     "transitions_invalid": "invalid transitions (wrong shape, dtype, value or reset row)",

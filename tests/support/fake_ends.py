@@ -118,11 +118,11 @@ class FakeWorker:
 class World:
     """One learner, some workers, simulated time; checks every rule after every event."""
 
-    def __init__(self, seed: int, faults: Faults, *, workers: int, lanes: int, max_lag: int, per_update: int) -> None:
+    def __init__(self, seed: int, faults: Faults, *, workers: int, lanes: int, max_lag: int) -> None:
         self.random = random.Random(seed)
         self.faults = faults
         self.run = run_spec(lanes)
-        self.max_lag, self.per_update = max_lag, per_update
+        self.max_lag = max_lag
         self.now = 0.0
         self.lives = itertools.count(1)
         self.order = itertools.count()
@@ -266,7 +266,6 @@ class World:
         self.plan = None
         coordinator = TicketCoordinator(
             self.run,
-            rollouts_per_update=self.per_update,
             max_lag=self.max_lag,
             worker_timeout_s=3.0,
             first_session=self.random.getrandbits(48),
@@ -274,7 +273,9 @@ class World:
             incarnations=incarnations,
         )
         self.coordinator = coordinator
-        self.to_workers(coordinator.publish(version, PARAMETERS, BUFFERS))
+        coordinator.publish(version, PARAMETERS, BUFFERS)
+        self.first = version
+        self.to_workers(coordinator.begin_update())
         return coordinator
 
     def restart_learner(self) -> None:
@@ -289,18 +290,16 @@ class World:
         """Take a batch if there is one; publish new weights a little later."""
         if self.updating or self._evaluating():
             return
+        self.to_workers(self.coordinator.begin_update())
         taken = self.coordinator.take()
-        self.to_workers(self.coordinator.deal())
         if taken is None:
             return
-        assert len(taken) == self.per_update
         rollouts = [arrived.rollout for arrived in taken]
+        assert [rollout.lane for rollout in rollouts] == list(range(self.run.lanes))
         for rollout in rollouts:
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
-            assert 0 <= self.coordinator.version - rollout.version <= self.max_lag
-        if self.max_lag == 0 and self.per_update == self.run.lanes:
-            assert sorted(rollout.lane for rollout in rollouts) == list(range(self.run.lanes))
+            assert rollout.version == max(self.first, self.coordinator.version - self.max_lag)
         self.updating = True
         coordinator = self.coordinator
 
@@ -310,7 +309,7 @@ class World:
             self.updates += 1
             self.updating = False
             evaluates = self.random.random() < self.faults.evaluations
-            self.to_workers(coordinator.publish(self.updates, PARAMETERS, BUFFERS, deal=not evaluates))
+            coordinator.publish(self.updates, PARAMETERS, BUFFERS)
             if evaluates:
                 self._begin_evaluation()
             if self.random.random() < 0.3:
@@ -396,15 +395,14 @@ class World:
 
     def check(self) -> None:
         coordinator, ledger = self.coordinator, self.coordinator.ledger
-        in_flight = len(coordinator.tickets) + len(coordinator.ready)
-        assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight, "the ledger does not balance"
-        assert ledger.transitions_waiting == sum(arrived.rollout.env_steps for arrived in coordinator.ready), (
-            "transitions do not balance"
-        )
+        in_flight = len(coordinator.tickets) + coordinator.rollouts_waiting()
+        assert ledger.issued == ledger.used + ledger.lost + in_flight, "the ledger does not balance"
+        assert ledger.transitions_waiting == sum(
+            arrived.rollout.env_steps for of_round in coordinator.ready.values() for arrived in of_round.values()
+        ), "transitions do not balance"
         if self.plan is not None:
             assert ledger.issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
-        bound = self.per_update * (coordinator.version + 1 + self.max_lag)
-        assert ledger.used + in_flight <= bound, "more tickets than the bound allows"
+        assert in_flight <= self.run.lanes * (1 + self.max_lag), "more tickets than the bound allows"
         for lane in coordinator.lanes:
             owners = [member for member in coordinator.members.values() if lane.number in member.lanes]
             assert len(owners) == (lane.owner is not None), "a lane has two owners"
@@ -415,4 +413,4 @@ class World:
         if self.epoch == 0:
             for worker in self.workers.values():
                 holds = held_count(worker.session)
-                assert holds <= self.per_update * (1 + self.max_lag), f"{worker.name!r} holds {holds} rollouts"
+                assert holds <= self.run.lanes * (1 + self.max_lag), f"{worker.name!r} holds {holds} rollouts"

@@ -161,7 +161,7 @@ Say = Callable[[Conversation, int], None]
 def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
     """Lane, ticket, version, sequence and incarnation of each rollout that an update used, in order."""
     link = Conversation()
-    coordinator = TicketCoordinator(RUN, rollouts_per_update=LANES, max_lag=1, worker_timeout_s=3.0, first_session=1)
+    coordinator = TicketCoordinator(RUN, max_lag=1, worker_timeout_s=3.0, first_session=1)
     settings = HubSettings(60.0, 600.0, max_env_failures=0)
     hub = Hub(cast(LearnerLink, link), coordinator, settings, clock=lambda: link.now)
     honest = [Honest(f"w{number}") for number in range(LANES)]

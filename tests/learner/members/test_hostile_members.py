@@ -47,9 +47,7 @@ class Noisy:
 
     def __init__(self, max_env_failures: int = 0) -> None:
         self.link = FakeLink()
-        self.coordinator = TicketCoordinator(
-            run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=5.0, first_session=1
-        )
+        self.coordinator = TicketCoordinator(run_spec(lanes=1), max_lag=0, worker_timeout_s=5.0, first_session=1)
         settings = HubSettings(60.0, 600.0, max_env_failures)
         self.hub = Hub(cast(LearnerLink, self.link), self.coordinator, settings, clock=lambda: self.link.now)
         self.joins("honest")

@@ -29,10 +29,7 @@ def case(seed: int) -> World:
         evaluations=draw.choice([0.0, 0.5]),
         until_s=until_s,
     )
-    per_update = lanes if draw.random() < 0.7 else draw.randint(1, lanes)
-    return World(
-        seed, faults, workers=draw.randint(1, 4), lanes=lanes, max_lag=draw.choice([0, 0, 1, 4]), per_update=per_update
-    )
+    return World(seed, faults, workers=draw.randint(1, 4), lanes=lanes, max_lag=draw.choice([0, 0, 1, 4]))
 
 
 IN_MAKE_TEST = 2  # blocks; `make soak` runs the others
@@ -51,23 +48,23 @@ def test_every_rule_holds_over_a_hostile_network(block: int) -> None:
 
 
 def test_without_faults_nothing_is_lost_or_said_twice() -> None:
-    world = World(1, Faults(until_s=0.0), workers=2, lanes=4, max_lag=0, per_update=4)
+    world = World(1, Faults(until_s=0.0), workers=2, lanes=4, max_lag=0)
     world.play(updates=200)
     counts = world.coordinator.ledger.counts()
-    assert counts["lost"] == counts["stale"] == counts["transitions_duplicate"] == counts["transitions_late"] == 0
+    assert counts["lost"] == counts["transitions_duplicate"] == counts["transitions_late"] == 0
     assert counts["used"] == 4 * 200
 
 
 def test_every_version_can_be_evaluated_although_workers_die_and_messages_are_lost() -> None:
     faults = Faults(loss=0.1, repeat=0.2, deaths=6, freezes=4, late_joiners=2, evaluations=1.0, until_s=20.0)
-    world = World(3, faults, workers=3, lanes=2, max_lag=1, per_update=2)
+    world = World(3, faults, workers=3, lanes=2, max_lag=1)
     world.play(updates=61, limit_s=4000.0)
     assert world.evaluations >= 60  # that of the last update may be pending
 
 
 def test_a_worker_without_a_lane_evaluates_too() -> None:
     """One lane and two workers: with the second as a spare, two orders of 0.2 s take no longer than one."""
-    world = World(3, Faults(evaluations=1.0, until_s=0.0), workers=2, lanes=1, max_lag=0, per_update=1)
+    world = World(3, Faults(evaluations=1.0, until_s=0.0), workers=2, lanes=1, max_lag=0)
     holders = set()
     check = world.check
 
@@ -83,8 +80,8 @@ def test_a_worker_without_a_lane_evaluates_too() -> None:
 
 def test_lost_messages_cost_no_transition() -> None:
     """Loss alone, without a death: every rollout is said again until it arrives."""
-    world = World(5, Faults(loss=0.05, until_s=0.0), workers=2, lanes=4, max_lag=1, per_update=4)
+    world = World(5, Faults(loss=0.05, until_s=0.0), workers=2, lanes=4, max_lag=1)
     world.coordinator.worker_timeout_s = 1e9
     world.play(updates=100, limit_s=4000.0)
     assert world.coordinator.ledger.lost == 0
-    assert world.coordinator.ledger.used == 4 * 100
+    assert world.coordinator.ledger.used == 4 * (100 + world.updating)

@@ -31,9 +31,7 @@ def hub_with_a_worker(
     weights_dtype: WeightsDtype = "float32", processes: ProcessCallbacks | None = None
 ) -> tuple[FakeLink, Hub, Heartbeat]:
     link = FakeLink()
-    coordinator = TicketCoordinator(
-        run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1
-    )
+    coordinator = TicketCoordinator(run_spec(lanes=1), max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
     hub = Hub(
         cast(LearnerLink, link),
         coordinator,

@@ -59,14 +59,12 @@ class Learner:
         self,
         lanes: int = 2,
         max_lag: int = 0,
-        per_update: int | None = None,
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
         publish: bool = True,
     ) -> None:
         self.coordinator = TicketCoordinator(
             run_spec(lanes),
-            rollouts_per_update=lanes if per_update is None else per_update,
             max_lag=max_lag,
             worker_timeout_s=TIMEOUT_S,
             first_session=100,
@@ -78,7 +76,9 @@ class Learner:
             self.publish(0)
 
     def publish(self, version: int) -> list[Outgoing]:
-        return self.balanced(self.coordinator.publish(version, PARAMETERS, BUFFERS))
+        """New weights, with which the next update begins."""
+        self.coordinator.publish(version, PARAMETERS, BUFFERS)
+        return self.balanced(self.coordinator.begin_update())
 
     def says(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
         return self.balanced(self.coordinator.receive(peer, message, self.now))
@@ -97,14 +97,12 @@ class Learner:
     def rollout_of(self, number: int, sequence: int | None = None, version: int | None = None) -> Rollout:
         """The rollout of an outstanding ticket, as its worker would send it."""
         ticket = self.coordinator.tickets[number]
-        lane = self.coordinator.lanes[ticket.lane]
-        expected = lane.next_sequence + sorted(lane.outstanding).index(number)
         return fake_rollout(
             self.session(ticket.peer),
             ticket.lane,
             number,
             ticket.version if version is None else version,
-            expected if sequence is None else sequence,
+            ticket.sequence if sequence is None else sequence,
         )
 
     def delivers(self, number: int) -> list[Outgoing]:
@@ -114,13 +112,27 @@ class Learner:
         for number in self.tickets():
             self.delivers(number)
 
+    def deliver_round(self) -> None:
+        """What the next update still needs."""
+        tickets = self.coordinator.tickets.values()
+        oldest = min(ticket.round for ticket in tickets)
+        for number in [ticket.number for ticket in tickets if ticket.round == oldest]:
+            self.delivers(number)
+
     def beats(
-        self, peer: bytes, *, version: int = 0, tickets: Sequence[int] | None = None, replies: int | None = None
+        self,
+        peer: bytes,
+        *,
+        versions: Sequence[int] | None = None,
+        tickets: Sequence[int] | None = None,
+        replies: int | None = None,
     ) -> list[Outgoing]:
         """A Heartbeat: by default of a worker that lost nothing."""
         held = self.tickets(peer) if tickets is None else tickets
-        seen = self.coordinator.members[peer].replies if replies is None else replies
-        return self.says(peer, Heartbeat(self.session(peer), seen, version, tuple(held), 0, {}, 0))
+        member = self.coordinator.members[peer]
+        seen = member.replies if replies is None else replies
+        weights = sorted(member.versions) if versions is None else versions
+        return self.says(peer, Heartbeat(self.session(peer), seen, tuple(weights), tuple(held), 0, {}, 0))
 
     def take(self) -> list[Rollout]:
         taken = self.coordinator.take()
@@ -135,11 +147,18 @@ class Learner:
         self.publish(self.coordinator.version + 1)
         return taken
 
+    def update_round(self, version: int) -> list[Rollout]:
+        """An update of the oldest round; then this version is published."""
+        self.deliver_round()
+        taken = self.take()
+        self.publish(version)
+        return taken
+
     def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
         coordinator, ledger = self.coordinator, self.coordinator.ledger
-        in_flight = len(coordinator.tickets) + len(coordinator.ready)
-        assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight
-        assert ledger.transitions_waiting == len(coordinator.ready)  # a fake rollout is one transition
+        in_flight = len(coordinator.tickets) + coordinator.rollouts_waiting()
+        assert ledger.issued == ledger.used + ledger.lost + in_flight
+        assert ledger.transitions_waiting == coordinator.rollouts_waiting()  # a fake rollout is one transition
         return outs
 
 
@@ -163,10 +182,10 @@ def lanes_of(learner: Learner, peer: bytes) -> set[int]:
 # -------------------------------------------------------------------- joining
 
 
-def test_hello_is_answered_by_welcome_weights_and_collect_in_this_order() -> None:
+def test_hello_is_answered_by_welcome_collect_and_weights_in_this_order() -> None:
     learner = Learner(lanes=2)
     outs = learner.joins(A)
-    assert kinds(outs, A) == [Welcome, Weights, Collect]
+    assert kinds(outs, A) == [Welcome, Collect, Weights]
     assert of(outs, Welcome) == [Welcome(100, 4_002, learner.coordinator.run)]
     assert learner.coordinator.events == [WorkerJoined("a", "host", 1)]
 
@@ -175,7 +194,7 @@ def test_before_the_first_weights_a_worker_is_welcomed_and_given_nothing() -> No
     learner = Learner(publish=False)
     assert kinds(learner.joins(A), A) == [Welcome]
     assert learner.coordinator.ledger.issued == 0
-    assert kinds(learner.publish(0), A) == [Weights, Collect]
+    assert kinds(learner.publish(0), A) == [Collect, Weights]
 
 
 def test_a_repeated_hello_is_answered_by_the_same_welcome() -> None:
@@ -216,7 +235,7 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
     learner = Learner(lanes=2)
     learner.joins(A)
     outs = learner.joins(A, pid=pid, host=host)
-    assert kinds(outs, A) == [Welcome, Weights, Collect]
+    assert kinds(outs, A) == [Welcome, Collect, Weights]
     assert learner.session(A) == 101
     assert learner.coordinator.ledger.lost == 2
     assert WorkerLeft("a", f"replaced by process {pid}", 2, False) in learner.coordinator.events
@@ -225,7 +244,7 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
 def test_a_process_that_was_replaced_joins_again_but_two_do_not_take_a_name_from_each_other_for_ever() -> None:
     learner = Learner(lanes=1)
     for pid, attempt in ((1, 1), (2, 1), (1, 2), (2, 2)):
-        assert kinds(learner.joins(A, pid=pid, attempt=attempt), A) == [Welcome, Weights, Collect]
+        assert kinds(learner.joins(A, pid=pid, attempt=attempt), A) == [Welcome, Collect, Weights]
     (refuse,) = of(learner.joins(A, pid=1, attempt=3), Refuse)
     assert "give each worker a name of its own" in refuse.reason
     assert learner.coordinator.members[A].hello.pid == 2
@@ -259,7 +278,7 @@ def test_a_message_of_no_session_of_ours_is_answered_by_rejoin(known: bool) -> N
     learner = Learner()
     if known:
         learner.joins(A)
-    for message in (Heartbeat(5, 0, 0, (), 0, {}, 0), fake_rollout(5, 0, 0, 0, 0)):
+    for message in (Heartbeat(5, 0, (0,), (), 0, {}, 0), fake_rollout(5, 0, 0, 0, 0)):
         assert learner.says(A, message) == [(A, Rejoin(5))]
 
 
@@ -274,45 +293,44 @@ def test_a_last_word_of_no_session_of_ours_is_not_answered() -> None:
 
 
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
-@pytest.mark.parametrize(("lanes", "per_update"), [(2, 2), (3, 1), (1, 3), (4, 3)])
-def test_tickets_are_dealt_while_used_and_outstanding_are_below_the_bound(max_lag: int, lanes: int, per_update: int) -> None:
-    """Rule: used + outstanding < per_update * (version + 1 + max_lag). As many as it allows are dealt, never more."""
-    learner = Learner(lanes, max_lag, per_update)
+@pytest.mark.parametrize("lanes", [1, 2, 4])
+def test_every_lane_has_a_ticket_for_every_open_round_and_no_other(max_lag: int, lanes: int) -> None:
+    """Rule: once update u has begun, the rounds up to u + max_lag are open."""
+    learner = Learner(lanes, max_lag)
     learner.joins(A)
-    for version in range(1, 6):
-        ledger = learner.coordinator.ledger
-        assert ledger.used + ledger.outstanding == per_update * (version + max_lag)
-        while len(learner.coordinator.ready) < per_update:
-            learner.delivers(learner.tickets()[0])
-        assert ledger.used + ledger.outstanding == per_update * (version + max_lag)
+    coordinator = learner.coordinator
+    for update in range(5):
+        open_rounds = {(number, lane) for number in range(update, update + max_lag + 1) for lane in range(lanes)}
+        assert {(ticket.round, ticket.lane) for ticket in coordinator.tickets.values()} == open_rounds
+        assert coordinator.begin_update() == []  # it has begun
+        learner.deliver_round()
+        assert len(coordinator.tickets) == lanes * max_lag
         learner.take()
-        assert learner.coordinator.deal() == []
-        learner.publish(version)
+        learner.publish(update + 1)
 
 
-def test_a_stale_drop_makes_room_for_a_fresh_ticket() -> None:
-    learner = Learner(lanes=2, max_lag=1, per_update=2)
+@pytest.mark.parametrize("max_lag", [0, 1, 3])
+def test_update_u_acts_under_the_weights_that_were_the_newest_when_update_u_minus_max_lag_began(max_lag: int) -> None:
+    """Numbers of versions mean nothing: two of three are never the newest when an update begins."""
+    learner = Learner(lanes=2, max_lag=max_lag)
     learner.joins(A)
-    learner.delivers(1)
-    learner.publish(1)
-    learner.publish(2)  # ticket 1 was acted under version 0: staler than max_lag
-    issued = learner.coordinator.ledger.issued
-    assert learner.coordinator.take() is None
-    outs = learner.balanced(learner.coordinator.deal())
-    assert learner.coordinator.ledger.stale == 1
-    assert learner.coordinator.ledger.transitions_stale == 1
-    assert [permit.ticket for permit in permits(outs)] == [issued]
-    assert [permit.lane for permit in permits(outs)] == [1]  # the lane whose rollout was dropped
+    newest = [3 * update for update in range(8)]
+    for update in range(8):
+        learner.deliver_round()
+        assert {rollout.version for rollout in learner.take()} == {newest[max(0, update - max_lag)]}
+        learner.coordinator.publish(3 * update + 2, PARAMETERS, BUFFERS)
+        learner.publish(3 * update + 3)
 
 
-def test_a_rollout_exactly_max_lag_old_is_used() -> None:
-    learner = Learner(lanes=1, max_lag=2, per_update=1)
+def test_an_update_without_new_weights_acts_under_those_there_are() -> None:
+    learner = Learner(lanes=1)
     learner.joins(A)
-    learner.delivers(0)
-    learner.publish(1)
-    learner.publish(2)
-    assert [rollout.version for rollout in learner.take()] == [0]
-    assert learner.coordinator.ledger.stale == 0
+    learner.update()
+    learner.deliver_all()
+    assert [rollout.version for rollout in learner.take()] == [1]
+    assert of(learner.coordinator.begin_update(), Weights) == []
+    learner.deliver_all()
+    assert [rollout.version for rollout in learner.take()] == [1]
 
 
 def test_an_update_takes_its_rollouts_in_the_order_of_lanes_whichever_comes_first() -> None:
@@ -323,25 +341,17 @@ def test_an_update_takes_its_rollouts_in_the_order_of_lanes_whichever_comes_firs
     assert [rollout.lane for rollout in learner.take()] == [0, 1, 2]
 
 
-def test_the_least_advanced_lane_is_dealt_to_first() -> None:
-    learner = Learner(lanes=3, max_lag=0, per_update=1)
+def test_the_round_of_a_lost_ticket_is_dealt_again_under_its_version() -> None:
+    learner = Learner(lanes=2, max_lag=1)
     learner.joins(A)
-    order = []
-    for version in range(1, 7):
-        order += [learner.coordinator.tickets[number].lane for number in learner.tickets()]
-        learner.update()
-        assert learner.coordinator.version == version
-    assert order == [0, 1, 2, 0, 1, 2]
-
-
-def test_a_lane_that_fell_behind_catches_up() -> None:
-    learner = Learner(lanes=2, max_lag=0, per_update=2)
-    learner.joins(A)
-    learner.delivers(1)
-    member = learner.coordinator.members[A]
-    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "broken", 0.0))
-    assert [permit.lane for permit in permits(outs)] == [0]
-    assert member.strikes == 1
+    learner.deliver_round()
+    learner.take()
+    learner.publish(1)
+    lost = next(ticket for ticket in learner.coordinator.tickets.values() if ticket.round == 1 and ticket.lane == 0)
+    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(lost.number), "broken", 0.0))
+    (permit,) = permits(outs)
+    again = learner.coordinator.tickets[permit.ticket]
+    assert (again.lane, again.round, again.version, again.sequence) == (0, 1, 0, 3)  # two and one of round 2 were dealt
 
 
 def test_a_synchronous_update_uses_exactly_one_rollout_of_every_lane_under_the_newest_weights() -> None:
@@ -360,43 +370,36 @@ def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_
     learner.joins(A)
     learner.delivers(learner.tickets()[0])  # lane 0 is done with its round
     learner.joins(B)  # a lane moves to B, at a rollout boundary
-    round_lanes = [arrived.rollout.lane for arrived in learner.coordinator.ready] + [
-        t.lane for t in learner.coordinator.tickets.values()
-    ]
+    round_lanes = [*learner.coordinator.ready[0], *(ticket.lane for ticket in learner.coordinator.tickets.values())]
     assert sorted(round_lanes) == [0, 1, 2]
     learner.says(A, Goodbye(learner.session(A), "bye", ()))
-    round_lanes = [arrived.rollout.lane for arrived in learner.coordinator.ready] + [
-        t.lane for t in learner.coordinator.tickets.values()
-    ]
+    round_lanes = [*learner.coordinator.ready[0], *(ticket.lane for ticket in learner.coordinator.tickets.values())]
     assert sorted(round_lanes) == [0, 1, 2]
 
 
-def test_while_the_least_advanced_lane_is_moving_no_other_takes_its_place() -> None:
-    learner = Learner(lanes=2, max_lag=1, per_update=1)  # two tickets: one for each lane
+def test_a_lane_that_is_to_move_finishes_what_it_was_dealt_and_the_others_go_on() -> None:
+    learner = Learner(lanes=3, max_lag=1)
     learner.joins(A)
-    learner.joins(B)  # lane 1 waits for its ticket to end
-    (moving,) = [lane for lane in learner.coordinator.lanes if lane.moving]
-    learner.publish(1)  # room for one more; both lanes stand at 1, lane 0 goes first
-    assert learner.coordinator.lanes[0].progress == 2 or moving.number == 0
-    learner.publish(2)  # room for another: it would be the moving lane's turn
-    other = learner.coordinator.lanes[1 - moving.number]
-    assert moving.progress == 1
-    assert other.progress <= 2
+    learner.joins(B)
+    (moving,) = [lane.number for lane in learner.coordinator.lanes if lane.moving]
+    learner.deliver_round()
+    learner.take()
+    dealt = {permit.lane for permit in permits(learner.publish(1))}
+    assert dealt == {0, 1, 2} - {moving}
+    (last,) = [ticket.number for ticket in learner.coordinator.tickets.values() if ticket.lane == moving]
+    outs = learner.delivers(last)
+    (permit,) = permits(outs, B)
+    assert (permit.lane, permit.incarnation, permit.sequence) == (moving, 1, 0)
+    assert [collect.version for collect in of(outs, Collect, B)] == [1]
 
 
 def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
     assert learner.balanced(learner.coordinator.remove_worker("a", "killed")) == []
-    assert learner.coordinator.deal() == []
+    assert learner.coordinator.begin_update() == []
     outs = learner.joins(B)
     assert {(permit.lane, permit.incarnation) for permit in permits(outs)} == {(0, 1), (1, 1)}
-
-
-def test_a_ticket_asks_for_the_version_it_was_dealt_under() -> None:
-    learner = Learner(lanes=1, max_lag=1)
-    assert [collect.version for collect in of(learner.joins(A), Collect)] == [0]
-    assert [collect.version for collect in of(learner.publish(1), Collect)] == [1]
 
 
 def test_a_ticket_is_used_once_and_a_repeat_is_counted() -> None:
@@ -417,26 +420,20 @@ def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() 
     rollout = learner.rollout_of(0)
     learner.coordinator.remove_worker("a", "killed")
     assert learner.says(A, rollout) == [(A, Rejoin(100))]
-    assert (learner.coordinator.ledger.transitions_late, learner.coordinator.ready) == (1, [])
+    assert (learner.coordinator.ledger.transitions_late, learner.coordinator.ready) == (1, {})
 
 
-def test_a_rollout_under_older_weights_than_its_ticket_asks_for_is_not_used() -> None:
-    learner = Learner(lanes=1, max_lag=1)
-    learner.joins(A)
-    learner.publish(1)
-    newest = learner.tickets()[-1]
-    outs = learner.says(A, learner.rollout_of(newest, version=0))
-    assert [permit.lane for permit in permits(outs)] == [0]  # dealt again
-    assert learner.coordinator.ledger.transitions_invalid == 1
-
-
-@pytest.mark.parametrize("change", [{"version": 7}, {"lane": 1}], ids=["weights that do not exist", "another lane"])
-def test_a_rollout_that_does_not_fit_its_ticket_is_not_used(change: dict[str, int]) -> None:
+@pytest.mark.parametrize("change", [{"version": 0}, {"version": 2}, {"lane": 1}, {"sequence": 0}, {"sequence": 2}])
+def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(change: dict[str, int]) -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
-    learner.says(A, msgspec.structs.replace(learner.rollout_of(0), **change))
+    learner.update()
+    number, other = learner.tickets()
+    assert learner.coordinator.tickets[number].version == learner.coordinator.tickets[number].sequence == 1
+    outs = learner.says(A, msgspec.structs.replace(learner.rollout_of(number), **change))
     ledger = learner.coordinator.ledger
-    assert (learner.coordinator.ready, ledger.transitions_invalid, ledger.lost) == ([], 1, 1)
+    assert (learner.coordinator.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
+    assert permits(outs) == [Permit(other + 1, 0, 0, 2)]
     assert learner.coordinator.members[A].strikes == 1
 
 
@@ -447,7 +444,7 @@ def test_a_rollout_of_another_workers_ticket_is_not_used_and_costs_that_worker_n
     learner.update()
     (theirs,) = learner.tickets(B)
     learner.says(A, msgspec.structs.replace(learner.rollout_of(theirs), session=learner.session(A)))
-    assert learner.coordinator.ready == []
+    assert learner.coordinator.ready == {}
     assert learner.tickets(B) == [theirs]
     assert (learner.coordinator.members[A].strikes, learner.coordinator.members[B].strikes) == (1, 0)
 
@@ -480,14 +477,11 @@ def test_a_new_life_of_a_lane_has_received_nothing() -> None:
 
 
 def test_a_lane_that_was_never_started_keeps_its_incarnation_when_moved() -> None:
-    learner = Learner(lanes=2, max_lag=0, per_update=1)  # one ticket a round: lane 1 is not started yet
+    learner = Learner(lanes=2, publish=False)
     learner.joins(A)
     learner.joins(B)
     assert lanes_of(learner, B) == {1}
-    assert [lane.incarnation for lane in learner.coordinator.lanes] == [0, 0]
-    learner.update()
-    (number,) = learner.tickets(B)
-    assert learner.coordinator.tickets[number].incarnation == 0
+    assert {(permit.lane, permit.incarnation) for permit in permits(learner.publish(0))} == {(0, 0), (1, 0)}
 
 
 def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
@@ -505,14 +499,16 @@ def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
 
 
 def test_release_travels_before_what_the_lanes_new_owner_is_told() -> None:
-    learner = Learner(lanes=2, max_lag=1)  # two rounds are outstanding
+    learner = Learner(lanes=2, max_lag=1)  # two rounds are open
     learner.joins(A)
     learner.joins(B)
-    learner.delivers(0)
+    learner.deliver_round()
+    learner.take()
     learner.publish(1)
-    outs = learner.delivers(2)  # lane 0 has nothing outstanding any more: it moves, and is dealt a ticket at once
-    assert [type(message) for _, message in outs if isinstance(message, Release | Collect)] == [Release, Collect, Collect]
-    assert [permit.lane for permit in permits(outs, B)] == [0]
+    (last,) = [ticket.number for ticket in learner.coordinator.tickets.values() if ticket.lane == 1]
+    outs = learner.delivers(last)  # lane 1 has nothing outstanding any more: it moves, and is dealt a ticket at once
+    assert [type(message) for _, message in outs] == [Release, Collect, Weights]
+    assert [permit.lane for permit in permits(outs, B)] == [1]
 
 
 def test_a_newcomer_takes_from_the_fullest() -> None:
@@ -552,30 +548,46 @@ def test_a_lane_has_one_owner_whoever_comes_and_goes() -> None:
 # -------------------------------------------------------------------- weights
 
 
-def test_at_most_one_weights_is_unacknowledged_and_the_next_is_the_newest() -> None:
-    learner = Learner(lanes=1)
-    assert [w.version for w in of(learner.joins(A), Weights)] == [0]
+def test_weights_are_sent_after_the_first_order_that_names_them_and_once() -> None:
+    learner = Learner(lanes=2, max_lag=1)
+    assert [weights.version for weights in of(learner.joins(A), Weights)] == [0]
     for version in (1, 2, 3):
-        assert of(learner.publish(version), Weights) == []
-    assert [w.version for w in of(learner.beats(A, version=0), Weights)] == [3]
-    assert of(learner.beats(A, version=0, replies=0), Weights) == []
-    assert of(learner.beats(A, version=3), Weights) == []
+        learner.deliver_round()
+        learner.take()
+        outs = learner.publish(version)
+        assert kinds(outs, A) == [Collect, Weights]
+        assert [weights.version for weights in of(outs, Weights)] == [version]
+        assert of(learner.beats(A), Weights) == []
 
 
-def test_a_rollout_acknowledges_weights() -> None:
+def test_a_worker_that_nothing_asks_for_gets_no_weights_until_something_does() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    assert kinds(learner.joins(B), B) == [Welcome]
+    learner.update()
+    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed"))
+    assert kinds(outs, B) == [Collect, Weights]
+    assert [weights.version for weights in of(outs, Weights, B)] == [1]
+
+
+def test_a_lane_that_moves_takes_the_weights_of_its_rounds_along() -> None:
+    """Two rounds are open, under versions 0 and 1: its new owner has neither."""
+    learner = Learner(lanes=1, max_lag=1)
+    learner.joins(A)
+    learner.joins(B)
+    learner.update_round(1)
+    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed"))
+    assert [collect.version for collect in of(outs, Collect, B)] == [0, 1]
+    assert [weights.version for weights in of(outs, Weights, B)] == [0, 1]
+
+
+def test_weights_that_act_in_no_open_round_are_not_kept() -> None:
     learner = Learner(lanes=1, max_lag=2)
     learner.joins(A)
-    learner.publish(1)
-    assert [w.version for w in of(learner.delivers(0), Weights)] == [1]
-
-
-def test_weights_travel_before_collect() -> None:
-    learner = Learner(lanes=2)
-    learner.joins(A)
-    learner.beats(A)
-    learner.deliver_all()
-    learner.take()
-    assert kinds(learner.publish(1), A) == [Weights, Collect]
+    for version in range(1, 9):
+        learner.update_round(version)
+        assert len(learner.coordinator._weights) <= 4  # one for each open round, and the newest
+        assert len(learner.coordinator.members[A].versions) <= 4
 
 
 def test_one_weights_is_said_to_all_so_that_it_is_encoded_once() -> None:
@@ -646,17 +658,22 @@ def test_a_lost_collect_is_said_again_only_when_a_reply_said_after_it_has_been_s
 def test_lost_weights_are_said_again_only_when_a_reply_said_after_them_has_been_seen() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    assert of(learner.beats(A, version=-1, replies=0), Weights) == []
-    assert len(of(learner.beats(A, version=-1, replies=1), Weights)) == 1
-    assert of(learner.beats(A, version=-1, replies=1), Weights) == []
+    assert of(learner.beats(A, versions=[], replies=0), Weights) == []
+    assert [weights.version for weights in of(learner.beats(A, versions=[], replies=1), Weights)] == [0]
+    assert of(learner.beats(A, versions=[], replies=1), Weights) == []
+    assert len(of(learner.beats(A, versions=[], replies=2), Weights)) == 1
 
 
-def test_lost_weights_are_made_good_by_the_newest() -> None:
-    learner = Learner(lanes=1)
+def test_weights_that_only_finished_tickets_name_are_not_said_again() -> None:
+    """Its worker has dropped them."""
+    learner = Learner(lanes=1, max_lag=1)
     learner.joins(A)
-    learner.beats(A, version=-1, replies=0)
-    learner.publish(1)
-    assert [w.version for w in of(learner.beats(A, version=-1, replies=1), Weights)] == [1]
+    learner.update_round(1)
+    old, new = learner.tickets()
+    learner.beats(A)
+    assert of(learner.beats(A, versions=[1], tickets=[new]), Weights) == []
+    outs = learner.beats(A, versions=[1], tickets=[old, new])  # it has the ticket, and lost the weights
+    assert [weights.version for weights in of(outs, Weights)] == [0]
 
 
 def test_a_lost_rollout_is_asked_for_again() -> None:
@@ -665,24 +682,24 @@ def test_a_lost_rollout_is_asked_for_again() -> None:
     learner.joins(A)
     learner.beats(A)
     outs = learner.beats(A, tickets=[1])
-    assert permits(outs) == [Permit(0, 0, 0)]
+    assert permits(outs) == [Permit(0, 0, 0, 0)]
     assert learner.coordinator.ledger.lost == 0
 
 
 def test_lost_collects_of_several_versions_are_said_again_each_under_its_own() -> None:
-    learner = Learner(lanes=1, max_lag=1)
+    learner = Learner(lanes=1, max_lag=2)
     learner.joins(A)
-    learner.publish(1)
+    learner.update_round(1)
     learner.beats(A)
     collects = of(learner.beats(A, tickets=[]), Collect)
-    assert [(collect.version, [p.ticket for p in collect.permits]) for collect in collects] == [(0, [0, 1]), (1, [2])]
+    assert [(collect.version, [p.ticket for p in collect.permits]) for collect in collects] == [(0, [1, 2]), (1, [3])]
 
 
 def test_what_is_said_again_travels_before_the_reply() -> None:
-    learner = Learner(lanes=1)
+    learner = Learner(lanes=2)
     learner.joins(A)
-    learner.beats(A, version=-1, replies=0)
-    assert kinds(learner.beats(A, version=-1, tickets=[], replies=1), A) == [Weights, Collect, HeartbeatReply]
+    learner.beats(A)
+    assert kinds(learner.beats(A, versions=[], tickets=[0]), A) == [Weights, Collect, HeartbeatReply]
 
 
 def test_a_reply_leaves_out_lanes_that_live_elsewhere() -> None:
@@ -703,7 +720,7 @@ def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0))
-    assert permits(outs) == [Permit(1, 0, 0)]
+    assert permits(outs) == [Permit(1, 0, 0, 1)]
     ledger = learner.coordinator.ledger
     assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
 
@@ -740,7 +757,7 @@ def test_one_that_was_refused_stays_refused_and_another_process_of_its_name_may_
     for _ in range(STRIKES):
         learner.coordinator.reject_message(A, "rubbish", 0.0)
     assert learner.joins(A, pid=1, attempt=2) == [(A, Refuse("rubbish"))]
-    assert kinds(learner.joins(A, pid=2), A) == [Welcome, Weights, Collect]
+    assert kinds(learner.joins(A, pid=2), A) == [Welcome, Collect, Weights]
 
 
 def test_rubbish_of_a_stranger_is_counted_and_refused() -> None:
@@ -858,7 +875,7 @@ def test_drain_asks_everybody_to_leave_and_deals_no_more() -> None:
     learner.deliver_all()
     issued = learner.coordinator.ledger.issued
     learner.take()
-    assert learner.publish(1) == learner.coordinator.deal() == []
+    assert learner.publish(1) == []
     assert learner.coordinator.ledger.issued == issued
 
 
@@ -907,24 +924,18 @@ def test_gone_does_not_wait_for_silence() -> None:
 # -------------------------------------------------------------------- the ledger and the checkpoint
 
 
-def test_every_ticket_ends_as_used_stale_or_lost() -> None:
-    """One of each; `Learner.balanced` has checked both identities after every event."""
-    learner = Learner(lanes=2, max_lag=1, per_update=2)
+def test_every_ticket_ends_as_used_or_lost() -> None:
+    """`Learner.balanced` has checked both identities after every event."""
+    learner = Learner(lanes=2, max_lag=1)
     learner.joins(A)
-    learner.delivers(0)
-    learner.publish(1)
-    learner.publish(2)
-    learner.coordinator.take()  # 0 was stale
-    learner.coordinator.deal()
+    learner.update_round(1)
     learner.coordinator.remove_worker("a", "killed")
     learner.joins(B)
-    learner.deliver_all()
-    learner.take()
+    learner.update_round(2)
     counts = learner.coordinator.ledger.counts()
-    assert counts["stale"] == 1
-    assert counts["lost"] >= 1
-    assert counts["used"] == 2
-    assert counts["issued"] == counts["used"] + counts["stale"] + counts["lost"] + counts["outstanding"]
+    assert {name: counts[name] for name in ("issued", "used", "lost", "outstanding")} == {
+        "issued": 12, "used": 4, "lost": 4, "outstanding": 4,
+    }  # fmt: skip
 
 
 def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> None:
@@ -945,14 +956,13 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
 
 
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:
-    learner = Learner(lanes=3, per_update=1)  # one ticket a round
-    assert learner.coordinator.incarnations() == [0, 0, 0]
+    learner = Learner(lanes=2, publish=False)
     learner.joins(A)
-    assert learner.coordinator.incarnations() == [1, 0, 0]
-    learner.update()
-    assert learner.coordinator.incarnations() == [1, 1, 0]
+    assert learner.coordinator.incarnations() == [0, 0]
+    learner.publish(0)
+    assert learner.coordinator.incarnations() == [1, 1]
     learner.coordinator.remove_worker("a", "killed")
-    assert learner.coordinator.incarnations() == [1, 1, 0]
+    assert learner.coordinator.incarnations() == [1, 1]
 
 
 def test_no_life_is_lived_twice_across_resumes() -> None:
@@ -992,8 +1002,7 @@ def test_a_resumed_run_with_other_lanes_deals_tickets_from_there(before: int, la
     learner.joins(A)
     for update in range(1, 6):
         assert len(learner.tickets()) == lanes * (1 + max_lag), f"update {update}"
-        for number in learner.tickets()[:lanes]:
-            learner.delivers(number)
+        learner.deliver_round()
         assert sorted(rollout.lane for rollout in learner.take()) == list(range(lanes))
         learner.publish(100 + update)
     assert learner.coordinator.ledger.used == 100 * before + 5 * lanes
@@ -1008,43 +1017,23 @@ def test_a_lane_that_is_given_up_and_comes_back_does_not_live_again() -> None:
 
 
 def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -> None:
-    learner = Learner(lanes=1, max_lag=3, per_update=1)
+    learner = Learner(lanes=1, max_lag=3)
     learner.joins(A)
-    coordinator = learner.coordinator
-
-    def used(number: int) -> list[tuple[int, bool]]:
-        learner.delivers(number)
-        taken = coordinator.take() or []
-        return [(arrived.rollout.sequence, arrived.fresh) for arrived in taken]
-
-    first, second, third, fourth = learner.tickets()
-    assert used(first) == [(0, True)]
-    assert used(second) == [(1, False)]
-    assert used(fourth) == [(3, True)]  # it came before the third
-    assert used(third) == [(2, True)]
-    assert [coordinator.lanes[0].use(0, sequence) for sequence in (4, 5)] == [False, True], (
-        "the fifth follows the fourth only"
-    )
+    first, second, third, _ = learner.tickets()
+    learner.delivers(first)
+    learner.delivers(second)
+    learner.coordinator.reject_rollout(
+        A, learner.rollout_of(third), "broken", 0.0
+    )  # its round is collected after the fourth
+    learner.deliver_all()
+    used = [arrived for _ in range(4) for arrived in learner.coordinator.take() or []]
+    assert [(arrived.rollout.sequence, arrived.fresh) for arrived in used] == [(0, True), (1, False), (4, True), (3, True)]
 
 
 def test_a_rollout_continues_only_one_of_its_own_incarnation() -> None:
-    """The first of the new incarnation was dropped as stale."""
+    """The first of the new incarnation was rejected."""
     lane = TicketedLane(0)
     assert [lane.use(0, 0), lane.use(0, 1), lane.use(1, 2), lane.use(1, 3)] == [False, True, False, True]
-
-
-def test_a_rollout_after_one_that_was_dropped_as_stale_is_fresh() -> None:
-    learner = Learner(lanes=1, max_lag=1, per_update=1)
-    learner.joins(A)
-    coordinator = learner.coordinator
-    learner.update()  # with the first of two rollouts
-    (third,) = learner.tickets()
-    learner.publish(3)  # the second is too old now
-    assert coordinator.take() is None
-    assert coordinator.ledger.stale == 1
-    learner.says(A, learner.rollout_of(third, version=3))
-    (arrived,) = coordinator.take() or []
-    assert (arrived.rollout.sequence, arrived.fresh) == (2, True), "it is not the first of its lane, and continues nothing"
 
 
 # -------------------------------------------------------------------- the table
@@ -1068,7 +1057,7 @@ def in_standing(standing: MemberState) -> Learner:
 EVERY_MESSAGE: list[ToLearner] = [
     Hello(PROTOCOL_VERSION, "a", "host", 1, 1001, "fake", 1),
     fake_rollout(100, 0, 0, 0, 0),
-    Heartbeat(100, 0, 0, (0,), 0, {}, 0),
+    Heartbeat(100, 0, (0,), (0,), 0, {}, 0),
     Goodbye(100, "bye", ()),
     Failure(100, "broke", "", None),
     Stepped(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
@@ -1124,5 +1113,5 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
 def test_the_most_tickets_that_a_run_may_have_outstanding_fit_one_message() -> None:
     numbers = range(2**31, 2**31 + MOST_TICKETS)
     received = tuple(Received(n, 200, 10**5) for n in range(MOST_TICKETS))
-    order = Collect(2**48, 10**6, tuple(Permit(number, n, 200) for n, number in enumerate(numbers)), received)
+    order = Collect(2**48, 10**6, tuple(Permit(number, n, 200, 10**5) for n, number in enumerate(numbers)), received)
     assert decode_to_worker([bytes(frame) for frame in encode(order)]) == order

@@ -24,9 +24,7 @@ class Unreliable:
 
     def __init__(self) -> None:
         self.link = FakeLink()
-        self.coordinator = TicketCoordinator(
-            run_spec(COPIES), rollouts_per_update=COPIES, max_lag=0, worker_timeout_s=1e9, first_session=1
-        )
+        self.coordinator = TicketCoordinator(run_spec(COPIES), max_lag=0, worker_timeout_s=1e9, first_session=1)
         link, settings = cast(LearnerLink, self.link), HubSettings(1e9, 1e9, max_env_failures=3)
         self.hub = Hub(link, self.coordinator, settings, clock=lambda: self.link.now)
         self.processes = 0

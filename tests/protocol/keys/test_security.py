@@ -490,7 +490,7 @@ def test_an_eavesdropper_reads_everything_without_keys_and_nothing_with_them(net
 
 def coordinator(workers: int = 2) -> TicketCoordinator:
     return TicketCoordinator(
-        run_spec(workers), rollouts_per_update=workers, max_lag=0, worker_timeout_s=60.0, first_session=1000
+        run_spec(workers), max_lag=0, worker_timeout_s=60.0, first_session=1000
     )
 
 
