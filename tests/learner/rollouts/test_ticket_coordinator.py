@@ -13,6 +13,7 @@ from learner.config.validation import MOST_TICKETS
 from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.membership import Outgoing
 from learner.members.states import TABLE, MemberState, SentUnusable, TimedOut
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.lanes import TicketedLane
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
@@ -478,9 +479,12 @@ def test_a_new_life_of_a_lane_has_received_nothing() -> None:
 
 def test_a_lane_that_was_never_started_keeps_its_incarnation_when_moved() -> None:
     learner = Learner(lanes=2, publish=False)
+    learner.coordinator.publish(0, PARAMETERS, BUFFERS)
     learner.joins(A)
+    learner.coordinator.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=2))
     learner.joins(B)
-    assert lanes_of(learner, B) == {1}
+    assert (lanes_of(learner, A), lanes_of(learner, B)) == ({0}, {1})
+    learner.coordinator.end_evaluation()
     assert {(permit.lane, permit.incarnation) for permit in permits(learner.publish(0))} == {(0, 0), (1, 0)}
 
 
@@ -591,11 +595,10 @@ def test_weights_that_act_in_no_open_round_are_not_kept() -> None:
 
 
 def test_one_weights_is_said_to_all_so_that_it_is_encoded_once() -> None:
-    learner = Learner(lanes=2)
+    learner = Learner(lanes=2, publish=False)
     for peer in (A, B):
         learner.joins(peer)
-        learner.beats(peer)
-    first, second = of(learner.publish(1), Weights)
+    first, second = of(learner.publish(0), Weights)
     assert first is second
 
 
