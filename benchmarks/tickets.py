@@ -50,11 +50,11 @@ def play(max_lag: int, seconds: float) -> Played:
     """What workers and learner do with tickets under this `max_lag`."""
     run = run_spec(LANES)
     rollout = canned(run)
-    coordinator = TicketCoordinator(run, max_lag=max_lag, worker_timeout_s=1e9, first_session=1, version=0)
+    coordinator = TicketCoordinator(run, max_lag=max_lag, worker_timeout_s=1e9, first_session=1)
     spans: list[Span] = []
     lags: list[int] = []
     events: list[tuple[float, int]] = []  # when a row's rollout or update ends
-    tickets: list[list[int]] = [[] for _ in range(LANES)]
+    tickets: list[list[tuple[int, int]]] = [[] for _ in range(LANES)]  # with the version that acts
     busy = [False] * (LANES + 1)
     collected = [0] * LANES
     now = 0.0
@@ -63,7 +63,11 @@ def play(max_lag: int, seconds: float) -> Played:
         for _, message in out:
             if isinstance(message, Collect):
                 for permit in message.permits:
-                    tickets[permit.lane].append(permit.ticket)
+                    tickets[permit.lane].append((permit.ticket, message.version))
+
+    def publish(version: int) -> None:
+        coordinator.publish(version, NOTHING, NOTHING)
+        dealt(list(coordinator.begin_update()))
 
     def begin(row: int, duration_s: float, version: int) -> None:
         busy[row] = True
@@ -73,27 +77,27 @@ def play(max_lag: int, seconds: float) -> Played:
     peers = [f"w{n}".encode() for n in range(LANES)]
     for n, peer in enumerate(peers):
         coordinator.receive(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", n + 1, n, "simulated", n + 1), now)
-    dealt(list(coordinator.publish(0, NOTHING, NOTHING)))
+    publish(0)
     while now < seconds:
         if not busy[LANES] and (taken := coordinator.take()):
             lags += [coordinator.version - each.rollout.version for each in taken]
             begin(LANES, UPDATE_S, coordinator.version)
         for lane in range(LANES):
             if tickets[lane] and not busy[lane]:
-                begin(lane, ROLLOUT_S[(lane + collected[lane]) % len(ROLLOUT_S)], coordinator.version)
+                begin(lane, ROLLOUT_S[(lane + collected[lane]) % len(ROLLOUT_S)], tickets[lane][0][1])
         now, row = heapq.heappop(events)
         busy[row] = False
         if row == LANES:
-            dealt(list(coordinator.publish(coordinator.version + 1, NOTHING, NOTHING)))
+            publish(coordinator.version + 1)
             continue
         owner = coordinator.lanes[row].owner
         assert owner is not None
-        version = next(span.version for span in reversed(spans) if span.row == row)
+        ticket, version = tickets[row].pop(0)
         filled = msgspec.structs.replace(
             rollout,
             session=coordinator.members[owner].session,
             lane=row,
-            ticket=tickets[row].pop(0),
+            ticket=ticket,
             version=version,
             sequence=collected[row],
         )

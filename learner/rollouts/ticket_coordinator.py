@@ -84,16 +84,15 @@ class TicketCoordinator:
         worker_timeout_s: float,
         first_session: int,
         ledger: Ledger | None = None,
-        version: int = -1,
         incarnations: Sequence[int] = (),
     ) -> None:
-        """`version` is -1 until `publish`. `ledger` and `incarnations` come from a checkpoint.
+        """`ledger` and `incarnations` come from a checkpoint.
 
         `incarnations`: the first of each lane; there may be more or fewer of them than lanes.
         """
         self.run = run
         self.ledger = ledger or Ledger()
-        self.version = version
+        self.version = -1  # until `publish`
         self.worker_timeout_s = worker_timeout_s
         self.membership: Membership[CollectingMember] = Membership(
             run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, self.lanes)

@@ -1025,9 +1025,8 @@ def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -
     first, second, third, _ = learner.tickets()
     learner.delivers(first)
     learner.delivers(second)
-    learner.coordinator.reject_rollout(
-        A, learner.rollout_of(third), "broken", 0.0
-    )  # its round is collected after the fourth
+    # The third round is collected again, after the fourth.
+    learner.coordinator.reject_rollout(A, learner.rollout_of(third), "broken", 0.0)
     learner.deliver_all()
     used = [arrived for _ in range(4) for arrived in learner.coordinator.take() or []]
     assert [(arrived.rollout.sequence, arrived.fresh) for arrived in used] == [(0, True), (1, False), (4, True), (3, True)]
