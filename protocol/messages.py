@@ -32,7 +32,7 @@ from protocol.rollout import Episode, Rollout
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
-PROTOCOL_VERSION = 5
+PROTOCOL_VERSION = 6
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
 
@@ -146,7 +146,7 @@ class Heartbeat(Message, frozen=True):
     replies: Natural
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost"""
     versions: Versions
-    """versions of the weights held: the newest that has come, and those that unfinished tickets name"""
+    """of the weights held, ascending: the newest that has come, and those that unfinished tickets name"""
     tickets: Tickets
     """tickets that are held and not finished"""
     steps: Natural

@@ -12,7 +12,7 @@ import { readToken, routingId } from "./token.js";
 
 export { box, discrete, UsageError };
 
-const PROTOCOL_VERSION = 5;
+const PROTOCOL_VERSION = 6;
 const FIELDS = { // how many fields each message of the learner has
   Welcome: 3, Rejoin: 1, Weights: 4, Collect: 4, Release: 2, Evaluate: 8, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
 };
@@ -164,7 +164,7 @@ class Worker {
     this.#due = at + this.#run.heartbeat_s;
     const { began, steps, stepSeconds, doing, since, calls } = this.#activity;
     const stages = { step: stepSeconds, wait: Math.max(0, at - began - stepSeconds) };
-    this.#send(["Heartbeat", this.#session, this.#replies, -1, this.#lanes.tickets, steps, stages, process.memoryUsage.rss()]);
+    this.#send(["Heartbeat", this.#session, this.#replies, [], this.#lanes.tickets, steps, stages, process.memoryUsage.rss()]);
     if (this.#run.type === "DescribeSpec") return this.#describe(); // it may have been lost
     this.#send(["Alive", [[this.name, this.#life, doing, Math.max(0, at - since), calls]], []]);
   }

@@ -48,7 +48,7 @@ class Worker
   end
 
   def hello
-    say({ type: "Hello", protocol: 5, worker: @name, host: Socket.gethostname.encode("UTF-8"),
+    say({ type: "Hello", protocol: 6, worker: @name, host: Socket.gethostname.encode("UTF-8"),
           pid: Process.pid, life: @life, software: "millrace.rb", attempt: @attempt })
     @next_at, @pause_s = now + @pause_s, [2 * @pause_s, 4].min
   end
@@ -96,7 +96,7 @@ class Worker
   end
 
   def beat
-    say(["Heartbeat", @session, @replies, -1, @held, @steps, {}, 0])
+    say(["Heartbeat", @session, @replies, [], @held, @steps, {}, 0])
     describe if @run[:type] == "DescribeSpec"
     @next_at, @give_up_at = now + @run.fetch(:heartbeat_s, 1), now + 600
   end

@@ -55,7 +55,7 @@ def messages(lanes: int) -> list[ToWorker]:
         Welcome(SESSION, 2, RunSpec(CARTPOLE, POLICY, rollout_steps=64, copies=lanes, lanes=lanes, seed=1)),
         Weights(3, weights, np.zeros(0, np.float32)),
         Weights(4, weights.astype(np.float16), np.zeros(0, np.float32)),
-        Collect(SESSION, 3, (Permit(10, 0, 0), Permit(11, 1, 1))[:lanes], FEW[:lanes]),
+        Collect(SESSION, 3, (Permit(10, 0, 0, 0), Permit(11, 1, 1, 0))[:lanes], FEW[:lanes]),
         Evaluate(SESSION, 12, 4, (1, 2), True, 30, False, False),
         HeartbeatReply(SESSION, 2, FEW[:1]),
         Drain("the run is over"),

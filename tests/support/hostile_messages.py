@@ -65,7 +65,7 @@ def real(rollout: Rollout) -> list[Any]:
             rollout.session, 1, 0, 0, (np.ones((3, 4)),), np.ones(2), np.ones(2), np.zeros(2, bool), np.ones(2, bool)
         ),
         Evaluated(rollout.session, 1, (Episode(1.5, 2, 0.1),), (False,)),
-        Heartbeat(rollout.session, 0, 0, (1, 2), 5, {"act": 0.1}, 0),
+        Heartbeat(rollout.session, 0, (0,), (1, 2), 5, {"act": 0.1}, 0),
         Goodbye(rollout.session, "bye", (1,)),
         Failure(rollout.session, "error", "traceback", 0),
         Stepped(rollout.session, 1, 0, 0, (np.ones((2, 4)),), np.ones(2), np.zeros(2, bool), np.ones(2, bool), packed),

@@ -96,7 +96,7 @@ class Hostile:
 FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
     lambda session: [Goodbye(session, "x" * 1_000, ())],
     lambda session: [Failure(session, "[/red]boom", f"2026-11-22 05:00:00,000 learner: forged\n{MARK}" * 1_500, 0)],
-    lambda session: [Heartbeat(session, 2**53, 2**53, tuple(range(60_000)), 2**53, {"step": 1e9}, 2**53)] * 5,
+    lambda session: [Heartbeat(session, 2**53, (2**53,), tuple(range(60_000)), 2**53, {"step": 1e9}, 2**53)] * 5,
     lambda session: [Inquire()] * 20,
     lambda session: [Alive((), ())] * 20,
     lambda session: [fake_rollout(session, n % 2, n, n, n) for n in range(20)],

@@ -32,7 +32,7 @@ def talk_rubbish(host: str, port: int, seed: int, *, connections: int = 100, mes
             stranger.send_multipart([noise.randbytes(noise.randrange(2000)) for _ in range(1 + number % 80)])
         hello = Hello(PROTOCOL_VERSION, NAME.decode(), "host", 1, 1, "", 1)
         stranger.send_multipart([*encode(hello), b"one frame too many"])
-        stranger.send_multipart(encode(Heartbeat(7, 0, 0, (), 0, {}, 0)))
+        stranger.send_multipart(encode(Heartbeat(7, 0, (), (), 0, {}, 0)))
         return bool(stranger.poll(10_000))
     except zmq.Again:  # the learner does not let it in, and its queue is full
         return False

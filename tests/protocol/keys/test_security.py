@@ -489,9 +489,7 @@ def test_an_eavesdropper_reads_everything_without_keys_and_nothing_with_them(net
 
 
 def coordinator(workers: int = 2) -> TicketCoordinator:
-    return TicketCoordinator(
-        run_spec(workers), max_lag=0, worker_timeout_s=60.0, first_session=1000
-    )
+    return TicketCoordinator(run_spec(workers), max_lag=0, worker_timeout_s=60.0, first_session=1000)
 
 
 def hub_of(link: LearnerLink) -> Hub:
@@ -520,7 +518,7 @@ def test_another_key_cannot_speak_in_a_workers_session_nor_take_it_over(net: Net
     routing_id = peer.rpartition(b"\0")[0]
     lanes = set(member.lanes)
     thief = net.raw(learner, token(HOME), routing_id)
-    for message in (Heartbeat(member.session, 0, 0, (), 0, {}, 0), hello(process_nonce=2)):
+    for message in (Heartbeat(member.session, 0, (), (), 0, {}, 0), hello(process_nonce=2)):
         thief.send_multipart(encode(message))
     serve(hub, lambda: len(hub.coordinator.members) == 2)
     assert hub.coordinator.members[peer] is member, "the session was replaced"
@@ -572,7 +570,7 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
         got = list(worker.receive())
         assert {type(message) for message in got} <= {Welcome, Weights, Collect}
         session = next(message.session for message in got if isinstance(message, Welcome))
-        worker.send(encode(Heartbeat(session, 0, 0, (), 0, {}, 0)))
+        worker.send(encode(Heartbeat(session, 0, (), (), 0, {}, 0)))
     serve(hub, lambda: all(member.heartbeat is not None for member in hub.coordinator.members.values()))
 
 
@@ -610,7 +608,7 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     assert any(isinstance(message, Refuse) and "was revoked" in message.reason for message in got)
 
     workers[0].send(encode(hello("w0", 9)))  # its connection is still there
-    workers[0].send(encode(Heartbeat(session, 0, 0, (), 0, {}, 0)))
+    workers[0].send(encode(Heartbeat(session, 0, (), (), 0, {}, 0)))
     serve(hub, lambda: learner.refused_messages == 2)
     assert len(hub.coordinator.members) == 1
     assert workers[0].poll(DEADLINE_S)

@@ -209,12 +209,12 @@ def test_a_default_stands_at_the_end_alone() -> None:
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (["Heartbeat", "7", 0, 0, [], 0, {}, 0], "Expected `int`, got `str` - at `Heartbeat.session`"),
-        (["Heartbeat", 7, 0, 0, [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
-        (["Heartbeat", 7, 0, 0, [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
-        (["Heartbeat", 7, 0, 0, [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
-        (["Heartbeat", 7, 0, 0, [], 0, {}], "Heartbeat expected 8 fields, got 6"),
-        (["Heartbeat", 7, 0, 0, [], 0, {}, 0, 0, 0], "Heartbeat expected 8 fields, got 9"),
+        (["Heartbeat", "7", 0, [], [], 0, {}, 0], "Expected `int`, got `str` - at `Heartbeat.session`"),
+        (["Heartbeat", 7, 0, [], [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
+        (["Heartbeat", 7, 0, [], [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
+        (["Heartbeat", 7, 0, [], [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
+        (["Heartbeat", 7, 0, [], [], 0, {}], "Heartbeat expected 8 fields, got 6"),
+        (["Heartbeat", 7, 0, [], [], 0, {}, 0, 0, 0], "Heartbeat expected 8 fields, got 9"),
         (["Heartbeat"], "Heartbeat expected 8 fields, got 0"),
         (["Inquire", 1], "Inquire expected 0 fields, got 1"),
         ({"type": "Hello", "protocol": None}, "Expected `int`, got `null` - at `$.protocol`"),
@@ -231,11 +231,11 @@ def test_what_is_wrong_in_a_head_is_named(content: object, says: str) -> None:
 
 def test_what_is_wrong_in_a_record_within_a_message_is_named() -> None:
     for permit, says in (
-        ([1, 2], "Expected `array` of at least length 3, got 2 - at `Collect.permits[1]`"),
-        ([1, 2, []], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
+        ([1, 2], "Expected `array` of at least length 4, got 2 - at `Collect.permits[1]`"),
+        ([1, 2, [], 0], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
     ):
         with pytest.raises(BadMessage) as caught:
-            decode_to_worker(head(["Collect", 7, 0, [[1, 0, 0], permit], []]))
+            decode_to_worker(head(["Collect", 7, 0, [[1, 0, 0, 0], permit], []]))
         assert says in str(caught.value)
 
 

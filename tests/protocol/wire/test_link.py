@@ -72,7 +72,7 @@ PACKED = np.frombuffer(pack([(0, {"ünï": 1.5})]), np.uint8)
 TO_LEARNER: list[ToLearner] = [
     HELLO,
     fake_rollout(1, 2, 3, 4, 5),
-    Heartbeat(1, 2, 3, (4, 5), 6, {"step": 0.5}, 7),
+    Heartbeat(1, 2, (3, 4), (4, 5), 6, {"step": 0.5}, 7),
     Goodbye(1, "told to stop", (4,)),
     Failure(1, "ValueError: ünïcode", "Traceback: …", None),
     Stepped(1, 2, 0, 1, (np.ones((3, 4), np.float32),), np.ones(3), np.zeros(3, bool), np.ones(3, bool), PACKED),
@@ -87,7 +87,7 @@ TO_WORKER: list[ToWorker] = [
     Refuse("no"),
     Rejoin(1),
     Weights(3, np.arange(5, dtype=np.float32), np.zeros(0, np.float32)),
-    Collect(1, 3, (Permit(7, 0, 1),), (Received(0, 1, 4, (6,)),)),
+    Collect(1, 3, (Permit(7, 0, 1, 4),), (Received(0, 1, 4, (6,)),)),
     Release(1, (LaneIncarnation(0, 1),)),
     HeartbeatReply(1, 9, (Received(0, 1, 4, ()),)),
     Drain("finished"),
