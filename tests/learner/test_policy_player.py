@@ -107,7 +107,7 @@ class Endless(FakeLink):
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
         message = decode_to_worker([bytes(frame) for frame in frames])
         if isinstance(message, Evaluate):
-            self.inbox.append((peer, Heartbeat(message.session, 0, 0, (message.ticket,), 31_000, {}, 0)))
+            self.inbox.append((peer, Heartbeat(message.session, 0, (0,), (message.ticket,), 31_000, {}, 0)))
         return True
 
 

@@ -120,12 +120,12 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     found = scraped.metrics()
     ledger = learning.coordinator.ledger.counts()
     assert ledger["lost"] > 0
-    assert by(found, "millrace_tickets_total", "reason") == {name: ledger[name] for name in ("used", "stale", "lost")}
+    assert by(found, "millrace_tickets_total", "reason") == {name: ledger[name] for name in ("used", "lost")}
     assert found["millrace_tickets_issued_total", ()] == ledger["issued"]
     assert found["millrace_tickets_outstanding", ()] == ledger["outstanding"]
     ended = by(found, "millrace_transitions_total", "reason")
     assert ended == {name: ledger[f"transitions_{name}"] for name in ended}
-    assert set(ended) == {"used", "stale", "duplicate", "late", "invalid"}
+    assert set(ended) == {"used", "duplicate", "late", "invalid"}
     received = found["millrace_transitions_received_total", ()]
     assert received == ledger["transitions_received"] == sum(ended.values()) + found["millrace_transitions_waiting", ()] > 0
     assert by(found, "millrace_workers", "state") == {"active": 2, "spare": 0, "draining": 0}

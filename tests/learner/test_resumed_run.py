@@ -83,7 +83,7 @@ def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str)
 
 
 def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
-    """A rollout of a lane that is not its first and continues nothing, as after a stale one, is fresh in the batch."""
+    """A rollout of a lane that is not its first and continues nothing, as after a lost one, is fresh in the batch."""
     sequences_and_fresh = {2: (0, True), 0: (5, True), 1: (5, False)}  # of each lane, as they arrive
     arrived = [
         AcceptedRollout(fake_rollout(1, lane, lane, 0, sequence), 0, fresh)

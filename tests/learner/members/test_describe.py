@@ -201,7 +201,7 @@ def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
 def test_heartbeats_are_answered_and_silence_is_the_end() -> None:
     made = coordinator()
     session = join(made, A)
-    assert made.receive(A, Heartbeat(session, 0, -1, (), 0, {}, 0), 4.0) == [(A, HeartbeatReply(session, 1, ()))]
+    assert made.receive(A, Heartbeat(session, 0, (), (), 0, {}, 0), 4.0) == [(A, HeartbeatReply(session, 1, ()))]
     made.remove_silent(8.9)
     assert made.membership.members
     made.remove_silent(9.1)
@@ -276,7 +276,7 @@ def _heartbeats(link: FakeLink) -> tuple[()]:
     for frames in link.sent:
         message = decode_to_worker([bytes(frame) for frame in frames])
         if isinstance(message, Welcome):
-            link.inbox.append((A, Heartbeat(message.session, 0, -1, (), 0, {}, 0)))
+            link.inbox.append((A, Heartbeat(message.session, 0, (), (), 0, {}, 0)))
             link.now += 0.5
     return ()
 

@@ -34,6 +34,7 @@ from protocol.messages import (
     Hello,
     Inquire,
     Order,
+    Permit,
     Refuse,
     Rejoin,
     Rollout,
@@ -130,17 +131,18 @@ class Honest:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.session, self.version, self.sent = 0, -1, 0
-        self.permits: list[tuple[int, int]] = []
+        self.session, self.sent = 0, 0
+        self.versions: set[int] = set()
+        self.permits: list[tuple[Permit, int]] = []
 
     def hears(self, message: ToWorker) -> None:
         match message:
             case Welcome(session):
                 self.session = session
             case Weights(version):
-                self.version = version
-            case Collect(_, _, permits):
-                self.permits += [(permit.ticket, permit.lane) for permit in permits]
+                self.versions.add(version)
+            case Collect(_, version, permits):
+                self.permits += [(permit, version) for permit in permits]
             case _:
                 pass
 
@@ -148,10 +150,11 @@ class Honest:
         if not self.session:
             yield Hello(PROTOCOL_VERSION, self.name, "host", 1, SECRET_NONCE, "fake", 1)
             return
-        yield Heartbeat(self.session, 0, self.version, tuple(ticket for ticket, _ in self.permits), self.sent, {}, 0)
+        held = tuple(permit.ticket for permit, _ in self.permits)
+        yield Heartbeat(self.session, 0, tuple(sorted(self.versions)), held, self.sent, {}, 0)
         if self.permits:
-            ticket, lane = self.permits.pop(0)
-            yield fake_rollout(self.session, lane, ticket, self.version, self.sent)
+            permit, version = self.permits.pop(0)
+            yield fake_rollout(self.session, permit.lane, permit.ticket, version, permit.sequence)
             self.sent += 1
 
 
@@ -186,7 +189,7 @@ def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
         link.now += TURN_S
     assert hub._server.unexpected_errors == 0
     ledger = coordinator.ledger
-    assert ledger.issued == ledger.used + ledger.outstanding + ledger.stale + ledger.lost
+    assert ledger.issued == ledger.used + ledger.outstanding + ledger.lost
     assert ledger.lost == 0
     assert not any(MARK in text for text in link.observed)
     return found
@@ -218,7 +221,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
     for turn in range(turns):
         for number in (0, 1):
             session = hub._coordinator.members[b"w%d" % number].session
-            link.inbox.append((b"w%d" % number, Heartbeat(session, 0, 0, tuple(hub._coordinator.orders), 0, {}, 0)))
+            link.inbox.append((b"w%d" % number, Heartbeat(session, 0, (), tuple(hub._coordinator.orders), 0, {}, 0)))
         if turn:
             say(link, turn)
         hub.send_orders(dict.fromkeys((0, 1), step))
@@ -275,7 +278,7 @@ def test_every_field_at_extreme_values_changes_no_answer_of_a_vector_environment
 FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
     lambda nonce: [Hello(PROTOCOL_VERSION, HOSTILE, "h" * 1_000, 2**31, nonce, "s", 1)],
     lambda nonce: [Goodbye(SESSION, "x" * 1_000, (0, 1))],
-    lambda nonce: [Heartbeat(SESSION, 2**53, 2**53, tuple(range(1_000)), 2**53, {"step": 1e9}, 2**53)],
+    lambda nonce: [Heartbeat(SESSION, 2**53, (0, 2**53), tuple(range(1_000)), 2**53, {"step": 1e9}, 2**53)],
     lambda nonce: [Failure(SESSION, "boom", "t" * 64_000, nonce % 3)],
     lambda nonce: [Inquire()],
     lambda nonce: [Alive((), ())],

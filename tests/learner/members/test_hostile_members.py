@@ -165,11 +165,11 @@ def test_what_is_kept_of_workers_that_left_is_limited() -> None:
     for number in range(REMEMBERED + 500):
         name = f"w{number}"
         session = noisy.joins(name)
-        noisy.hears(name, Heartbeat(session, 0, 0, (), 2**53, {"step": 1e9}, 0), fake_rollout(session, 0, 9, 0, 0))
+        noisy.hears(name, Heartbeat(session, 0, (0,), (), 2**53, {"step": 1e9}, 0), fake_rollout(session, 0, 9, 0, 0))
     honest = noisy.joins("honest", 2)
     for _ in range(20):
         noisy.link.now += 0.4
-        noisy.hears("honest", Heartbeat(honest, 0, 0, (), 0, {}, 0))
+        noisy.hears("honest", Heartbeat(honest, 0, (0,), (), 0, {}, 0))
     logging.disable(logging.NOTSET)
     assert set(noisy.coordinator.members) == {b"honest"}
     assert len(stages._removed_for_silence) == REMEMBERED
@@ -182,11 +182,11 @@ def test_the_stages_of_a_process_that_joins_again_are_counted_once() -> None:
     learner = Learner(lanes=1)
     learner.joins(b"a")
     learner.now = 60.0
-    learner.says(b"a", Heartbeat(learner.session(b"a"), 0, 0, tuple(learner.tickets(b"a")), 1, {"step": 10.0}, 0))
+    learner.says(b"a", Heartbeat(learner.session(b"a"), 0, (0,), tuple(learner.tickets(b"a")), 1, {"step": 10.0}, 0))
     learner.says(b"a", hello("a", 4_001, attempt=2))
     for now, step_s in ((61.0, 10.5), (100.0, 30.5)):
         learner.now = now
-        learner.says(b"a", Heartbeat(learner.session(b"a"), 0, 0, tuple(learner.tickets(b"a")), 1, {"step": step_s}, 0))
+        learner.says(b"a", Heartbeat(learner.session(b"a"), 0, (0,), tuple(learner.tickets(b"a")), 1, {"step": step_s}, 0))
     assert learner.coordinator.membership.stages() == {"step": 30.0}
 
 
@@ -241,8 +241,8 @@ def test_a_flood_is_read_for_a_limited_time_and_an_honest_worker_is_not_taken_fo
         return hears(peer, message, now)
 
     noisy.coordinator.receive = slowly  # type: ignore[method-assign, assignment]
-    flood = [(b"spare", cast(ToLearner, Heartbeat(7, 0, 0, (), 0, {}, 0)))] * 1_000
-    noisy.link.inbox += [*flood, (b"honest", Heartbeat(1, 0, 0, (), 0, {}, 0))]
+    flood = [(b"spare", cast(ToLearner, Heartbeat(7, 0, (0,), (), 0, {}, 0)))] * 1_000
+    noisy.link.inbox += [*flood, (b"honest", Heartbeat(1, 0, (0,), (), 0, {}, 0))]
     while noisy.link.inbox:
         began_s, left = noisy.link.now, len(noisy.link.inbox)
         noisy.hub.pulse()
@@ -290,7 +290,7 @@ def test_an_error_in_the_learner_costs_its_sender_the_membership_and_nothing_els
 
     noisy.coordinator.receive = raises  # type: ignore[method-assign, assignment]
     for _ in range(3):
-        noisy.hears("spare", Heartbeat(2, 0, 0, (), 0, {}, 0))
+        noisy.hears("spare", Heartbeat(2, 0, (0,), (), 0, {}, 0))
     assert set(noisy.coordinator.members) == {b"honest"}
     assert decode_to_worker(noisy.link.sent[-1]) == Refuse("its Heartbeat led to an error in the learner: ZeroDivisionError")
     assert noisy.hub._server.unexpected_errors == 3
@@ -313,7 +313,7 @@ def test_failures_after_env_steps_end_the_run_if_there_are_too_many_within_an_ho
     noisy = Noisy(max_env_failures=1)  # of one env copy: two within the first hour
     for nonce, later_s in ((2, apart_s), (3, 0.0), (4, 0.0)):
         session = noisy.joins("honest", nonce)
-        noisy.hears("honest", Heartbeat(session, 0, 0, (), 1, {}, 0), Failure(session, "boom", "", 0))
+        noisy.hears("honest", Heartbeat(session, 0, (0,), (), 1, {}, 0), Failure(session, "boom", "", 0))
         noisy.link.now += later_s
     if ends:
         with pytest.raises(EnvironmentFailed, match="boom; failure 3 within an hour; max_env_failures allows 1 "):
@@ -423,8 +423,8 @@ def test_invented_stage_names_are_not_kept() -> None:
     noisy = Noisy()
     for nonce in range(5):
         session = noisy.joins("a", nonce)
-        as_bytes(noisy, "a", Heartbeat(session, 0, 0, (), 0, {f"stage {n}": 1.0 for n in range(45_000)}, 0))  # type: ignore[misc]
-        as_bytes(noisy, "a", Heartbeat(session, 0, 0, (), 0, {"[/red]": 1.0}, 0))  # type: ignore[dict-item]
+        as_bytes(noisy, "a", Heartbeat(session, 0, (0,), (), 0, {f"stage {n}": 1.0 for n in range(45_000)}, 0))  # type: ignore[misc]
+        as_bytes(noisy, "a", Heartbeat(session, 0, (0,), (), 0, {"[/red]": 1.0}, 0))  # type: ignore[dict-item]
     assert noisy.coordinator.membership.stages() == {}
     assert noisy.coordinator.ledger.messages_bad == 10
 

@@ -110,5 +110,5 @@ def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() 
     served = Served()
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers at fake, 1 joined; start one: millrace worker fake"):
         served.server.wait_for(2, 1.0, lambda: served.server.listen(POLL_S))
-    served.link.inbox.append((b"w0", Heartbeat(1, 0, -1, (), 0, {}, 0)))
+    served.link.inbox.append((b"w0", Heartbeat(1, 0, (), (), 0, {}, 0)))
     served.server.wait_for(1, 1.0, lambda: served.server.listen(POLL_S))

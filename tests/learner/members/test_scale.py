@@ -56,7 +56,6 @@ def of_rollout(learner: Learner, number: int | None = None) -> int:
     def arrives() -> None:
         learner.coordinator.receive(peer, rollout, learner.now)
         learner.coordinator.take()
-        learner.coordinator.deal()
         learner.coordinator.remove_silent(learner.now)
 
     return lines(arrives)
@@ -70,7 +69,7 @@ def test_a_rollout_costs_as_much_whatever_the_number_of_workers(max_lag: int) ->
 def test_an_account_costs_as_much_whatever_the_number_of_workers() -> None:
     def of_account(learner: Learner) -> int:
         (ticket,) = learner.tickets(b"w1")
-        account = Heartbeat(learner.session(b"w1"), 0, 1, (ticket,), 0, {}, 0)
+        account = Heartbeat(learner.session(b"w1"), 0, (1,), (ticket,), 0, {}, 0)
         return lines(lambda: learner.coordinator.receive(b"w1", account, learner.now))
 
     assert of_account(crowd(MANY)) <= of_account(crowd(FEW)) + 5

@@ -28,10 +28,10 @@ WORKER_TIMEOUT_S = 3.0
 
 
 def hub_with_a_worker(
-    weights_dtype: WeightsDtype = "float32", processes: ProcessCallbacks | None = None
+    weights_dtype: WeightsDtype = "float32", processes: ProcessCallbacks | None = None, lanes: int = 1
 ) -> tuple[FakeLink, Hub, Heartbeat]:
     link = FakeLink()
-    coordinator = TicketCoordinator(run_spec(lanes=1), max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
+    coordinator = TicketCoordinator(run_spec(lanes), max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
     hub = Hub(
         cast(LearnerLink, link),
         coordinator,
@@ -41,7 +41,7 @@ def hub_with_a_worker(
     )
     link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
     hub.wait_for(1)
-    return link, hub, Heartbeat(1, 0, -1, (), 0, {}, 0)
+    return link, hub, Heartbeat(1, 0, (), (), 0, {}, 0)
 
 
 def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
@@ -58,7 +58,7 @@ def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
 
 @pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2"), ("float16", "<f2")])
 def test_weights_are_rounded_and_encoded_once_for_all_workers(dtype: WeightsDtype, sent: str) -> None:
-    link, hub, _ = hub_with_a_worker(dtype)
+    link, hub, _ = hub_with_a_worker(dtype, lanes=2)
     link.inbox.append((b"w1", Hello(PROTOCOL_VERSION, "w1", "host", 2, 2, "fake", 1)))
     hub.wait_for(2)
     parameters = np.array([1.00001, -2.0], np.float32)
@@ -113,12 +113,12 @@ def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixtur
     """As after a restart of the learner, from every worker that went on saying Heartbeat."""
     link, hub, _ = hub_with_a_worker()
     caplog.set_level(logging.INFO)
-    link.inbox += [(b"w1", Heartbeat(7, number, -1, (), 0, {}, 0)) for number in range(100)]
+    link.inbox += [(b"w1", Heartbeat(7, number, (), (), 0, {}, 0)) for number in range(100)]
     link.now += PULSE_S
     hub.pulse()
     assert [record.getMessage() for record in caplog.records] == ["worker w1 was told to join again: its session had ended"]
     link.now += 100
-    link.inbox.append((b"w1", Heartbeat(7, 100, -1, (), 0, {}, 0)))
+    link.inbox.append((b"w1", Heartbeat(7, 100, (), (), 0, {}, 0)))
     hub.pulse()
     assert caplog.records[-1].getMessage().endswith("had ended (99 more like this since the last line)")
 
@@ -133,7 +133,7 @@ def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCa
 
     def poll_while_it_works(timeout_s: float) -> bool:
         steps = int(10 * min(link.now, steps_until_s))
-        link.inbox.append((b"w0", msgspec.structs.replace(heartbeat, version=0, tickets=(0,), steps=steps)))
+        link.inbox.append((b"w0", msgspec.structs.replace(heartbeat, versions=(0,), tickets=(0,), steps=steps)))
         if link.now > arrives_s:
             link.inbox.append((b"w0", fake_rollout(1, 0, 0, 0, 0)))
         link.now += timeout_s

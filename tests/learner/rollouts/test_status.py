@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zmq
 
-from learner.members.events import Event, RejoinRequested, RolloutDropped, WorkerLeft, describe
+from learner.members.events import Event, RejoinRequested, WorkerLeft, describe
 from learner.members.membership import MAX_LATE_ACTIONS
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.status import status
@@ -37,7 +37,7 @@ def told(learner: Learner, waiting: str = "") -> Status:
 def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
     seen = learner.coordinator.members[peer].replies
     held = tuple(learner.tickets(peer))
-    learner.says(peer, Heartbeat(learner.session(peer), seen, 0, held, steps, {}, resident))
+    learner.says(peer, Heartbeat(learner.session(peer), seen, (0,), held, steps, {}, resident))
 
 
 def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> None:
@@ -59,7 +59,7 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
 
 
 def late(learner: Learner, peer: bytes, actions: int) -> None:
-    learner.says(peer, Heartbeat(learner.session(peer), 0, 0, (), 0, {}, 0, actions))
+    learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), (), 0, {}, 0, actions))
 
 
 def test_late_actions_are_counted_once_also_when_a_worker_joins_again() -> None:
@@ -113,7 +113,7 @@ def test_speed_is_measured_between_two_accounts_that_are_apart() -> None:
     counts(learner, b"a", steps=1_000, resident=5)
     assert told(learner).workers[0].steps_per_s == 0.0  # nobody knows since when
     learner.now += 0.1
-    counts(learner, b"a", steps=1_010)  # early, to acknowledge weights
+    counts(learner, b"a", steps=1_010)  # early
     learner.now += 1.9
     counts(learner, b"a", steps=1_400, resident=6)
     worker = told(learner).workers[0]
@@ -124,7 +124,7 @@ def test_weights_count_as_held_when_the_worker_says_so() -> None:
     learner = Learner()
     learner.joins(b"a")
     assert told(learner).workers[0].version == -1
-    learner.beats(b"a", version=0)
+    learner.beats(b"a", versions=(0,))
     assert told(learner).workers[0].version == 0
 
 
@@ -241,23 +241,9 @@ def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event(
     assert "1 transitions that it sent are counted, not used" in describe(learner.coordinator.events[0])
 
 
-def test_a_rollout_that_is_too_old_is_an_event() -> None:
-    learner = Learner(lanes=1, max_lag=1)
-    learner.joins(b"a")
-    learner.deliver_all()
-    learner.publish(1)
-    learner.publish(2)
-    learner.coordinator.events.clear()
-    assert learner.coordinator.take() is None
-    stale = [event for event in learner.coordinator.events if isinstance(event, RolloutDropped)]
-    assert stale
-    assert stale[0].lag == 2
-    assert "2 versions old" in describe(stale[0])
-
-
 EVENTS: list[tuple[Event, dict[str, Any]]] = [
     (WorkerLeft("w0", "was killed", 2, False), {"event": "left", "worker": "w0", "why": "was killed", "tickets": 2}),
-    (RolloutDropped(3, 2, 640), {"event": "stale", "lane": 3, "lag": 2, "transitions": 640}),
+    (RejoinRequested("w0", 7, 640), {"event": "told", "worker": "w0", "session": 7, "late": 640}),
 ]
 
 

@@ -161,7 +161,7 @@ def watch(learner: Learner, timeouts: CallTimeouts = TIMEOUTS) -> StallWatch:
 
 def beats(learner: Learner, peer: bytes, steps: int) -> None:
     held = tuple(learner.tickets(peer))
-    learner.says(peer, Heartbeat(learner.session(peer), 0, 0, held, steps, {}, 0))
+    learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), held, steps, {}, 0))
 
 
 def test_a_run_in_which_nothing_happens_stands_still() -> None:
@@ -247,7 +247,7 @@ def about_to_evaluate() -> Learner:
     learner.joins(A)
     learner.deliver_all()
     assert learner.coordinator.take() is not None
-    learner.balanced(learner.coordinator.publish(1, PARAMETERS, BUFFERS, deal=False))
+    learner.coordinator.publish(1, PARAMETERS, BUFFERS)
     learner.joins(B, host="other")
     return learner
 

@@ -50,7 +50,7 @@ class Unreliable:
         """The process of this worker dies. It is started again."""
         member = self.coordinator.members[f"w{worker}".encode()]
         if after_steps:
-            self.hears(member.peer, Heartbeat(member.session, 0, 0, tuple(member.tickets), 9, {}, 0))
+            self.hears(member.peer, Heartbeat(member.session, 0, (0,), tuple(member.tickets), 9, {}, 0))
         why = "was killed by SIGSEGV in a reset of its environment"
         exits = (WorkerExit(member.hello.worker, member.hello.process_nonce, why, failed=True),)
         self.hears(b"supervisor", Alive((), exits))
@@ -60,9 +60,8 @@ class Unreliable:
         """Every lane collects, and an update is made of it. Raises what ends the run."""
         self.link.now += seconds
         for number, ticket in list(self.coordinator.tickets.items()):
-            member, lane = self.coordinator.members[ticket.peer], self.coordinator.lanes[ticket.lane]
-            rollout = fake_rollout(member.session, ticket.lane, number, self.coordinator.version, lane.next_sequence)
-            self.hears(ticket.peer, rollout)
+            session = self.coordinator.members[ticket.peer].session
+            self.hears(ticket.peer, fake_rollout(session, ticket.lane, number, ticket.version, ticket.sequence))
         self.hub.gather()
         self.publishes()
 

@@ -45,7 +45,7 @@ class Run:
         for more in (0, per_s):
             self.learner.now += 1.0
             held = tuple(self.learner.tickets(peer))
-            self.learner.says(peer, Heartbeat(session, 0, 0, held, steps + int(more), {}, 0))
+            self.learner.says(peer, Heartbeat(session, 0, (0,), held, steps + int(more), {}, 0))
 
     @property
     def line(self) -> str:
@@ -123,8 +123,7 @@ def test_with_a_lag_every_lane_that_may_bring_the_next_rollout_counts_once() -> 
 @pytest.mark.parametrize(("max_lag", "idle"), [(0, ", 1 of 1 workers waiting for weights"), (1, "")])
 def test_while_it_learns_only_workers_without_a_ticket_wait(max_lag: int, idle: str) -> None:
     run = Run(max_lag=max_lag)
-    for number in run.learner.tickets()[:2]:
-        run.learner.delivers(number)
+    run.learner.deliver_round()
     run.learner.take()
     run.turn("learning")
     assert run.line == ""
@@ -179,7 +178,7 @@ def test_an_evaluation_says_how_far_it_is_and_who_is_held_up(purpose: Purpose, w
     run = Run(workers=(A, B))
     run.learner.deliver_all()
     run.learner.take()
-    run.learner.balanced(run.learner.coordinator.publish(1, PARAMETERS, BUFFERS, deal=False))
+    run.learner.coordinator.publish(1, PARAMETERS, BUFFERS)
     run.turn("evaluating")
     plan = EvaluationPlan.of(10, seed=1, copies=2, max_steps=5_000, purpose=purpose)
     run.learner.balanced(run.learner.coordinator.begin_evaluation(plan))
@@ -199,7 +198,7 @@ def test_if_the_members_only_act_the_worker_that_steps_is_named() -> None:
     acting.learner.now += 5.0
     stepping.learner.now = acting.learner.now
     for peer in (A, B):
-        stepping.learner.says(peer, Heartbeat(stepping.learner.session(peer), 0, 0, (), 0, {}, 0))
+        stepping.learner.says(peer, Heartbeat(stepping.learner.session(peer), 0, (), (), 0, {}, 0))
     stepping.does(B, "resetting", 4.0)
     acting.stepping = list(stepping.learner.coordinator.members.values())
     assert acting.line == "waiting 5 s for lanes 0, 1 (worker b on host-of-b: in reset for 4 s)"

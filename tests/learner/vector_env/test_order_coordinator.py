@@ -165,7 +165,7 @@ def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
 
 
 def beat(made: OrderCoordinator, peer: bytes, now: float, steps: int = 0) -> None:
-    made.receive(peer, Heartbeat(made.members[peer].session, 0, -1, (), steps, {}, 0), now)
+    made.receive(peer, Heartbeat(made.members[peer].session, 0, (), (), steps, {}, 0), now)
 
 
 def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
@@ -189,7 +189,7 @@ def test_a_worker_that_was_given_up_is_told_to_join_again() -> None:
     made = order_coordinator(A)
     session = made.members[A].session
     made.remove_silent(TIMEOUT_S + 1)
-    assert made.receive(A, Heartbeat(session, 0, -1, (), 0, {}, 0), 9.0) == [(A, Rejoin(session))]
+    assert made.receive(A, Heartbeat(session, 0, (), (), 0, {}, 0), 9.0) == [(A, Rejoin(session))]
     assert made.receive(A, Goodbye(session, "told to stop", ()), 9.0) == []
 
 
@@ -206,7 +206,7 @@ def test_what_was_lost_on_the_way_is_said_again() -> None:
     session = made.members[A].session
     said: list[list[object]] = []
     for replies, held in ((0, ()), (1, (order_ticket(order),)), (2, ()), (2, ())):
-        outs = made.receive(A, Heartbeat(session, replies, -1, held, 0, {}, 0), 1.0)
+        outs = made.receive(A, Heartbeat(session, replies, (), held, 0, {}, 0), 1.0)
         said.append([message for _, message in outs if isinstance(message, Step)])
     assert said == [[], [], [order], []], "again only once it must have arrived, and once for each time"
 
