@@ -2,7 +2,7 @@
 
 Rule: both sides run the same command lines (`RUNS`) on this machine, with the same packages: this tree with 1 and with 3
 workers, and a worktree of the commit, which is made for it and removed, with 3. What both sides name is compared: arrays of
-policies, columns of metrics without those of time, evaluations, arrays of recorded datasets, and the state of the algorithm
+policies, columns of metrics without those that tell of time, evaluations, arrays of recorded datasets, and the state of the algorithm
 in the newest checkpoint. A name that only one side has is printed and is no difference.
 
 Exit code 1: something differs that `--expect-different` does not name, or a side refused such a run.
@@ -53,6 +53,12 @@ RUNS: dict[str, tuple[str, ...]] = {
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
     "per": (f"train CartPole-v1 --algo dqn --replay prioritized --n-step 3 --normalize-observations {REPLAY}",),
+    "ppo at lag 1": (f"train CartPole-v1 --algo ppo --max-lag 1 {ON_POLICY}",),
+    "impala at lag 2": (f"train CartPole-v1 --algo impala --max-lag 2 {ON_POLICY}",),
+    "lstm at lag 2": (f"train workers.envs.toy:Recall-v0 --algo ppo --core lstm --core-size 16 --max-lag 2 {ON_POLICY}",),
+    "masks at lag 1": (f"train Taxi-v4 --algo a2c --action-masks info --max-lag 1 {ON_POLICY}",),
+    "dqn at lag 1": (f"train CartPole-v1 --algo dqn --max-lag 1 {REPLAY}",),
+    "sac at lag 2": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 --max-lag 2 {REPLAY}",),
     "prior": (f"train CartPole-v1 --algo dqn --prior {RECORDED} --prior-steps 20 {REPLAY}",),
     "record": (
         f"train CartPole-v1 --algo a2c --record {RECORDED} {ON_POLICY}",
@@ -61,7 +67,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     ),
 }
 """The commands of each run, in one folder. COMMON is added to `train`, and RUN is its run folder."""
-TIMES = ("stage/", "time/fps", "time/time_elapsed")
+TIMES = ("stage/", "time/fps", "time/time_elapsed", "ledger/transitions_received", "ledger/transitions_waiting")
 EVALUATED = ("env_steps", "updates", "return_mean_100", "evaluation", "best")
 PARTS = ("policy", "metrics", "evaluation", "dataset", "checkpoint")
 

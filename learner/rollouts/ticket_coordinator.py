@@ -248,6 +248,10 @@ class TicketCoordinator:
         """End the evaluation, also one that is not done. Returns its episodes, in the order of their seeds."""
         return self.evaluation.end()
 
+    def awaited(self) -> list[Ticket]:
+        """The outstanding tickets of the next update."""
+        return [ticket for ticket in self.tickets.values() if ticket.round == self._rounds.next]
+
     def rollouts_waiting(self) -> int:
         """Number of rollouts that have come and were not taken."""
         return sum(map(len, self.ready.values()))

@@ -1,9 +1,9 @@
 """Who waits for whom in a run, and for what share of the time: one line. Pure: the state and `now` in, a sentence out.
 
 Rule: what takes less than `LONG_S` is not said. Between two long waits for rollouts, the line tells of the last one, so that
-it does not come and go. While the learner waits, the line names lanes whose tickets are with workers: with a lag above 0,
-any of these may bring the next rollout. While it learns, the workers that hold no ticket wait for weights. The shares are
-those of training since the learner started: evaluations do not count.
+it does not come and go. While the learner waits, the line names the lanes whose rollouts the next update lacks. While it
+learns, the workers that hold no ticket wait for weights. The shares are those of training since the learner started:
+evaluations do not count.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class LearnerTime:
             text = self._learning(now)
         elif not members:
             text = f"waiting {lasts_s:.0f} s for {self._no_worker()}"
-        elif self._coordinator.tickets and self.phase == "gathering":
+        elif self.phase == "gathering" and self._coordinator.awaited():
             text = f"waiting {lasts_s:.0f} s for {self._awaited(now)}"
         if text and (total_s := spent_s["gathering"] + spent_s["learning"]) >= SHARES_AFTER_S:
             gather, learn = spent_s["gathering"] / total_s, spent_s["learning"] / total_s
@@ -81,7 +81,7 @@ class LearnerTime:
     def _awaited(self, now: float) -> str:
         """The lanes of the worker that is held up longest, that worker, and how many other lanes are awaited."""
         lanes, members = dict[bytes, set[int]](), self._coordinator.members
-        for ticket in self._coordinator.tickets.values():
+        for ticket in self._coordinator.awaited():
             lanes.setdefault(ticket.peer, set()).add(ticket.lane)
         peer = max(lanes, key=lambda peer: held_up(members[peer], now))
         mine, more = sorted(lanes.pop(peer)), sum(map(len, lanes.values()))
