@@ -91,7 +91,7 @@ class RolloutService:
 
     Use it in a `with` statement and from one thread. While you compute, a thread of the service answers the workers, so a
     long computation loses none of them. Iterating gives a `RolloutBatch` for each update; it waits until one rollout of each
-    lane is there. A batch can be at most `max_lag` versions old.
+    lane is there. It was collected under the weights that were the newest when `gather` was called `max_lag` batches before.
 
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", millrace.MLP(64), workers=1, envs=4, rollout_steps=8) as service:
@@ -155,7 +155,7 @@ class RolloutService:
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._owner = threading.get_ident()
-        self._taken, self._published = 0, 0
+        self._published = False
         self._window, self._steps_before, self._began_s = EpisodeWindow(), self.env_steps, time.monotonic()
         self._moments: Moments | None = None
         self._resources = ExitStack()
@@ -202,7 +202,7 @@ class RolloutService:
         return self._version
 
     def publish(self, parameters: Mapping[str, Array] | Array, buffers: Mapping[str, Array] | Array | None = None) -> int:
-        """Send new weights to all workers; they may now collect the rollouts of the next batch. Returns their version.
+        """Set the newest weights, under which rollouts are collected from the next `gather` on. Returns their version.
 
         `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
         that normalizes observations; by default those of `moments`. They are copied.
@@ -218,9 +218,9 @@ class RolloutService:
             buffers = self._moments.buffers()
         flat, flat_buffers = self.policy.flat(parameters), self.policy.flat_buffers(buffers)
         with self._lock:
-            self._service.publish(self._version + 1, flat, flat_buffers)
+            self._service.publish(self._version + 1, flat, flat_buffers, deal=False)
         self._version += 1
-        self._published += 1
+        self._published = True
         return self._version
 
     @property
@@ -250,13 +250,10 @@ class RolloutService:
         (8, 2)
         """
         self._check_open()
-        if self._taken >= self._published + self.config.max_lag or not self._published:
-            raise UsageError(
-                f"rollout service: expected new weights before the next batch (max_lag {self.config.max_lag}); call publish"
-            )
+        if not self._published:
+            raise UsageError("rollout service: expected weights before the first batch; call publish")
         with self._lock, self._interrupts:
             arrived = self._service.gather()
-        self._taken += 1
         batch = self._batch(arrived)
         self.env_steps += batch.env_steps
         self._window.extend(batch.episodes)
