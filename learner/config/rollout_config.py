@@ -54,8 +54,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: Free[Natural] = 0
-    """The lag of rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take turns.
-    Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results are reproducible either way.
+    """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
+    turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
     """
     vector: Free[Literal["auto", "loop", "native", "envpool"]] = "auto"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
