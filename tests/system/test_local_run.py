@@ -79,6 +79,28 @@ def test_the_curve_does_not_depend_on_the_number_of_workers(tmp_path: Path, env:
     assert (other / "policy.safetensors").read_bytes() != policies[1, "inproc"], "the seed changes nothing"
 
 
+class Uneven(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Its steps take longer in some processes than in others."""
+
+    def step(self, action: Any) -> Any:
+        time.sleep(0.001 * (os.getpid() % 4))
+        return self.env.step(action)
+
+
+def test_with_a_lag_the_curve_does_not_depend_on_who_is_fast(tmp_path: Path) -> None:
+    policies, max_lag = set(), 2
+    for workers, transport in ((1, "inproc"), (3, "ipc"), (4, "ipc")):
+        folder = millrace.train(
+            lambda: Uneven(gymnasium.make("CartPole-v1")),
+            run_dir=str(tmp_path), seed=3, workers=workers, transport=transport, max_lag=max_lag, envs=4, rollout_steps=16,
+            steps=640, eval_every=200, batch_size=64, **SMALL,
+        ).path  # fmt: skip
+        policies.add((folder / "policy.safetensors").read_bytes())
+        lags = [row["lag/max"] for row in read_rows(folder / "metrics.jsonl")]
+        assert lags == [min(update, max_lag) for update in range(len(lags))]
+    assert len(policies) == 1
+
+
 def test_compressing_rollouts_does_not_change_the_run(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
     plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
@@ -111,15 +133,6 @@ def test_a_run_ends_when_its_weights_do_not_fit(tmp_path: Path) -> None:
     (folder,) = tmp_path.glob("runs*/*")
     assert "weights_dtype float16" in summary(folder)["stop_reason"]
     assert list((folder / "checkpoints").iterdir())
-
-
-@pytest.mark.parametrize("max_lag", [0, 1, 4])
-def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
-    folder = run(tmp_path, "CartPole-v1", max_lag=max_lag, steps=8_000, **SMALL)
-    rows = read_rows(folder / "metrics.jsonl")
-    assert max(row["lag/max"] for row in rows) == max_lag, "the bound is not reached, so it does not show"
-    assert all(row["lag/mean"] <= row["lag/max"] and "drop/stale" in row for row in rows)
-    assert_balanced(summary(folder)["ledger"])
 
 
 @pytest.mark.parametrize("max_lag", [0, 1])
