@@ -32,7 +32,7 @@ from protocol.logs.notices import log_notice
 PROGRESS = Progress(
     run="runs/CartPole-v1-ppo-s1", env_steps=62_208, total_steps=100_000, updates=243, wall_s=14.8, steps_per_s=4210.3,
     return_mean=231.44, length_mean=231.0, lag_mean=0.5, lag_max=1, workers_alive=1, workers_expected=2,
-    ledger={"issued": 976, "used": 970, "stale": 2, "lost": 0, "outstanding": 4, "transitions_used": 62_208,
+    ledger={"issued": 976, "used": 970, "lost": 2, "outstanding": 4, "transitions_used": 62_208,
             "messages_bad": 1},
     stages={"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 5.0},
 )  # fmt: skip
@@ -92,7 +92,7 @@ def test_the_block_has_everything() -> None:
         "4,210 steps/s   return 231.4   lag 0.5 (max 1)   workers 1 of 2   update 243",
         "learner time  wait 25% · update 75%",
         "worker time   step 100%",
-        "tickets       issued 976 · used 970 · stale 2 · outstanding 4",
+        "tickets       issued 976 · used 970 · lost 2 · outstanding 4",
         "transitions   used 62,208",
         "messages      bad 1",
         "run           runs/CartPole-v1-ppo-s1",

@@ -323,7 +323,7 @@ class OneRun:
         summary: dict[str, Any] = json.loads((run / "summary.json").read_text())
         T, steps, most_lag = (int(str(self.flags.get(name, 0))) for name in ("rollout-steps", "steps", "max-lag"))
         ledger = accounted(summary, lanes=LANES, rows=T * ENVS // LANES, max_lag=most_lag)
-        self.account.tickets.update({name: ledger[name] for name in ("issued", "used", "stale", "lost", "outstanding")})
+        self.account.tickets.update({name: ledger[name] for name in ("issued", "used", "lost", "outstanding")})
         rows = read_rows(run / "metrics.jsonl")
         assert [row["time/iterations"] for row in rows] == list(range(1, summary["updates"] + 1)), "rows of metrics"
         assert all("train/n_updates" in row for row in rows[1:] if "eval/mean_reward" not in row)

@@ -81,5 +81,5 @@ def test_the_commands_of_the_manifest_train(capsys: pytest.CaptureFixture[str], 
     summary = started.summary()
     assert summary["stop_reason"] == "all steps done", summary
     assert summary["ledger"]["issued"] == summary["ledger"]["used"] + sum(
-        summary["ledger"][how] for how in ("outstanding", "stale", "lost")
+        summary["ledger"][how] for how in ("outstanding", "lost")
     )

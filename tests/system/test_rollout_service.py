@@ -59,7 +59,7 @@ def test_a_killed_worker_is_replaced_and_no_batch_is_missing() -> None:
         wait_for(lambda: service.workers() == ["w0", "w1"], 60, "the worker that replaces the killed one")
         counts = service.ledger()
         assert counts["used"] == 16
-        assert counts["issued"] == counts["used"] + counts["outstanding"] + counts["stale"] + counts["lost"]
+        assert counts["issued"] == counts["used"] + counts["outstanding"] + counts["lost"]
     assert not children()
 
 

@@ -29,8 +29,8 @@ from learner.run_folder.run_folder import RunFolder
 from protocol.errors import RunError, UsageError
 
 ROOT = Path(__file__).parents[3]
-LEDGER = {"issued": 30, "used": 20, "outstanding": 4, "stale": 5, "lost": 1, "transitions_received": 900,
-          "transitions_used": 800, "transitions_waiting": 50, "transitions_stale": 50, "messages_bad": 0}  # fmt: skip
+LEDGER = {"issued": 30, "used": 20, "outstanding": 4, "lost": 6, "transitions_received": 900,
+          "transitions_used": 800, "transitions_waiting": 50, "transitions_late": 50, "messages_bad": 0}  # fmt: skip
 STAGES = {"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 2.0, "worker_wait": 2.0}
 
 
@@ -152,22 +152,22 @@ def test_each_run_has_its_headline(tmp_path: Path) -> None:
 def test_a_run_that_goes_on_is_told_as_far_as_it_got(tmp_path: Path) -> None:
     run = a_run(tmp_path, finished=False)
     assert "seed 1 – not evaluated 101.0 2,000 50 40.0 s 20 not finished" in text_of(sections.results(report_data(run)))
-    assert "30 = 20 + 4 + 5 + 1 balances" in Reader(page([run])).text
+    assert "30 = 20 + 4 + 6 balances" in Reader(page([run])).text
     new = a_run(tmp_path, seed=2, finished=False, length=1)
     text = Reader(page([new])).text
     assert "PPO: no episode has ended yet" in text
     (new / "metrics.jsonl").write_text("")
-    assert "Tickets issued used outstanding stale lost seed 2 not known" in Reader(page([new])).text
+    assert "Tickets issued used outstanding lost seed 2 not known" in Reader(page([new])).text
 
 
 def test_the_ledger_balances_or_says_by_how_much_it_does_not(tmp_path: Path) -> None:
     good = a_run(tmp_path)
-    bad = a_run(tmp_path, seed=2, ledger={**LEDGER, "used": 13, "transitions_stale": 5000, "messages_bad": 3})
+    bad = a_run(tmp_path, seed=2, ledger={**LEDGER, "used": 13, "transitions_late": 5000, "messages_bad": 3})
     text = Reader(page([good, bad])).text
-    assert "seed 1 30 = 20 + 4 + 5 + 1 balances" in text
-    assert "seed 2 30 = 13 + 4 + 5 + 1 off by 7" in text
-    assert "seed 1 900 = 800 + 50 + 50 + 0 + 0 + 0 balances" in text
-    assert "seed 2 900 = 800 + 50 + 5,000 + 0 + 0 + 0 off by −4,950" in text
+    assert "seed 1 30 = 20 + 4 + 6 balances" in text
+    assert "seed 2 30 = 13 + 4 + 6 off by 7" in text
+    assert "seed 1 900 = 800 + 50 + 0 + 50 + 0 balances" in text
+    assert "seed 2 900 = 800 + 50 + 0 + 5,000 + 0 off by −4,950" in text
     assert "3 messages could not be read." in text
 
 

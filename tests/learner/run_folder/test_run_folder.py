@@ -192,15 +192,15 @@ def test_a_row_has_the_names_that_users_know(tmp_path: Path) -> None:
     log = MetricsLog(tmp_path)
     progress = Progress(
         env_steps=256, updates=1, wall_s=2.0, steps_per_s=128.0, return_mean=20.5, length_mean=20.0, lag_mean=0.5,
-        lag_max=1, ledger={"issued": 8, "used": 7, "stale": 1}, stages={"update": 0.5},
+        lag_max=1, ledger={"issued": 8, "used": 7, "lost": 1}, stages={"update": 0.5},
     )  # fmt: skip
     log.write(progress, {"train/approx_kl": 0.01, "loss": float("nan")})
     log.close()
     (row,) = read_rows(tmp_path / "metrics.jsonl")
     assert row == {
         "rollout/ep_rew_mean": 20.5, "rollout/ep_len_mean": 20.0, "time/fps": 128.0, "time/iterations": 1,
-        "time/time_elapsed": 2.0, "time/total_timesteps": 256, "lag/mean": 0.5, "lag/max": 1, "drop/stale": 1,
-        "ledger/issued": 8, "ledger/used": 7, "ledger/stale": 1, "stage/update": 0.5, "train/approx_kl": 0.01,
+        "time/time_elapsed": 2.0, "time/total_timesteps": 256, "lag/mean": 0.5, "lag/max": 1,
+        "ledger/issued": 8, "ledger/used": 7, "ledger/lost": 1, "stage/update": 0.5, "train/approx_kl": 0.01,
         "train/loss": None,
     }  # fmt: skip
 
