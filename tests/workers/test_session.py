@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -84,12 +85,20 @@ def lanes(*numbers: int, below: int = 0, ahead: tuple[int, ...] = (), incarnatio
 
 
 def collect(
-    *permits: tuple[int, int], version: int = 0, incarnation: int = 0, received: tuple[Received, ...] | None = None
+    *tickets: tuple[int, int],
+    version: int = 0,
+    incarnation: int = 0,
+    first: int = 0,
+    received: tuple[Received, ...] | None = None,
 ) -> Collect:
-    """Permission for (ticket, lane) pairs; the lanes named are all that the worker has, unless `received` says more."""
-    named = sorted({lane for _, lane in permits})
-    theirs = lanes(*named, incarnation=incarnation) if received is None else received
-    return Collect(SESSION, version, tuple(Permit(ticket, lane, incarnation) for ticket, lane in permits), theirs)
+    """Permission for (ticket, lane) pairs, in the order of their sequence, which begins with `first` in each lane.
+
+    The lanes named are all that the worker has, unless `received` says more.
+    """
+    sequences: defaultdict[int, Iterator[int]] = defaultdict(lambda: itertools.count(first))
+    permits = tuple(Permit(ticket, lane, incarnation, next(sequences[lane])) for ticket, lane in tickets)
+    theirs = lanes(*sorted(sequences), incarnation=incarnation) if received is None else received
+    return Collect(SESSION, version, permits, theirs)
 
 
 def joining() -> Session:
@@ -103,7 +112,6 @@ def ready(*messages: ToWorker, version: int | None = 0) -> Session:
     session.handle(Welcome(SESSION, FIRST, RUN), 0.0)
     if version is not None:
         session.handle(weights(version), 0.0)
-        session.tick(0.0)  # acknowledges them
     for message in messages:
         session.handle(message, 0.0)
     return session
@@ -113,6 +121,12 @@ def task_of(session: Session) -> Task:
     task = session.next_work()
     assert isinstance(task, Task)
     return task
+
+
+def versions_held(session: Session) -> tuple[int, ...]:
+    """As the next Heartbeat lists them."""
+    (heartbeat,) = sent(session.tick(session.due_s), Heartbeat)
+    return heartbeat.versions
 
 
 def collected(session: Session) -> list[Rollout]:
@@ -286,7 +300,7 @@ def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_on
 def test_collect_also_lists_what_was_received() -> None:
     session = ready(collect((0, 0)))
     collected(session)
-    session.handle(collect((1, 0), received=lanes(0, below=1)), 0.1)
+    session.handle(collect((1, 0), first=1, received=lanes(0, below=1)), 0.1)
     assert held_count(session) == 1  # the new ticket
 
 
@@ -310,31 +324,17 @@ def test_the_sequence_counts_the_rollouts_of_an_incarnation_of_the_lane() -> Non
     assert [rollout.sequence for _ in range(3) for rollout in collected(session)] == [0, 1, 2]
 
 
-def test_a_rollout_starts_only_under_weights_at_least_as_new_as_its_ticket_asks_for() -> None:
-    session = ready(collect((0, 0), version=2), version=1)
-    assert session.next_work() is None
-    session.handle(weights(2), 0.2)
-    assert task_of(session).weights.version == 2
-
-
-def test_without_weights_nothing_starts() -> None:
-    session = ready(collect((0, 0), version=0), version=None)
-    assert session.next_work() is None
-
-
-def test_a_task_has_the_newest_weights() -> None:
-    session = ready(weights(3), weights(2), collect((0, 0), version=1))
-    assert task_of(session).weights.version == 3
-
-
-def test_a_ticket_that_waits_for_newer_weights_does_not_delay_an_older_one_of_its_lane() -> None:
-    session = ready(collect((0, 0), version=5), collect((1, 0), version=0))
-    assert [assignment.ticket for assignment in task_of(session).assignments] == [1]
-
-
-def test_the_oldest_startable_ticket_of_every_lane_is_taken_together_in_lane_order() -> None:
+def test_the_next_rollout_of_every_lane_is_collected_together_in_lane_order() -> None:
     session = ready(collect((5, 2), (3, 2), (9, 0), (4, 1)))
-    assert [(a.lane, a.ticket) for a in task_of(session).assignments] == [(0, 9), (1, 4), (2, 3)]
+    assert [(a.lane, a.ticket) for a in task_of(session).assignments] == [(0, 9), (1, 4), (2, 5)]
+
+
+def test_a_permit_is_not_started_before_an_earlier_one_that_has_not_come() -> None:
+    """Else the rollouts of a lane, and the weights that act in them, would depend on what the network loses."""
+    session = ready(collect((1, 0), first=1))
+    assert session.next_work() is None
+    session.handle(collect((0, 0)), 0.1)
+    assert [(rollout.ticket, rollout.sequence) for _ in range(2) for rollout in collected(session)] == [(0, 0), (1, 1)]
 
 
 def test_one_task_at_a_time() -> None:
@@ -395,7 +395,7 @@ def test_the_worker_holds_at_most_what_the_learner_has_outstanding() -> None:
     issued = arrived = 0
     for _ in range(100):
         fresh = [(issued + n, 0) for n in range(5)]
-        session.handle(collect(*fresh, received=lanes(0, below=arrived)), 0.1)
+        session.handle(collect(*fresh, first=issued, received=lanes(0, below=arrived)), 0.1)
         issued += 5
         assert held_count(session) <= 5
         while session.next_work() is not None:
@@ -408,28 +408,104 @@ def test_the_worker_holds_at_most_what_the_learner_has_outstanding() -> None:
 def test_the_number_of_remembered_tickets_is_bounded() -> None:
     session = ready()
     for ticket in range(200):
-        session.handle(collect((ticket, 0), received=lanes(0, below=ticket)), 0.1)
+        session.handle(collect((ticket, 0), first=ticket, received=lanes(0, below=ticket)), 0.1)
         collected(session)
     assert len(session._current.rollouts._lanes[0].finished) <= REMEMBERED_TICKETS == 64
 
 
-# -------------------------------------------------------------------- acknowledging
+# -------------------------------------------------------------------- weights
 
 
-def test_weights_are_acknowledged_at_once_when_nothing_else_does() -> None:
-    session = ready()
-    assert session.tick(0.1) == []
-    session.handle(weights(1), 0.2)
-    (heartbeat,) = sent(session.tick(0.2), Heartbeat)
-    assert heartbeat.version == 1
-    assert session.tick(0.3) == []  # once
+def test_without_weights_nothing_starts() -> None:
+    session = ready(collect((0, 0), version=0), version=None)
+    assert session.next_work() is None
 
 
-def test_a_rollout_acknowledges_the_weights_it_was_acted_under() -> None:
-    session = ready(weights(1), collect((0, 0)))
-    (rollout,) = collected(session)
-    assert rollout.version == 1
-    assert session.tick(0.1) == []
+def test_a_rollout_starts_only_under_exactly_the_weights_that_its_order_names() -> None:
+    session = ready(collect((0, 0), version=2), weights(3), version=1)
+    assert session.next_work() is None
+    session.handle(weights(2), 0.2)
+    assert task_of(session).weights.version == 2
+
+
+def test_a_permit_does_not_overtake_one_whose_weights_have_not_come() -> None:
+    session = ready(collect((0, 0), version=1), collect((1, 0), version=2, first=1), weights(2))
+    assert session.next_work() is None
+    session.handle(weights(1), 0.1)
+    assert [(rollout.ticket, rollout.version) for _ in range(2) for rollout in collected(session)] == [(0, 1), (1, 2)]
+
+
+def test_lanes_of_the_lowest_version_go_first_and_different_versions_are_not_collected_together() -> None:
+    session = ready(collect((0, 0), version=1), collect((1, 1), (2, 2), version=0), weights(1))
+    collections = [[(rollout.ticket, rollout.version) for rollout in collected(session)] for _ in range(2)]
+    assert collections == [[(1, 0), (2, 0)], [(0, 1)]]
+
+
+def test_a_lane_whose_weights_have_come_does_not_wait_for_one_of_a_lower_version() -> None:
+    session = ready(collect((0, 0), version=1), collect((1, 1), version=2), weights(2))
+    assert [(rollout.ticket, rollout.version) for rollout in collected(session)] == [(1, 2)]
+
+
+def test_weights_are_kept_until_no_unfinished_ticket_names_them() -> None:
+    session = ready(collect((0, 0), (1, 0), version=0), weights(1))
+    held = [versions_held(session)]
+    for _ in range(2):
+        collected(session)
+        held.append(versions_held(session))
+    assert held == [(0, 1), (0, 1), (1,)]
+
+
+def test_weights_of_work_that_was_abandoned_are_kept() -> None:
+    session = ready(collect((0, 0), version=0), weights(1))
+    task_of(session)
+    session.work_ended([])
+    assert task_of(session).weights.version == 0
+
+
+def test_the_newest_weights_are_kept_though_no_ticket_names_them() -> None:
+    session = ready(collect((0, 0), version=0))
+    collected(session)
+    assert versions_held(session) == (0,)
+
+
+@pytest.mark.parametrize(
+    "message", [Release(SESSION, (LaneIncarnation(0, 0),)), HeartbeatReply(SESSION, 1, ())], ids=lambda m: type(m).__name__
+)
+def test_weights_that_only_a_released_lane_names_are_dropped(message: ToWorker) -> None:
+    session = ready(collect((0, 0), version=0), weights(1))
+    session.handle(message, 0.1)
+    assert versions_held(session) == (1,)
+
+
+def test_weights_that_come_before_their_order_are_kept_until_work_ends() -> None:
+    """The order was lost, and is sent again after a heartbeat; the weights would not be."""
+    session = ready(weights(1), weights(0), version=None)
+    session.handle(HeartbeatReply(SESSION, 1, ()), 0.1)
+    session.handle(Release(SESSION, (LaneIncarnation(7, 0),)), 0.1)
+    assert versions_held(session) == (0, 1)
+    session.handle(collect((0, 0), version=0), 0.2)
+    collected(session)
+    assert versions_held(session) == (1,)
+
+
+def test_weights_that_come_twice_are_ignored() -> None:
+    first = weights(0)
+    session = ready(first, weights(0), collect((0, 0)), version=None)
+    assert task_of(session).weights is first
+
+
+# -------------------------------------------------------------------- heartbeats
+
+
+def test_new_weights_are_worth_no_heartbeat_of_their_own() -> None:
+    session = ready(weights(1))
+    assert session.due_s == 1.0
+    assert session.tick(0.9) == []
+
+
+def test_a_heartbeat_lists_the_versions_of_the_weights_held_in_ascending_order() -> None:
+    session = ready(weights(7), weights(2), weights(5), version=None)
+    assert versions_held(session) == (2, 5, 7)
 
 
 def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
@@ -438,7 +514,7 @@ def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     session.update_statistics(Statistics(120, {"step": 0.5}, 0))
     assert session.tick(0.9) == []
     (heartbeat,) = sent(session.tick(1.0), Heartbeat)
-    assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"step": 0.5}, 0)
+    assert heartbeat == Heartbeat(SESSION, 4, (0,), (7, 8), 120, {"step": 0.5}, 0)
     assert session.due_s == 2.0
 
 
@@ -450,10 +526,8 @@ def test_a_heartbeat_lists_the_ticket_in_progress_and_no_finished_one() -> None:
     assert sent(session.tick(2.0), Heartbeat)[0].tickets == (8,)
 
 
-def test_before_the_first_weights_a_heartbeat_has_version_minus_one() -> None:
-    session = ready(version=None)
-    (heartbeat,) = sent(session.tick(1.0), Heartbeat)
-    assert heartbeat.version == -1
+def test_before_the_first_weights_a_heartbeat_lists_no_version() -> None:
+    assert versions_held(ready(version=None)) == ()
 
 
 # -------------------------------------------------------------------- lanes
@@ -535,7 +609,7 @@ def test_nothing_of_a_session_outlives_it() -> None:
     assert held_count(session) == 0
     assert session.next_work() is None
     (heartbeat,) = sent(session.tick(2.2), Heartbeat)
-    assert (heartbeat.session, heartbeat.replies, heartbeat.version, heartbeat.tickets) == (12, 0, -1, ())
+    assert (heartbeat.session, heartbeat.replies, heartbeat.versions, heartbeat.tickets) == (12, 0, (), ())
 
 
 def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_sent() -> None:
@@ -672,7 +746,7 @@ def test_no_ticket_is_accepted_while_draining() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
     session.stop()
-    assert session.handle(collect((1, 0)), 0.1) == []
+    assert session.handle(collect((1, 0), first=1), 0.1) == []
     effects = session.work_ended(fake_rollouts(task))
     assert sent(effects, Goodbye)[0].tickets == ()
 
@@ -824,5 +898,5 @@ def test_a_worker_sends_only_messages_for_a_learner() -> None:
 
 def test_weights_are_held_and_not_copied() -> None:
     parameters = np.zeros(3, np.float32)
-    session = ready(Weights(1, parameters, BUFFERS), collect((0, 0)))
+    session = ready(Weights(1, parameters, BUFFERS), collect((0, 0), version=1))
     assert task_of(session).weights.parameters is parameters

@@ -104,7 +104,7 @@ BUFFERS = np.ones(buffer_size(RUN.policy), np.float32)
 
 def said_to_a_worker(run: RunSpec, parameters: Array = PARAMETERS) -> list[ToWorker]:
     """To join, collect one rollout and leave."""
-    permits, received = (Permit(0, 0, 0),), (Received(0, 0, 0),)
+    permits, received = (Permit(0, 0, 0, 0),), (Received(0, 0, 0),)
     return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received), Drain("done")]
 
 
@@ -192,6 +192,13 @@ def test_a_worker_that_makes_its_policy_is_not_silent() -> None:
     assert "making" not in NO_ENVIRONMENT_CODE
 
 
+def log_prob_under(parameters: Array, lane: int = 0) -> object:
+    """Of the first rollout of this lane, as bytes."""
+    collector = random_collector(RUN)
+    collector.load(parameters, BUFFERS)
+    return bits(collect(collector, RUN, lanes=[lane])[0])["log_prob"]
+
+
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])
 def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> None:
     travelling = to_wire_dtype(PARAMETERS, dtype)
@@ -199,13 +206,32 @@ def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> 
     link = FakeLink([welcome, decode_to_worker(encode(weights)), *rest])
     assert work(link).exit_code == 0
     (rollout,) = (message for message in link.heard() if isinstance(message, Rollout))
-    found = []
-    for parameters in (to_float32(travelling), PARAMETERS):
-        collector = random_collector(RUN)
-        collector.load(parameters, BUFFERS)
-        found.append(bits(collect(collector, RUN)[0])["log_prob"])
-    assert rollout.log_prob.tobytes() == found[0]
-    assert (found[0] == found[1]) == (dtype == "float32")
+    assert rollout.log_prob.tobytes() == log_prob_under(to_float32(travelling))
+    assert (rollout.log_prob.tobytes() == log_prob_under(PARAMETERS)) == (dtype == "float32")
+
+
+class DrainsAfterTwo(FakeLink):
+    """A link whose learner says Drain when two rollouts have come."""
+
+    def send(self, frames: list[Buffer]) -> None:
+        super().send(frames)
+        if sum(len(each) > 1 for each in self.sent) == 2:
+            self.messages.append(Drain("done"))
+
+
+def test_each_rollout_of_a_worker_acts_under_the_weights_that_its_order_names() -> None:
+    """Both versions are held before the first rollout starts."""
+    received = (Received(0, 0, 0), Received(1, 0, 0))
+    orders = (Collect(1, version, (Permit(version, version, 0, 0),), received) for version in (0, 1))
+    parameters = PARAMETERS, -PARAMETERS
+    weights = (Weights(version, each, BUFFERS) for version, each in enumerate(parameters))
+    link = DrainsAfterTwo([Welcome(1, 1, RUN), *weights, *orders])
+    assert work(link).exit_code == 0
+    rollouts = [message for message in link.heard() if isinstance(message, Rollout)]
+    assert [(rollout.lane, rollout.version) for rollout in rollouts] == [(0, 0), (1, 1)]
+    assert [rollout.log_prob.tobytes() for rollout in rollouts] == [
+        log_prob_under(each, lane) for lane, each in enumerate(parameters)
+    ]
 
 
 @pytest.mark.parametrize("looks_open", [True, False])

@@ -196,8 +196,10 @@ class _SessionState:
     def release(self, lanes: Sequence[LaneIncarnation]) -> list[Effect]:
         """Drop these lanes."""
         released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
+        if not released:
+            return []
         self.drop_weights()
-        return [CloseLanes(released)] if released else []
+        return [CloseLanes(released)]
 
     def release_unlisted(self, received: Sequence[Received]) -> list[Effect]:
         """Drop the lanes that the learner does not list: their Release was lost.
