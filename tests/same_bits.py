@@ -2,8 +2,8 @@
 
 Rule: both sides run the same command lines (`RUNS`) on this machine, with the same packages: this tree with 1 and with 3
 workers, and a worktree of the commit, which is made for it and removed, with 3. What both sides name is compared: arrays of
-policies, columns of metrics without those that tell of time, evaluations, arrays of recorded datasets, and the state of the algorithm
-in the newest checkpoint. A name that only one side has is printed and is no difference.
+policies, columns of metrics without those that tell of time, evaluations, arrays of recorded datasets, and the state of the
+algorithm in the newest checkpoint. A name that only one side has is printed and is no difference.
 
 Exit code 1: something differs that `--expect-different` does not name, or a side refused such a run.
 """
