@@ -92,31 +92,24 @@ def test_episodes_are_those_of_the_rows() -> None:
     assert rewards >= sum(episode.reward for episode in episodes) > 0
 
 
-def test_a_batch_before_new_weights_is_refused() -> None:
-    with service() as made:
-        with pytest.raises(UsageError, match="call publish"):
-            made.gather()
-        made.publish(made.policy.initial())
+def test_a_batch_before_the_first_weights_is_refused() -> None:
+    with service() as made, pytest.raises(UsageError, match="call publish"):
         made.gather()
-        with pytest.raises(UsageError, match="expected new weights before the next batch"):
-            made.gather()
 
 
-def test_with_a_lag_a_batch_may_be_gathered_before_its_weights_are_published() -> None:
-    with service(max_lag=1) as made:
-        made.publish(made.policy.initial())
-        lags = []
-        for _ in range(4):
-            batch = made.gather()
-            lags.append(made.version - int(batch.version.min()))
-            made.publish(made.policy.initial())
-        made.gather()
-        made.gather()
-        with pytest.raises(UsageError, match="max_lag 1"):
-            made.gather()
-        assert max(lags) <= 1
+@pytest.mark.parametrize("max_lag", [0, 1, 2])
+def test_a_batch_acts_under_the_weights_that_were_the_newest_max_lag_batches_before(max_lag: int) -> None:
+    """One publishes any number of times between two batches: not at all, once, or twice."""
+    with service(max_lag=max_lag) as made:
+        newest, acted = [], []
+        for times in (1, 0, 2, 1, 2, 0):
+            for _ in range(times):
+                made.publish(made.policy.initial())
+            newest.append(made.version)
+            (version,) = set(made.gather().version.tolist())
+            acted.append(version)
+        assert acted == [newest[max(0, batch - max_lag)] for batch in range(6)]
         counts = made.ledger()
-        assert counts["used"] == 12
         assert counts["issued"] == counts["used"] + counts["outstanding"] + counts["lost"]
         assert sum(made.lags().values()) == counts["used"]
 
