@@ -6,6 +6,7 @@ longer than the grace time.
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
 import time
@@ -135,6 +136,19 @@ def test_a_resumed_run_equals_one_whose_lanes_were_started_anew(tmp_path: Path, 
         plain = run(tmp_path / "plain", **settings)
         policies = [(one / "policy.safetensors").read_bytes() for one in (plain, folder)]
         assert policies[0] != policies[1], "starting lanes anew changes nothing, so this shows nothing"
+
+
+def test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal(tmp_path: Path) -> None:
+    """They are not equal to one that went on: its first updates after the checkpoint use older weights."""
+    settings = {**VARIANTS["impala"], "max_lag": 2}
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "one", interrupts_at(STOP), **settings)
+    folder = folder_of(tmp_path / "one")
+    other = tmp_path / "other" / folder.name
+    shutil.copytree(folder, other)
+    run(tmp_path / "one", resume=folder, **settings)
+    run(tmp_path / "other", resume=other, **{**settings, "workers": 2})
+    assert_equal(folder, other)
 
 
 def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
