@@ -72,8 +72,8 @@ MUTANTS = [
     ),
     Mutant(
         "forgotten heartbeat", "session.hpp",
-        "due_s_ = now + run_.heartbeat_s, acknowledged_",
-        "due_s_ = now + 60, acknowledged_",
+        "due_s_ = now + run_.heartbeat_s;",
+        "due_s_ = now + 60;",
         "environment", "beats as often as", rules.HEARTBEAT, "none",
     ),
     Mutant(
@@ -84,8 +84,8 @@ MUTANTS = [
     ),
     Mutant(
         "steps counted by session", "session.hpp",
-        "version_ = acknowledged_ = -1, replies_ = 0;",
-        "version_ = acknowledged_ = -1, replies_ = 0, steps_ = 0;",
+        "replies_ = 0;\n    heard_s_",
+        "replies_ = 0, steps_ = 0;\n    heard_s_",
         "environment", "ignores an order of another session", rules.HEARTBEAT_STEPS, "0",
     ),
     Mutant(
@@ -254,28 +254,30 @@ MUTANTS = [
         "collector", "weights rounded to 16 bits", rules.LOG_PROB, "",
     ),
     Mutant(
-        "repeated ticket", "rollouts.hpp",
-        "held.tickets.erase(rollout->ticket), ++held.sequence",
-        "++held.sequence",
+        "repeated rollout", "rollouts.hpp",
+        "    send_rollout(*rollout);\n"
+        "    held.kept",
+        "    send_rollout(*rollout), send_rollout(*rollout);\n"
+        "    held.kept",
         "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 rollouts",
     ),
     Mutant(
-        "collects a repeated ticket again", "rollouts.hpp",
+        "ignores a repeated ticket", "rollouts.hpp",
         "for (const auto& rollout : held.kept) if (rollout->ticket == permit.ticket) return send_rollout(*rollout);",
         "",
-        "collector", "sends a lost rollout again", rules.ROLLOUT_ONCE, "another",
+        "collector", "sends a lost rollout again", rules.ROLLOUT_ONCE, "none within",
     ),
     Mutant(
-        "forgets finished tickets", "rollouts.hpp",
-        "held.finished.push_back(held.kept[i]->ticket);",
-        "",
-        "collector", "late Collect", rules.ROLLOUT_ONCE, "another",
+        "takes a finished ticket again", "rollouts.hpp",
+        "if (permit.sequence >= held.sequence) held",
+        "held",
+        "collector", "late Collect", rules.HEARTBEAT_TICKETS, "which was answered",
     ),
     Mutant(
         "wrong sequence", "rollouts.hpp",
-        "held.tickets.erase(rollout->ticket), ++held.sequence",
-        "held.tickets.erase(rollout->ticket)",
-        "collector", "collects rollouts", rules.SEQUENCE, "sequence 0",
+        "rollout->sequence = held.sequence;",
+        "rollout->sequence = held.sequence + 1;",
+        "collector", "collects rollouts", rules.SEQUENCE, "sequence 1",
     ),
     Mutant(
         "obeys a lower incarnation", "rollouts.hpp",
@@ -284,27 +286,49 @@ MUTANTS = [
         "collector", "starts a lane again", rules.INCARNATION, "Rollout(",
     ),
     Mutant(
-        "takes old weights", "rollouts.hpp",
-        "if (static_cast<std::int64_t>(m.version) <= version_) return;",
-        "",
-        "collector", "acts under the newest", rules.WEIGHTS_NEW_ENOUGH, "version 3",
-    ),
-    Mutant(
         "does not wait for weights", "rollouts.hpp",
-        "static_cast<std::int64_t>(lowest) <= version_ && ticket",
-        "ticket",
-        "collector", "waits for the weights", rules.WEIGHTS_NEW_ENOUGH, "version 1",
+        "if (permitted.sequence == held.sequence && weights_.count(permitted.version))\n"
+        "          first = std::min(first, {permitted.version, ticket, number});",
+        "if (permitted.sequence == held.sequence && !weights_.empty())\n"
+        "          first = std::min(first, {weights_.rbegin()->first, ticket, number});",
+        "collector", "waits for the weights", rules.VERSION, "version 1",
     ),
     Mutant(
-        "does not acknowledge weights", "session.hpp",
-        "if (now < due_s_ && acknowledged_ == version_) return;",
-        "if (now < due_s_) return;",
-        "collector", "acknowledges new weights", rules.ACKNOWLEDGE, "none within",
+        "acts under the newest weights", "rollouts.hpp",
+        "load(version);\n"
+        "    std::unique_ptr",
+        "load_newest();\n"
+        "    std::unique_ptr",
+        "collector", "acts under the version", rules.LOG_PROB, "",
+    ),
+    Mutant(
+        "holds the last weights only", "rollouts.hpp",
+        "if (!weights_.count(m.version)) weights_.emplace(",
+        "if (!weights_.count(m.version)) weights_.clear(), weights_.emplace(",
+        "collector", "holds two versions", rules.HOLDS_WEIGHTS, "none within",
+    ),
+    Mutant(
+        "collects in the order of tickets", "rollouts.hpp",
+        "permitted.sequence == held.sequence && weights_",
+        "weights_",
+        "collector", "in their order", rules.SEQUENCE, "sequence 1",
+    ),
+    Mutant(
+        "lists the newest weights only", "rollouts.hpp",
+        "listed_versions_.push_back(version);",
+        "listed_versions_.assign(1, version);",
+        "collector", "lists the versions", rules.HEARTBEAT_VERSIONS, "none within",
+    ),
+    Mutant(
+        "keeps all weights", "rollouts.hpp",
+        "return version == weights_.rbegin()->first;",
+        "return version > 0;",
+        "collector", "drops weights", rules.HOLDS_WEIGHTS, "[1, 2, 3]",
     ),
     Mutant(
         "other weights in the middle of a rollout", "rollouts.hpp",
-        "policy_.take(m);",
-        "policy_.take(m), policy_.load();",
+        "weights_.emplace(m.version, policy_.weights(m));",
+        "weights_.emplace(m.version, policy_.weights(m)), load_newest();",
         "collector", "keeps the weights of a rollout", rules.LOG_PROB, "",
     ),
     Mutant(

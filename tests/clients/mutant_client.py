@@ -55,7 +55,9 @@ class Mutant(WorkerLink):
         super().__init__(address, f"mutant-{os.getpid()}")
         self.mutant = mutant
         self.session = self.first_session = self.beats = self.attempt = self.newest = 0
-        self.said_hello = self.described = self.has_weights = False
+        self.said_hello = self.described = False
+        self.versions = set[int]()  # of the weights that came
+        self.arrived = 0  # permits
         self.late_drain: Drain | None = None
 
     # ---------------------------------------------------------------- what it says
@@ -67,8 +69,8 @@ class Mutant(WorkerLink):
             case "oversized frame", Goodbye(session):
                 return super().send([msgpack.packb(["Goodbye", session, "x" * (2 << 20), []])])
             case "wrong order", Heartbeat():
-                name, session, replies, version, *more = msgpack.unpackb(bytes(frames[0]))
-                return super().send([msgpack.packb([name, session, version, replies, *more])])
+                name, session, replies, versions, *more = msgpack.unpackb(bytes(frames[0]))
+                return super().send([msgpack.packb([name, session, versions, replies, *more])])
         for said in self.said(message):
             super().send(encode(said))
         return None
@@ -102,6 +104,12 @@ class Mutant(WorkerLink):
                 return [replace(message, valid=np.ones_like(message.valid))]
             case "wrong sequence", Rollout():
                 return [replace(message, sequence=message.sequence + 1)]
+            case "acts under the newest weights", Rollout():
+                return [replace(message, version=max(self.versions))]
+            case "lists the newest weights only", Heartbeat():
+                return [replace(message, versions=message.versions[-1:])]
+            case "lists all weights that came", Heartbeat():
+                return [replace(message, versions=tuple(sorted(self.versions)))]
             case "Goodbye without tickets", Goodbye():
                 return [replace(message, tickets=())]
             case "same attempt after Rejoin", Hello():
@@ -159,9 +167,17 @@ class Mutant(WorkerLink):
                 return [Drain(reason)]
             case "ignores seeds", Reset():
                 return [replace(message, seeds=(None,) * len(message.seeds))]
-            case "first weights only", Weights():
-                had, self.has_weights = self.has_weights, True
-                return [] if had else [message]
+            case "ignores older weights", Weights(version) if version < max(self.versions, default=-1):
+                return []
+            case "acts under the newest weights", Weights(version):
+                self.versions.add(version)
+                return [replace(message, version=each) for each in range(1, 1 + version)]
+            case _, Weights(version):
+                self.versions.add(version)
+            case "order of arrival", Collect():
+                begin, self.arrived = self.arrived, self.arrived + len(message.permits)
+                permits = [replace(each, sequence=n) for n, each in enumerate(message.permits, begin)]
+                return [replace(message, permits=tuple(permits))]
             case "executes a repeated order again", _ if hasattr(message, "ticket") and hasattr(message, "incarnation"):
                 self.newest = max(self.newest + 1, message.ticket * 1000)
                 return [replace(message, ticket=self.newest)]

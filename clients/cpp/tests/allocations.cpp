@@ -54,10 +54,10 @@ int main(int, char** words) {
   std::printf("%ld\n", allocations);
   client.take(corpus[8]);  // Rejoin
   client.take(corpus[9]);  // Welcome, RunSpec
-  client.take(corpus[10]);  // Weights
+  client.take(corpus[11]);  // Weights
   for (std::uint64_t i = 0; i < 40; ++i) {
     if (i == 20) allocations = 0;
-    head.begin("Collect", 4).natural(77).natural(3).array(1).array(3).natural(i).natural(0).natural(0).array(1).array(3).natural(0).natural(0).natural(i);
+    head.begin("Collect", 4).natural(77).natural(3).array(1).array(4).natural(i).natural(0).natural(0).natural(i).array(1).array(3).natural(0).natural(0).natural(i);
     client.take({head.bytes});
   }
   std::printf("%ld\n", allocations / 20);

@@ -5,8 +5,11 @@ Each function is one check (`script.py`). The watch recomputes what it can of ev
 
 from __future__ import annotations
 
+from collections import Counter
+
 import msgpack
 import numpy as np
+from msgspec.structs import replace
 
 from learner.conformance.client import rules
 from learner.conformance.client.join_checks import described
@@ -58,6 +61,7 @@ class Collecting:
 
     def __init__(self, learner: Learner, run: RunSpec) -> None:
         self.learner, self.run = learner, run
+        self._sequences = Counter[tuple[int, int]]()  # of the next permit, by lane and incarnation
 
     def random_parameters(self, seed: int) -> Floats:
         """Parameters [P] of a policy that prefers some actions."""
@@ -71,17 +75,30 @@ class Collecting:
 
     def permit(self, lane: int = 0, incarnation: int = 0) -> Permit:
         """The next ticket, for this lane."""
-        return Permit(self.learner.ticket(), lane, incarnation)
+        sequence = self._sequences[lane, incarnation]
+        self._sequences[lane, incarnation] += 1
+        return Permit(self.learner.ticket(), lane, incarnation, sequence)
 
-    def deal(self, *permits: Permit, version: int = 1) -> None:
-        """Send a Collect."""
+    def order(self, *permits: Permit, version: int = 1) -> None:
+        """Send a Collect, without the weights that it names."""
         self.learner.send(Collect(self.learner.session, version, permits, self.learner.of_lanes()))
 
-    def rollout(self, permit: Permit) -> Script[Rollout]:
-        """The rollout of a permit that was dealt."""
+    def give(self, weights: Weights) -> None:
+        """Send these weights, unless their version was sent in this session."""
+        assert self.learner.watch is not None
+        if weights.version not in self.learner.watch.versions:
+            self.learner.send(weights)
+
+    def deal(self, *permits: Permit, version: int = 1) -> None:
+        """Send a Collect, and then the weights that it names."""
+        self.order(*permits, version=version)
+        self.give(self.weights(version))
+
+    def rollout(self, permit: Permit, rule: Rule = rules.TICKETS) -> Script[Rollout]:
+        """The rollout of a permit that was dealt. If none comes, this rule is broken."""
         text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
         within_s = 2 * self.learner.settings.patience_s
-        return (yield from self.learner.expect(Rollout, rules.TICKETS, text, within_s=within_s, ticket=permit.ticket))
+        return (yield from self.learner.expect(Rollout, rule, text, within_s=within_s, ticket=permit.ticket))
 
     def collect(self, permit: Permit, version: int = 1) -> Script[Rollout]:
         """Deal one permit and wait for its rollout."""
@@ -98,7 +115,7 @@ class Collecting:
         yield from self.learner.quiet(Rollout, QUIET_S, rule, expected)
 
 
-def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0, net: tuple[int, ...] = NET) -> Script[RunSpec]:
+def run_spec(learner: Learner, steps: int = STEPS, net: tuple[int, ...] = NET) -> Script[RunSpec]:
     """A run of the client's environment."""
     env = yield from described(learner)
     try:
@@ -113,7 +130,7 @@ def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0, net
         copies=settings.copies,
         lanes=2,
         seed=5,
-        heartbeat_s=heartbeat_s or settings.heartbeat_s,
+        heartbeat_s=settings.heartbeat_s,
         learner_timeout_s=30.0,
     )
 
@@ -121,19 +138,13 @@ def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0, net
 def collecting(
     learner: Learner,
     steps: int = STEPS,
-    heartbeat_s: float = 0.0,
-    *,
-    weights: bool = True,
     net: tuple[int, ...] = NET,
 ) -> Script[Collecting]:
-    """A new session of the collector profile. `weights`: version 1 is sent."""
-    run = yield from run_spec(learner, steps, heartbeat_s, net)
+    """A new session of the collector profile."""
+    run = yield from run_spec(learner, steps, net)
     yield from learner.joining()
     learner.welcome(run)
-    session = Collecting(learner, run)
-    if weights:
-        learner.send(session.weights(1))
-    return session
+    return Collecting(learner, run)
 
 
 def collecting_at_length(learner: Learner) -> Script[Collecting]:
@@ -193,11 +204,13 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
     longest = env.max_episode_steps
     if longest is None or longest > MOST_LIMIT_STEPS:
         raise Skipped("the environment has no time limit" if longest is None else f"its time limit is {longest} steps")
-    session = yield from collecting(learner, steps=longest + 10, weights=False)
-    learner.send(session.weights(1, _balancing(session)))
+    session = yield from collecting(learner, steps=longest + 10)
     reached = False
     for _ in range(2):
-        rollout = yield from session.collect(session.permit())
+        permit = session.permit()
+        session.order(permit)
+        session.give(session.weights(1, _balancing(session)))
+        rollout = yield from session.rollout(permit)
         for episode in rollout.episodes:
             if episode.length > longest:
                 raise Broken(
@@ -233,27 +246,74 @@ def _balancing(session: Collecting) -> Floats:
 
 
 def waits_for_weights(learner: Learner) -> Script[None]:
-    """A permit under weights that have not come yet."""
+    """A permit under weights that have not come yet, while older ones are held."""
     session = yield from collecting(learner)
+    yield from session.collect(session.permit())
     permit = session.permit()
-    session.deal(permit, version=2)
-    yield from learner.quiet(
-        Rollout, QUIET_S, rules.WEIGHTS_NEW_ENOUGH, f"no rollout of ticket {permit.ticket} before version 2"
-    )
-    learner.send(session.weights(2))
-    rollout = yield from session.rollout(permit)
-    if rollout.version != 2:
-        raise Broken(rules.WEIGHTS_NEW_ENOUGH, "version 2", f"version {rollout.version}")
+    session.order(permit, version=2)
+    text = f"no rollout of ticket {permit.ticket} before the Weights of version 2"
+    yield from learner.quiet(Rollout, QUIET_S, rules.VERSION, text)
+    session.give(session.weights(2))
+    yield from session.rollout(permit, rules.VERSION)
 
 
-def acts_under_the_newest(learner: Learner) -> Script[None]:
-    """A late copy of old weights."""
+def acts_under_the_named_version(learner: Learner) -> Script[None]:
+    """The weights that a permit names were lost and come after newer ones. The watch compares the versions."""
     session = yield from collecting(learner)
-    learner.send(session.weights(5))
-    learner.send(session.weights(3))
-    rollout = yield from session.collect(session.permit())
-    if rollout.version != 5:
-        raise Broken(rules.WEIGHTS_NEW_ENOUGH, "version 5, the newest held", f"version {rollout.version}")
+    older, newer = session.permit(), session.permit()
+    session.order(older, version=3)
+    session.give(session.weights(5))
+    text = f"no rollout of ticket {older.ticket} before the Weights of version 3, which it names"
+    yield from learner.quiet(Rollout, QUIET_S, rules.VERSION, text)
+    session.give(session.weights(3))
+    yield from session.rollout(older, rules.VERSION)
+    session.order(newer, version=5)
+    yield from session.rollout(newer, rules.HOLDS_WEIGHTS)
+
+
+def holds_two_versions(learner: Learner) -> Script[None]:
+    """Two permits of one lane under two versions; the weights of the second come first."""
+    session = yield from collecting(learner)
+    first, second = session.permit(), session.permit()
+    session.order(first, version=1)
+    session.deal(second, version=2)
+    session.give(session.weights(1))
+    for permit in (first, second):
+        yield from session.rollout(permit, rules.HOLDS_WEIGHTS)
+
+
+def collects_in_order(learner: Learner) -> Script[None]:
+    """The Collect of a rollout was lost; that of the next one has come, under weights that are held."""
+    session = yield from collecting(learner)
+    yield from session.collect(session.permit())
+    lost, later = session.permit(), session.permit()
+    session.deal(later)
+    text = f"no rollout of sequence {later.sequence} before that of sequence {lost.sequence}"
+    yield from learner.quiet(Rollout, QUIET_S, rules.IN_ORDER, text)
+    session.deal(lost)
+    for permit in (lost, later):
+        yield from session.rollout(permit, rules.IN_ORDER)
+
+
+def lists_its_versions(learner: Learner) -> Script[None]:
+    """Permits wait, because the weights that the first of them names were lost."""
+    session = yield from collecting(learner)
+    session.order(session.permit(), version=1)
+    for version in (2, 3):
+        session.deal(session.permit(), version=version)
+    text = "a Heartbeat with versions 2 and 3, which have come and which tickets name"
+    yield from learner.expect(Heartbeat, rules.HEARTBEAT_VERSIONS, text, versions=(2, 3))
+
+
+def drops_weights(learner: Learner) -> Script[None]:
+    """Rollouts under one version after the other; at last nothing is asked for."""
+    session = yield from collecting(learner)
+    for version in (1, 2, 3):
+        yield from session.collect(session.permit(), version=version)
+    for _ in range(2):
+        beat = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    if beat.versions != (3,):
+        raise Broken(rules.HOLDS_WEIGHTS, "version 3 only, the newest: no ticket is left", f"{list(beat.versions)}")
 
 
 def keeps_its_weights(learner: Learner) -> Script[None]:
@@ -261,8 +321,8 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     session.deal(permit)
-    for version in range(2, 20):
-        learner.send(session.weights(version))
+    for version in range(2, 20):  # their orders were lost
+        session.give(session.weights(version))
         yield from learner.let_pass(learner.long_s / 10)
     assert learner.watch is not None
     if permit.ticket not in learner.watch.rollouts:
@@ -270,24 +330,15 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
     yield from session.collect(session.permit(), version=version)
 
 
-def acknowledges_weights(learner: Learner) -> Script[None]:
-    """Weights come, and there is nothing to collect."""
-    session = yield from collecting(learner, heartbeat_s=4.0)
-    for version in (1, 2):
-        if version > 1:
-            learner.send(session.weights(version))
-        yield from learner.expect(
-            Heartbeat, rules.ACKNOWLEDGE, f"a Heartbeat with version {version} at once", within_s=2.0, version=version
-        )
-
-
 def takes_rounded_weights(learner: Learner) -> Script[None]:
     """Parameters rounded to bfloat16, which are sent as uint16, and to float16."""
-    session = yield from collecting(learner, weights=False)
+    session = yield from collecting(learner)
     for version, dtype in ((1, "bfloat16"), (2, "float16")):
         rounded = to_wire_dtype(session.random_parameters(version), dtype)  # type: ignore[arg-type]
-        learner.send(Weights(version, rounded, np.zeros(buffer_size(session.run.policy), np.float32)))
-        yield from session.collect(session.permit(), version=version)
+        permit = session.permit()
+        session.order(permit, version=version)
+        session.give(Weights(version, rounded, np.zeros(buffer_size(session.run.policy), np.float32)))
+        yield from session.rollout(permit)
 
 
 def sends_again(learner: Learner) -> Script[None]:
@@ -350,7 +401,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     if _repeats(before, after):
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
         raise Broken(rules.INDEPENDENT, "other episodes in incarnation 2", got)
-    old = session.permit(incarnation=1)
+    _, old = session.permit(incarnation=1), session.permit(incarnation=1)  # `old`: of the sequence that is next
     session.deal(old)
     yield from learner.quiet(Rollout, QUIET_S, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
@@ -361,27 +412,27 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     yield from session.collect(session.permit(0))
     lost, kept = session.permit(0), session.permit(1)
-    session.deal(lost, kept, version=2)
+    session.order(lost, kept, version=2)
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     learner.release(0)
-    learner.send(session.weights(2))
+    session.give(session.weights(2))
     yield from session.rollout(kept)
     yield from session.nothing_of(lost, rules.RELEASE, "whose lane was released")
     found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
     if lost.ticket in found.tickets:
         raise Broken(rules.RELEASE, "no tickets of the released lane in a Heartbeat", f"ticket {lost.ticket}")
-    yield from session.collect(session.permit(0, incarnation=1))
+    yield from session.collect(session.permit(0, incarnation=1), version=2)
 
 
 def closes_unlisted_lanes(learner: Learner) -> Script[None]:
     """A Release was lost; the next HeartbeatReply does not list the lane."""
     session = yield from collecting(learner)
     lost, kept = session.permit(0), session.permit(1)
-    session.deal(lost, kept, version=2)
+    session.order(lost, kept, version=2)
     learner.unlisted.add(0)
     for _ in range(3):
         yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
-    learner.send(session.weights(2))
+    session.give(session.weights(2))
     yield from session.rollout(kept)
     yield from session.nothing_of(lost, rules.UNLISTED, "whose lane is not listed")
 
@@ -393,11 +444,11 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
     yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
     learner.send(HeartbeatReply(learner.session, 6, ()))
     permit = session.permit()
-    session.deal(permit, version=2)
+    session.order(permit, version=2)
     learner.send(HeartbeatReply(learner.session, 6, ()))
     learner.send(HeartbeatReply(learner.session, 2, ()))
     yield from learner.let_pass(0.3)
-    learner.send(session.weights(2))
+    session.give(session.weights(2))
     learner.answers_heartbeats = True
     text = f"the rollout of ticket {permit.ticket}: late copies of replies 6 and 2 close no lane"
     yield from learner.expect(Rollout, rules.HEARTBEAT_REPLIES, text, ticket=permit.ticket)
@@ -411,12 +462,12 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
     session = yield from collecting_at_length(learner)
     session.deal(session.permit(0), session.permit(1))
     yield from learner.let_pass(learner.long_s / 5)
-    again = yield from collecting(learner, weights=False, net=LONG_NET)
+    again = yield from collecting(learner, net=LONG_NET)
     permit = again.permit()
-    again.deal(permit, version=0)
+    again.order(permit)
     text = "no rollout before the first Weights of the session"
     yield from learner.quiet(Rollout, 2 * QUIET_S, rules.SESSION, text)
-    learner.send(again.weights(1))
+    again.give(again.weights(1))
     yield from again.rollout(permit)
 
 
@@ -432,14 +483,14 @@ def collects_over_a_new_connection(learner: Learner) -> Script[None]:
         raise Broken(rules.CONNECTION, "the client over a new connection, in the same session", "nothing within 10 s")
     assert learner.watch is not None
     if permit.ticket not in learner.watch.rollouts:
+        session.order(permit)
         learner.send(session.weights(1))
-        session.deal(permit)
         yield from session.rollout(permit)
     yield from session.collect(session.permit())
 
 
 def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
-    """A Collect with an extra field, Weights with a missing frame, and one for another session."""
+    """A Collect with an extra field, Weights with a missing frame, and a Collect for another session."""
     session = yield from collecting(learner)
     yield from session.collect(session.permit())
     permit = session.permit()
@@ -450,15 +501,11 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
         [msgpack.packb(head[:-1])],
         [encode(session.weights(9))[0]],
     )
-    other = Collect(learner.session + 1000, 1, (session.permit(),), ())
-    learner.send(other)
+    of_other = replace(permit, ticket=learner.ticket())
+    learner.send(Collect(learner.session + 1000, 1, (of_other,), ()))
     text = "no rollout for a Collect with a field too many or too few, or of another session"
     yield from learner.quiet(Rollout, QUIET_S, rules.IGNORE_UNREADABLE, text)
-    rollout = yield from session.collect(session.permit())
-    if rollout.version != 1:
-        raise Broken(
-            rules.IGNORE_UNREADABLE, "version 1: the Weights of version 9 had no frames", f"version {rollout.version}"
-        )
+    yield from session.collect(replace(permit, ticket=learner.ticket()))
 
 
 def beats_while_it_collects(learner: Learner) -> Script[None]:
@@ -471,10 +518,10 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 def evaluates(learner: Learner) -> Script[None]:
     """Two episodes, greedy, once more with a short limit. The answer to an order is lost."""
-    yield from collecting(learner)
-    yield from _evaluate(learner, _evaluation(learner))
+    session = yield from collecting(learner)
+    yield from _evaluate(session, _evaluation(learner))
     order = _evaluation(learner, most_steps=2)
-    answer = yield from _evaluate(learner, order)
+    answer = yield from _evaluate(session, order)
     learner.send(order)
     text = f"Evaluated for ticket {order.ticket} again"
     again = yield from learner.expect(Evaluated, rules.EVALUATE_ONCE, text, ticket=order.ticket)
@@ -483,21 +530,22 @@ def evaluates(learner: Learner) -> Script[None]:
 
 
 def evaluates_one_version(learner: Learner) -> Script[None]:
-    """An evaluation under weights that have not come yet."""
+    """An evaluation under weights that have not come yet, while older ones are held."""
     session = yield from collecting(learner)
+    yield from session.collect(session.permit())
     order = _evaluation(learner, version=2)
     learner.send(order)
     text = f"no Evaluated for ticket {order.ticket} before version 2"
     yield from learner.quiet(Evaluated, QUIET_S, rules.EVALUATE_VERSION, text)
-    learner.send(session.weights(2))
+    session.give(session.weights(2))
     text = f"Evaluated for ticket {order.ticket}"
     yield from learner.expect(Evaluated, rules.EVALUATE, text, within_s=2 * learner.settings.patience_s, ticket=order.ticket)
 
 
 def evaluates_with_rows(learner: Learner) -> Script[None]:
     """Two episodes with their rows. A client may decline that."""
-    yield from collecting(learner)
-    answer = yield from _evaluate(learner, _evaluation(learner, send_rows=True))
+    session = yield from collecting(learner)
+    answer = yield from _evaluate(session, _evaluation(learner, send_rows=True))
     if isinstance(answer, Goodbye):
         yield from learner.left(rules.DECLINED, 2, "Goodbye")
         raise Skipped(f"it declines: {answer.reason}")
@@ -509,12 +557,13 @@ def _evaluation(
     return Evaluate(learner.session, learner.ticket(), version, (1, 2), True, most_steps, send_rows, False)
 
 
-def _evaluate(learner: Learner, order: Evaluate) -> Script[Evaluated | Goodbye]:
+def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated | Goodbye]:
     """Order an evaluation and check its answer; a Goodbye declines rows."""
-    learner.send(order)
+    session.learner.send(order)
+    session.give(session.weights(order.version))
     rows: dict[int, int] = {}
     kinds = EpisodeRows | Evaluated | Goodbye if order.send_rows else EpisodeRows | Evaluated
-    within_s = 2 * learner.settings.patience_s
+    within_s = 2 * session.learner.settings.patience_s
     while True:
         found = yield Wait(within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kinds))
         if found is None:
@@ -553,7 +602,7 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     permits = [session.permit(), session.permit()]
     session.deal(*permits)
     waits = session.permit(1)
-    session.deal(waits, version=9)
+    session.order(waits, version=9)
     yield from learner.let_pass(learner.long_s / 5)
     learner.send(Drain("the run is over"))
     assert learner.watch is not None
@@ -585,7 +634,7 @@ def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
     session.deal(first)
     yield from learner.let_pass(learner.long_s / 5)
     learner.send(Drain("the run is over"))
-    session.deal(second)
+    session.order(second)
     text = "Goodbye after Drain"
     within_s = 2 * learner.settings.patience_s
     goodbye = yield from learner.expect(Goodbye, rules.DRAIN, text, within_s=within_s)

@@ -151,10 +151,10 @@ HEARTBEAT_STEPS = Rule(
     "`steps` counts the env steps since the worker started: it never falls",
     "count env steps of the process, not of the session",
 )
-HEARTBEAT_VERSION = Rule(
+HEARTBEAT_VERSIONS = Rule(
     "Messages, Heartbeat",
-    "`version` is that of the newest weights held, -1 before the first of the session",
-    "set it to -1 with each session, and to the version of the Weights that are held",
+    "`versions` lists the weights held, ascending; with each session it begins empty",
+    "list the version of every Weights that is held, and drop all weights when a session ends",
 )
 DESCRIBE = Rule(
     "Describe",
@@ -268,24 +268,33 @@ ROLLOUT_ONCE = Rule(
 )
 RECEIVED = Rule(
     "The worker's half",
-    "The worker keeps a rollout until `received` says that it has arrived, and remembers finished tickets: a late "
-    "repeat of their Collect is ignored",
-    "remember the last 64 finished tickets of a lane",
+    "The worker keeps a rollout until `received` says that it has arrived. After that, a late repeat of its Collect is "
+    "ignored",
+    "ignore a permit whose sequence is lower than that of its lane's next rollout, unless its rollout is kept",
 )
 SEQUENCE = Rule(
     "Words",
-    "`sequence` counts the rollouts of a lane and incarnation in a session, from 0",
-    "set it to 0 when a lane starts or starts again, and add 1 for each rollout",
+    "`sequence` is the number of the rollout within this lane and incarnation, from 0, as its permit says",
+    "take the sequence of a rollout from its permit",
 )
-WEIGHTS_NEW_ENOUGH = Rule(
+IN_ORDER = Rule(
     "The worker's half",
-    "A rollout starts only under weights at least as new as `Collect.version`, and always under the newest held",
-    "wait for the Weights that the permit asks for; ignore Weights older than those held",
+    "The rollouts of a lane are collected in the order of `Permit.sequence`, from 0 in every incarnation. A permit waits "
+    "for those before it",
+    "keep the sequence of each lane's next rollout, and start only the permit that has it",
 )
-ACKNOWLEDGE = Rule(
+VERSION = Rule(
     "The worker's half",
-    "The worker acknowledges new weights at once by a Heartbeat, unless a rollout under them does so",
-    "send a Heartbeat when Weights arrive and no work begins under them",
+    "A rollout is collected under exactly the version that its Collect names, also if newer weights have come. It waits "
+    "until these weights are held",
+    "keep the version with each ticket, keep weights by version, and load those of the ticket before the rollout starts",
+)
+HOLDS_WEIGHTS = Rule(
+    "The worker's half",
+    "The worker holds the newest weights that have come, and those that an unfinished ticket names. It drops all others "
+    "when a piece of work ends",
+    "keep weights in a map by version; after each rollout or evaluation drop those that are neither the newest nor named by "
+    "a ticket that is left",
 )
 ROWS = Rule(
     "Messages, Rollout",
@@ -339,7 +348,7 @@ EVALUATE_ONCE = Rule(
 EVALUATE_VERSION = Rule(
     "Collector profile",
     "An Evaluate is executed under exactly its version: it waits until those weights are held",
-    "compare the order's version with that of the weights held before the first episode",
+    "look for the order's version among the weights held before the first episode",
 )
 REAPPEARS = Rule(
     "Messages, Hello",

@@ -47,7 +47,7 @@ UNREADABLE = rules.IGNORE_UNREADABLE, "no message that names it can be read"
 
 
 class Dealt(NamedTuple):
-    """A permit, and the version that it asks for."""
+    """A permit, and the version that its Collect names."""
 
     permit: Permit
     version: int
@@ -161,14 +161,12 @@ class Watch:
         if message.steps < self.steps:
             raise Broken(rules.HEARTBEAT_STEPS, f"{self.steps} or more, as before", f"{message.steps}")
         self.steps = message.steps
-        if message.version != -1 and message.version not in self.versions:
-            expected = (
-                f"-1 or one of {sorted(self.versions)}" if self.versions else "-1: no weights were sent in this session"
-            )
-            raise Broken(rules.HEARTBEAT_VERSION, expected, f"{message.version}")
-        if before is not None and message.version < before.version:
-            expected = f"a Heartbeat with version {before.version} or newer, as before"
-            raise Broken(rules.WEIGHTS_NEW_ENOUGH, expected, f"version {message.version}")
+        if list(message.versions) != sorted(self.versions.keys() & message.versions):
+            sent = f"those sent: {sorted(self.versions)}" if self.versions else "none: no weights were sent in this session"
+            raise Broken(rules.HEARTBEAT_VERSIONS, f"versions in ascending order, of {sent}", f"{list(message.versions)}")
+        if before is not None and before.versions and max(before.versions) > max(message.versions, default=-1):
+            expected = f"version {max(before.versions)}, as before, or a newer one"
+            raise Broken(rules.HOLDS_WEIGHTS, expected, f"{list(message.versions)}")
         self._see_tickets(message.tickets)
 
     def _see_tickets(self, tickets: Sequence[int]) -> None:
@@ -248,10 +246,14 @@ class Watch:
                 f"ticket {message.ticket} to be ignored: it is of incarnation {permit.incarnation}, its lane is in {newest}",
                 brief(message),
             )
-        if message.version not in self.versions or message.version < version:
+        if message.version != version:
             raise Broken(
-                rules.WEIGHTS_NEW_ENOUGH, f"version {version} or newer, of those sent", f"version {message.version}"
+                rules.VERSION,
+                f"version {version}, which the Collect of ticket {permit.ticket} names",
+                f"version {message.version}",
             )
+        if version not in self.versions:
+            raise Broken(rules.VERSION, f"no rollout before the Weights of version {version}", brief(message))
         self._answered[message.ticket] += 1
         first = self.rollouts.setdefault(message.ticket, message)
         if first is not message:
@@ -264,12 +266,18 @@ class Watch:
             if first.sequence != message.sequence or not same_arrays(first, message):
                 raise Broken(rules.ROLLOUT_ONCE, f"the same rollout of ticket {message.ticket} again", "another")
             return
+        if message.sequence != permit.sequence:
+            raise Broken(
+                rules.SEQUENCE,
+                f"sequence {permit.sequence}, as in the permit with ticket {permit.ticket}",
+                f"sequence {message.sequence}",
+            )
         place = (message.lane, permit.incarnation)
         expected = self._next_sequence.get(place, 0)
         if message.sequence != expected:
             raise Broken(
-                rules.SEQUENCE,
-                f"sequence {expected} of lane {place[0]}, incarnation {place[1]}",
+                rules.IN_ORDER,
+                f"sequence {expected} first, of lane {place[0]}, incarnation {place[1]}",
                 f"sequence {message.sequence}",
             )
         self._next_sequence[place] = expected + 1

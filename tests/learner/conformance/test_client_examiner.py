@@ -39,6 +39,7 @@ from protocol.messages import (
     Goodbye,
     Heartbeat,
     Hello,
+    Permit,
     Rollout,
     Stepped,
     Weights,
@@ -139,7 +140,7 @@ def welcomed(script: Callable[[Learner], Script[None]] = in_a_session) -> tuple[
 
 
 def beat(session: int, replies: int = 0) -> Heartbeat:
-    return Heartbeat(session, replies, -1, (), 0, {}, 0)
+    return Heartbeat(session, replies, (), (), 0, {}, 0)
 
 
 def test_a_heartbeat_that_is_missing_breaks_a_rule() -> None:
@@ -206,14 +207,52 @@ def test_a_client_may_end_at_once_when_it_is_refused() -> None:
     assert [each.outcome for each in test.results] == ["passed"]
 
 
-def test_old_weights_break_the_same_rule_in_a_heartbeat_as_in_a_rollout() -> None:
+def watch_of(*versions: int) -> Watch:
+    """The watch over a session in which these weights were sent."""
     watch = Watch(1, run_spec(), 0.0)
-    for version in (5, 3):
+    for version in versions:
         watch.sent(Weights(version, np.zeros(1, np.float32), np.zeros(0, np.float32)))
-    watch.see(Heartbeat(1, 0, 5, (), 0, {}, 0), 0.1)
+    return watch
+
+
+def test_the_newest_weights_are_held_from_heartbeat_to_heartbeat() -> None:
+    watch = watch_of(5, 3)
+    watch.see(Heartbeat(1, 0, (3, 5), (), 0, {}, 0), 0.1)
+    watch.see(Heartbeat(1, 0, (5,), (), 0, {}, 0), 0.2)
     with pytest.raises(Broken) as broken:
-        watch.see(Heartbeat(1, 0, 3, (), 0, {}, 0), 0.2)
-    assert (broken.value.rule, broken.value.got) == (rules.WEIGHTS_NEW_ENOUGH, "version 3")
+        watch.see(Heartbeat(1, 0, (3,), (), 0, {}, 0), 0.3)
+    assert (broken.value.rule, broken.value.got) == (rules.HOLDS_WEIGHTS, "[3]")
+
+
+@pytest.mark.parametrize("versions", [(5, 3), (3, 3), (3, 4)])
+def test_a_heartbeat_lists_versions_that_were_sent_in_ascending_order(versions: tuple[int, ...]) -> None:
+    with pytest.raises(Broken) as broken:
+        watch_of(5, 3).see(Heartbeat(1, 0, versions, (), 0, {}, 0), 0.1)
+    assert (broken.value.rule, broken.value.got) == (rules.HEARTBEAT_VERSIONS, str([*versions]))
+
+
+@pytest.mark.parametrize(
+    ("sent", "version", "sequence", "rule"),
+    [
+        ((3, 5), 5, 0, rules.VERSION),  # another than its Collect names, though a newer one
+        ((5,), 3, 0, rules.VERSION),  # before the weights
+        ((3, 5), 3, 1, rules.SEQUENCE),  # another than that of its permit
+    ],
+)
+def test_a_rollout_is_that_of_its_permit(sent: tuple[int, ...], version: int, sequence: int, rule: Rule) -> None:
+    watch = watch_of(*sent)
+    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0),), ()))
+    with pytest.raises(Broken) as broken:
+        watch.see(fake_rollout(1, 0, 7, version, sequence), 0.1)
+    assert broken.value.rule is rule
+
+
+def test_a_rollout_does_not_come_before_an_earlier_one_of_its_lane() -> None:
+    watch = watch_of(3)
+    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0), Permit(8, 0, 0, 1)), ()))
+    with pytest.raises(Broken) as broken:
+        watch.see(fake_rollout(1, 0, 8, 3, 1), 0.1)
+    assert (broken.value.rule, broken.value.got) == (rules.IN_ORDER, "sequence 1")
 
 
 def test_last_words_of_a_process_that_was_ended_do_not_count_for_the_next() -> None:

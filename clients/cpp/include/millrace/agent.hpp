@@ -36,7 +36,7 @@ class Agent : public CollectorSession {
       if (state_ != State::left) fail(error.what(), rollout_ ? std::optional(rollout_->lane) : std::nullopt);
     }
     if (!rollout_ && state_ == State::ready) begin_rows(obs);
-    if (!acts_) return ++counts_.without_policy, late_ = true, fallback_;
+    if (!acts()) return ++counts_.without_policy, late_ = true, fallback_;
     float log_prob;
     policy_.act(obs, evaluation_ ? nullptr : &random_, stored_.data(), &log_prob);
     policy_.to_env(stored_.data(), action_.data());
@@ -71,7 +71,6 @@ class Agent : public CollectorSession {
     rows_ = std::make_unique<Recorder>(run, description_.observation, description_.action);
     rows_->started(0, now_s()), rows_->gap[0] = 1;  // in the middle of an episode, perhaps
     random_ = Random{run.seed, session_};
-    acts_ = false;
     return "";
   }
   std::string no_rows() const override { return "a program that owns its loop does not record episodes; train with --record"; }
@@ -102,14 +101,13 @@ class Agent : public CollectorSession {
   }
 
   void begin_rows(const void* obs) {
-    if (load_newest()) acts_ = true;
     if (evaluation_) return;
     if (const Evaluation* order = next_evaluation()) {  // on the one environment that there is, from the next episode on
       if (rows_->ended[0]) evaluation_ = std::make_unique<Playing>(Playing{*order, {}, now_s(), false});
       return;
     }
     rollout_ = next_rollout();
-    if (!rollout_) return;
+    if (!rollout_) return load_newest();
     std::memcpy(rows_->obs.data(), obs, rows_->obs_bytes);
     rows_->begin(*rollout_);
   }
@@ -138,7 +136,7 @@ class Agent : public CollectorSession {
   std::unique_ptr<Playing> evaluation_;
   Random random_;
   Counts counts_;
-  bool acts_ = false, late_ = false;
+  bool late_ = false;
 };
 
 }  // namespace millrace

@@ -45,7 +45,7 @@ struct Run {  // DescribeSpec, RunSpec or StepSpec
   bool relu = false, normalize = false;
 };
 
-struct Permit { std::uint64_t ticket, lane, incarnation; };
+struct Permit { std::uint64_t ticket, lane, incarnation, sequence; };
 struct Received { std::uint64_t lane, incarnation, next_sequence; std::size_t first, count; };  // of `numbers`: out of order
 struct LaneIncarnation { std::uint64_t lane, incarnation; };
 
@@ -123,9 +123,9 @@ class Decoder {
     } else if (name == "Collect") {
       m.type = Type::Collect, expect(fields == 4), session(), m.version = r.natural();
       for (std::size_t n = r.array(); n; --n) {
-        expect(r.array() == 3);
-        std::uint64_t ticket = r.natural(), lane = r.natural();
-        m.permits.push_back({ticket, lane, r.natural()});
+        expect(r.array() == 4);
+        Permit permit{r.natural(), r.natural(), r.natural(), r.natural()};
+        m.permits.push_back(permit);
       }
       received(r, m);
     } else if (name == "Release") {

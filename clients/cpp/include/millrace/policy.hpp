@@ -26,6 +26,8 @@ class Random {  // SplitMix64 (Steele et al. 2014); normal numbers by Box and Mu
   std::uint64_t state_ = 0;
 };
 
+struct Weights { std::vector<float> parameters, buffers; };  // in the order of the wire document
+
 class Policy {
  public:
   Policy() = default;
@@ -44,18 +46,18 @@ class Policy {
     for (const Layer& layer : layers_) size_ += layer.outputs * (layer.inputs + 1);
   }
 
-  void take(const Message& weights) {  // the next weights. Throws BadMessage if they are not of this policy
-    const Array &given = weights.arrays[0], &buffers = weights.arrays[1];
+  Weights weights(const Message& m) const {  // throws BadMessage if they are not of this policy
+    const Array &given = m.arrays[0], &buffers = m.arrays[1];
     bool known = given.dtype == "<f4" || given.dtype == "<f2" || given.dtype == "<u2";
     if (!known || given.elements != size_ || buffers.elements != (normalize_ ? 2 * inputs_ : 0))
       throw BadMessage("Weights: expected " + std::to_string(size_) + " parameters, got " + std::to_string(given.elements));
-    next_.resize(size_);
-    for (std::size_t i = 0; i < size_; ++i) next_[i] = as_float(given, i);
     const float* numbers = static_cast<const float*>(buffers.data);
-    next_buffers_.assign(numbers, numbers + buffers.elements);
+    Weights taken{std::vector<float>(size_), {numbers, numbers + buffers.elements}};
+    for (std::size_t i = 0; i < size_; ++i) taken.parameters[i] = as_float(given, i);
+    return taken;
   }
-  void load() {  // act under the weights that were taken last, which are in the order of the wire document
-    const float* next = next_.data();
+  void load(const Weights& weights) {  // act under these
+    const float* next = weights.parameters.data();
     for (Layer& layer : layers_) {
       layer.weight.resize(layer.inputs * layer.outputs), layer.bias.resize(layer.outputs);
       for (std::size_t o = 0; o < layer.outputs; ++o)
@@ -63,7 +65,7 @@ class Policy {
       for (float& each : layer.bias) each = *next++;
     }
     for (float& each : log_std_) each = *next++;
-    buffers_ = next_buffers_;
+    buffers_ = weights.buffers;
   }
 
   void act(const void* obs, Random* random, void* action, float* log_prob) {  // without random numbers: the most probable action
@@ -155,7 +157,7 @@ class Policy {
   bool relu_ = false, normalize_ = false;
   std::size_t inputs_ = 0, outputs_ = 0, size_ = 0;
   std::vector<Layer> layers_;
-  std::vector<float> x_, y_, params_, log_std_, buffers_, next_, next_buffers_;
+  std::vector<float> x_, y_, params_, log_std_, buffers_;
 };
 
 }  // namespace millrace

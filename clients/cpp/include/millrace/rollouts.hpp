@@ -1,7 +1,8 @@
-// The tickets, rollouts and evaluation orders of the collector profile, and the columns of a rollout.
+// The tickets, weights, rollouts and evaluation orders of the collector profile, and the columns of a rollout.
 //
-// Rule: a ticket is collected once. Its rollout is kept until the learner has received it, and sent again when the learner
-// asks for it again. The memory of a rollout that has arrived is used for the next one.
+// Rule: a ticket is collected once, under the version that it names, and after those before it of its lane. Its rollout is
+// kept until the learner has received it, and sent again when the learner asks for it again. The memory of a rollout that has
+// arrived is used for the next one. Of weights, we hold the newest and those that unfinished tickets name.
 #pragma once
 #include <deque>
 
@@ -92,11 +93,12 @@ class Recorder {  // writes the rows of a lane, and counts its episodes from one
   std::size_t elements_;
 };
 
+struct Permitted { std::uint64_t sequence, version; };
+
 struct Held {  // of one lane
-  std::uint64_t incarnation = 0, sequence = 0;
-  std::map<std::uint64_t, std::uint64_t> tickets;  // not yet collected -> the lowest version to collect it under
-  std::vector<std::unique_ptr<Rollout>> kept;      // that the learner may not have received
-  std::deque<std::uint64_t> finished;              // the last of them, to know a late repeat
+  std::uint64_t incarnation = 0, sequence = 0;  // sequence: of the next rollout
+  std::map<std::uint64_t, Permitted> tickets;   // not yet collected
+  std::vector<std::unique_ptr<Rollout>> kept;   // that the learner may not have received
 };
 
 struct Evaluation {  // an order, and its answer: an episode for each seed
@@ -125,10 +127,10 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     if (seen.dtype == "uint8" && seen.shape.size() == 3) return "the C++ client has no convolutions; start the learner with --inference learner";
     if (done.kind == "box" && done.dtype != "float32") return "the C++ client chooses float32 actions; start the learner with --inference learner";
     policy_ = Policy(run, seen, done);
-    loaded_ = false;
+    loaded_.reset();
     return "";
   }
-  void end_collecting() { held_.clear(), orders_.clear(), answers_.clear(); }
+  void end_collecting() { held_.clear(), weights_.clear(), orders_.clear(), answers_.clear(); }
 
   void handle_collecting(const Message& m) {
     switch (m.type) {
@@ -144,9 +146,14 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   }
   const std::vector<std::uint64_t>& tickets() override {
     listed_.clear();
-    for (auto& [number, lane] : held_) for (auto& [ticket, version] : lane.tickets) listed_.push_back(ticket);
+    for (auto& [number, lane] : held_) for (auto& [ticket, permitted] : lane.tickets) listed_.push_back(ticket);
     for (const Evaluation& order : orders_) listed_.push_back(order.ticket);
     return listed_;
+  }
+  const std::vector<std::uint64_t>& versions() override {
+    listed_versions_.clear();
+    for (auto& [version, weights] : weights_) listed_versions_.push_back(version);
+    return listed_versions_;
   }
   std::vector<std::uint64_t> lanes() const override {
     std::vector<std::uint64_t> all;
@@ -155,25 +162,28 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   }
   void release(std::uint64_t number, std::uint64_t incarnation) override {
     auto found = held_.find(number);
-    if (found != held_.end() && found->second.incarnation <= incarnation) held_.erase(found);
+    if (found != held_.end() && found->second.incarnation <= incarnation) held_.erase(found), drop_weights();
   }
 
-  bool load_newest() {  // let the policy act under the newest weights; false if there are none
-    if (version_ < 0) return false;
-    if (!loaded_) policy_.load(), loaded_ = true;
-    return true;
+  bool acts() const { return loaded_.has_value(); }  // whether weights have come, under which the policy can act
+  void load_newest() {
+    if (!weights_.empty()) load(weights_.rbegin()->first);
   }
-  std::unique_ptr<Rollout> next_rollout() {  // for the oldest ticket that can start; null if there is none
-    std::uint64_t oldest = std::numeric_limits<std::uint64_t>::max(), number = 0;
-    for (auto& [lane, held] : held_)
-      for (auto& [ticket, lowest] : held.tickets)
-        if (static_cast<std::int64_t>(lowest) <= version_ && ticket < oldest) oldest = ticket, number = lane;
-    if (oldest == std::numeric_limits<std::uint64_t>::max() || !load_newest()) return nullptr;
+  std::unique_ptr<Rollout> next_rollout() {  // of those that can start: the lowest version, then the oldest ticket. Or null
+    const std::uint64_t none = std::numeric_limits<std::uint64_t>::max();
+    std::array<std::uint64_t, 3> first{none, none, none};
+    for (auto& [number, held] : held_)
+      for (auto& [ticket, permitted] : held.tickets)
+        if (permitted.sequence == held.sequence && weights_.count(permitted.version))
+          first = std::min(first, {permitted.version, ticket, number});
+    const auto [version, ticket, number] = first;
+    if (ticket == none) return nullptr;
+    load(version);
     std::unique_ptr<Rollout> rollout = spare_.empty() ? std::make_unique<Rollout>() : std::move(spare_.back());
     if (!spare_.empty()) spare_.pop_back();
     const Held& held = held_[number];
-    rollout->lane = number, rollout->incarnation = held.incarnation, rollout->ticket = oldest, rollout->sequence = held.sequence;
-    rollout->version = static_cast<std::uint64_t>(version_);
+    rollout->lane = number, rollout->incarnation = held.incarnation, rollout->ticket = ticket, rollout->sequence = held.sequence;
+    rollout->version = version;
     return rollout;
   }
   bool wanted(const Rollout& r, std::uint64_t session) const {  // whether its ticket still is ours
@@ -185,15 +195,17 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     for (unsigned char valid : rollout->valid) steps_ += valid;
     Held& held = held_[rollout->lane];
     held.tickets.erase(rollout->ticket), ++held.sequence;
-    acknowledged_ = std::max(acknowledged_, static_cast<std::int64_t>(rollout->version));
     send_rollout(*rollout);
     held.kept.push_back(std::move(rollout));
+    drop_weights();
   }
-  const Evaluation* next_evaluation() {  // the oldest of the version held; those of older versions are dropped
-    auto older = [&](const Evaluation& order) { return static_cast<std::int64_t>(order.version) < version_; };
+  const Evaluation* next_evaluation() {  // the oldest of the newest version held; those of older versions are dropped
+    if (weights_.empty()) return nullptr;
+    const std::uint64_t newest = weights_.rbegin()->first;
+    auto older = [&](const Evaluation& order) { return order.version < newest; };
     orders_.erase(std::remove_if(orders_.begin(), orders_.end(), older), orders_.end());
     for (const Evaluation& order : orders_)
-      if (static_cast<std::int64_t>(order.version) == version_ && load_newest()) return &order;
+      if (order.version == newest) return load(newest), &order;
     return nullptr;
   }
   void evaluated(const Evaluation& evaluation) {
@@ -204,16 +216,26 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     answers_.push_back(evaluation);
     if (answers_.size() > 8) answers_.pop_front();
     send_evaluation(evaluation);
+    drop_weights();
   }
 
   Policy policy_;
 
  private:
   void take_weights(const Message& m) {
-    if (static_cast<std::int64_t>(m.version) <= version_) return;
     if (m.arrays.size() > 2) return decline("the C++ client has no attributes that the learner could set in its environments");
-    policy_.take(m);  // and a rollout in progress goes on under its own weights
-    version_ = static_cast<std::int64_t>(m.version), loaded_ = false;
+    if (!weights_.count(m.version)) weights_.emplace(m.version, policy_.weights(m));  // a rollout in progress goes on under its own
+  }
+  void load(std::uint64_t version) {  // let the policy act under these weights, which are held
+    if (loaded_ != version) policy_.load(weights_.at(version)), loaded_ = version;
+  }
+  void drop_weights() {  // that are neither the newest nor asked for
+    auto asked = [&](std::uint64_t version) {
+      for (auto& [number, lane] : held_) for (auto& [ticket, permitted] : lane.tickets) if (permitted.version == version) return true;
+      for (const Evaluation& order : orders_) if (order.version == version) return true;
+      return version == weights_.rbegin()->first;
+    };
+    for (auto each = weights_.begin(); each != weights_.end();) each = asked(each->first) ? std::next(each) : weights_.erase(each);
   }
   void take(const Permit& permit, std::uint64_t version) {
     auto found = held_.find(permit.lane);
@@ -224,9 +246,8 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     }
     Held& held = held_[permit.lane];
     if (permit.incarnation < held.incarnation) return;
-    if (std::find(held.finished.begin(), held.finished.end(), permit.ticket) != held.finished.end()) return;
     for (const auto& rollout : held.kept) if (rollout->ticket == permit.ticket) return send_rollout(*rollout);
-    held.tickets.emplace(permit.ticket, version);
+    if (permit.sequence >= held.sequence) held.tickets.emplace(permit.ticket, Permitted{permit.sequence, version});  // else a late copy
   }
   void received(const Message& m) {
     for (const Received& got : m.received) {
@@ -237,8 +258,6 @@ class CollectorSession : public Session {  // a Session that holds the weights a
       for (std::size_t i = held.kept.size(); i-- > 0;) {
         const std::uint64_t sequence = held.kept[i]->sequence;
         if (sequence >= got.next_sequence && std::find(first, last, sequence) == last) continue;
-        held.finished.push_back(held.kept[i]->ticket);
-        if (held.finished.size() > 64) held.finished.pop_front();
         spare_.push_back(std::move(held.kept[i]));
         held.kept.erase(held.kept.begin() + static_cast<std::ptrdiff_t>(i));
       }
@@ -276,12 +295,13 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     send(head_);
   }
 
-  bool loaded_ = false;
+  std::map<std::uint64_t, Weights> weights_;  // by version
+  std::optional<std::uint64_t> loaded_;       // the version under which the policy acts
   std::map<std::uint64_t, Held> held_;
   std::vector<std::unique_ptr<Rollout>> spare_;
   std::vector<Evaluation> orders_;
   std::deque<Evaluation> answers_;
-  std::vector<std::uint64_t> listed_;
+  std::vector<std::uint64_t> listed_, listed_versions_;
 };
 
 }  // namespace millrace

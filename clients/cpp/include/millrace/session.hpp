@@ -92,7 +92,8 @@ class Session {
   virtual void handle(const Message& message) = 0;    // orders, tickets, weights of this session
   virtual void release(std::uint64_t lane, std::uint64_t incarnation) = 0;  // another worker has it from this incarnation on
   virtual std::vector<std::uint64_t> lanes() const = 0;
-  virtual const std::vector<std::uint64_t>& tickets() = 0;  // held and not finished
+  virtual const std::vector<std::uint64_t>& tickets() = 0;   // held and not finished
+  virtual const std::vector<std::uint64_t>& versions() = 0;  // of the weights held, ascending
   virtual bool busy() const { return false; }         // work in progress, which draining finishes
 
   void close() {  // the last class calls it in its destructor, because the second thread calls the functions above
@@ -178,7 +179,6 @@ class Session {
   Description description_;
   Run run_;
   std::uint64_t session_ = 0, steps_ = 0, late_actions_ = 0;
-  std::int64_t version_ = -1, acknowledged_ = -1;  // of the weights held; that a message of ours has named
   double act_s_ = 0, step_s_ = 0, evaluate_s_ = 0;
   Writer head_;
   std::mutex mutex_;
@@ -221,11 +221,13 @@ class Session {
   }
 
   void heartbeat_if_due(double now) {
-    if (now < due_s_ && acknowledged_ == version_) return;
-    due_s_ = now + run_.heartbeat_s, acknowledged_ = version_;
-    const std::vector<std::uint64_t>& held = tickets();
-    Writer& w = beat_head_.begin("Heartbeat", 8).natural(session_).natural(replies_).whole(version_).array(held.size());
-    for (std::uint64_t ticket : held) w.natural(ticket);
+    if (now < due_s_) return;
+    due_s_ = now + run_.heartbeat_s;
+    Writer& w = beat_head_.begin("Heartbeat", 8).natural(session_).natural(replies_);
+    for (const std::vector<std::uint64_t>* held : {&versions(), &tickets()}) {
+      w.array(held->size());
+      for (std::uint64_t each : *held) w.natural(each);
+    }
     w.natural(steps_).map(4).text("act").real(act_s_).text("step").real(step_s_).text("evaluate").real(evaluate_s_)
         .text("wait").real(std::max(0.0, now - began_s_ - act_s_ - step_s_ - evaluate_s_)).natural(resident_bytes())
         .natural(late_actions_);
@@ -248,7 +250,7 @@ class Session {
     if (m.attempt != attempt_ || (state_ == State::ready && *m.session == session_)) return;
     end();
     state_ = State::ready, session_ = *m.session, run_ = m.run;
-    version_ = acknowledged_ = -1, replies_ = 0;
+    replies_ = 0;
     heard_s_ = now_s(), due_s_ = heard_s_ + run_.heartbeat_s;
     join_timeout_s_ = options_.rejoin_timeout_s;
     std::string why;

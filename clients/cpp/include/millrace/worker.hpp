@@ -2,7 +2,7 @@
 //
 // The learner decides which profile it is. Environment profile: the learner acts, and we answer Reset and Step. An order is
 // executed once; its answer is kept until the lane's next order, and sent again if the order comes again. Collector profile:
-// we act with the newest weights, and send whole rollouts. Rule: once a lane is open, a step allocates nothing.
+// we act under the weights that each ticket names, and send whole rollouts. Rule: once a lane is open, a step allocates nothing.
 #pragma once
 #include <functional>
 
