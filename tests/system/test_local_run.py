@@ -101,6 +101,37 @@ def test_with_a_lag_the_curve_does_not_depend_on_who_is_fast(tmp_path: Path) -> 
     assert len(policies) == 1
 
 
+def test_with_a_lag_a_lost_worker_leads_to_the_same_run_whoever_is_fast(tmp_path: Path) -> None:
+    """There are three workers for two lanes: the spare one takes the lane over, whichever it is."""
+    died = tmp_path / "died"
+
+    class Dies(Uneven):
+        def __init__(self, env: Any) -> None:
+            super().__init__(env)
+            copy = millrace.env_copy()
+            self.steps, self.dies = 0, copy.lane == 0 and not copy.evaluation
+
+        def step(self, action: Any) -> Any:
+            self.steps += 1
+            if self.dies and self.steps == 90 and not died.exists():
+                died.touch()
+                os._exit(1)
+            return super().step(action)
+
+    policies = set()
+    for _ in range(2):
+        died.unlink(missing_ok=True)
+        folder = millrace.train(
+            lambda: Dies(gymnasium.make("CartPole-v1")),
+            run_dir=str(tmp_path), seed=3, workers=3, lanes=2, envs=2, max_lag=1, rollout_steps=20, steps=400, eval_every=0,
+            batch_size=20, worker_timeout_s=5.0, **SMALL,
+        ).path  # fmt: skip
+        assert died.exists()
+        assert summary(folder)["ledger"]["lost"] in (1, 2)
+        policies.add((folder / "policy.safetensors").read_bytes())
+    assert len(policies) == 1
+
+
 def test_compressing_rollouts_does_not_change_the_run(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
     plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
