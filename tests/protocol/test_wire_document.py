@@ -119,7 +119,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MAX_NAME"): "characters of a `Name`",
     (bounds, "MAX_LINE"): "characters of a `Line`",
     (bounds, "MAX_TEXT"): "characters of a `Text`",
-    (bounds, "MAX_TICKETS"): "tickets in one message",
+    (bounds, "MAX_TICKETS"): "tickets in one message; also versions in a Heartbeat",
     (bounds, "MAX_WORKERS"): "workers that one supervisor speaks for",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
     (bounds, "MAX_FACTS"): "facts of an episode",
