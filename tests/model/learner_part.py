@@ -10,8 +10,9 @@ from typing import Self, TypeVar
 
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership, Outgoing
-from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
+from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.rounds import Rounds
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
 from protocol.messages import ToLearner, WorkerExit
 from tests.model.conversation import Content
@@ -31,29 +32,20 @@ from tests.model.settings import TIMEOUT_S, Settings
 from tests.support.fake_ends import BUFFERS, PARAMETERS
 
 SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"ledger", "version", "membership", "lanes", "tickets", "ready", "_held_back", "_placement", "_queue"}
-    | {"_oldest_ready", "_weights"},
+    TicketCoordinator: {"ledger", "version", "membership", "lanes", "tickets", "ready", "_placement", "_rounds", "_to_deal"}
+    | {"_weights"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
-    CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "acknowledged"}
-    | {"sending", "sending_since", "strikes", "takeovers"},
-    TicketedLane: {"number", "incarnation", "owner", "moving", "progress", "started", "outstanding", "next_sequence"}
+    CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "versions"}
+    | {"strikes", "takeovers"},
+    TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order"},
-    Ticket: {"number", "lane", "incarnation", "version", "peer"},
+    Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
-    LaneQueue: {"_lanes", "_heap"},
+    Rounds: {"next", "_versions"},
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {
-        "run",
-        "rollouts_per_update",
-        "max_lag",
-        "max_env_copies",
-        "worker_timeout_s",
-        "evaluation",
-        "_absent",
-    }
-    | {"_first_version", "_used_before"},  # no run of the model changes its lanes, so counting from 0 gives the same
+    TicketCoordinator: {"run", "max_env_copies", "worker_timeout_s", "evaluation", "_absent"},
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "_is_spare"}
     | {"_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
@@ -70,7 +62,7 @@ NOT_SAVED: dict[type, set[str]] = {
     TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},
-    LaneQueue: set(),
+    Rounds: {"_max_lag"},
 }
 """What is not: constants, figures for people, and parts that no event of the model uses."""
 
@@ -82,6 +74,8 @@ class Learner:
         self.settings, self.coordinator = settings, coordinator
         self.updating = False
         """whether rollouts were taken, and the weights made of them are not published"""
+        self.lag = 0
+        """how old the weights are that act in the round of the next update: it takes `max_lag` updates until so old"""
         self.checkpoints: list[Content] = []
         """of each version so far: ticket to issue next, tickets used, incarnations, newest incarnations accepted"""
         self.used: set[int] = set()
@@ -94,11 +88,12 @@ class Learner:
     # ---------------------------------------------------------------- events
 
     def receive(self, worker: int, message: ToLearner, now: float) -> list[Outgoing]:
-        waiting = len(self.coordinator.ready)
+        waiting = {arrived.rollout.ticket for arrived in waiting_rollouts(self.coordinator)}
         out = self.coordinator.receive(peer_of(worker), message, now)
-        for arrived in self.coordinator.ready[waiting:]:
-            assert arrived.rollout is message, "a rollout that did not arrive was accepted"
-            self._accept(arrived)
+        for arrived in waiting_rollouts(self.coordinator):
+            if arrived.rollout.ticket not in waiting:
+                assert arrived.rollout is message, "a rollout that did not arrive was accepted"
+                self._accept(arrived)
         rejected = self.coordinator.ledger.transitions_invalid
         assert rejected == 0, "a rollout of a worker that does all right was rejected"
         return out + self._learn()
@@ -107,7 +102,7 @@ class Learner:
         self.updating = False
         coordinator = self.coordinator
         out = self._publish(coordinator.version + 1)
-        return [*out, *self._checkpoint(), *self._learn()]
+        return [*out, *self._checkpoint(), *self._gather()]
 
     def pass_time(self, now: float) -> list[Outgoing]:
         return self.coordinator.remove_silent(now) + self._learn()
@@ -124,7 +119,6 @@ class Learner:
         settings = self.settings
         coordinator = TicketCoordinator(
             settings.run,
-            rollouts_per_update=settings.rollouts_per_update,
             max_lag=settings.max_lag,
             worker_timeout_s=TIMEOUT_S,
             first_session=self.coordinator.membership._next_session,
@@ -136,15 +130,31 @@ class Learner:
         learner.used = {number for number in self.used if number < issued.value}
         learner.accepted = [(-1 if number is None else number.value, None, set()) for number in accepted]
         out = learner._publish(version)
-        return learner, out + learner._checkpoint()
+        return learner, [*out, *learner._checkpoint(), *learner._gather()]
 
-    def is_member(self, worker: int) -> bool:
-        return peer_of(worker) in self.coordinator.members
+    def named(self) -> list[tuple[CollectingMember, int]]:
+        """Which versions the orders of which workers name."""
+        members = self.coordinator.members
+        tickets = [(members[each.peer], each.version) for each in self.coordinator.tickets.values()]
+        return tickets + [(members[peer], self.coordinator.version) for peer in self.coordinator.evaluation.holders]
 
     # ---------------------------------------------------------------- inside
 
     def _publish(self, version: int) -> list[Outgoing]:
-        return self.coordinator.publish(version, PARAMETERS, BUFFERS)
+        self.coordinator.publish(version, PARAMETERS, BUFFERS)
+        return self.coordinator.begin_update()
+
+    def _gather(self) -> list[Outgoing]:
+        """Begin to gather the rollouts of the next update."""
+        out = self.coordinator.begin_update()
+        opened = len(self.coordinator._rounds._versions)
+        assert opened == self.settings.max_lag + 1, "an update has begun and not all of its rounds are open"
+        return out + self._learn()
+
+    def acts(self, number: int) -> int:
+        """The version that must act in this open round."""
+        ahead = self.settings.max_lag - (number - self.coordinator._rounds.next)
+        return self.coordinator.version + self.updating - min(self.lag, ahead)
 
     def _checkpoint(self) -> list[Outgoing]:
         coordinator = self.coordinator
@@ -171,34 +181,28 @@ class Learner:
         coordinator, ledger = self.coordinator, self.coordinator.ledger
         before = ledger.transitions_used
         taken = coordinator.take()
-        out = coordinator.deal()
         if taken is None:
-            return out
-        assert len(taken) == self.settings.rollouts_per_update, "an update has another number of rollouts"
+            return []
         assert ledger.transitions_used - before == len(taken), "an update counted another number of transitions"
         for rollout in (arrived.rollout for arrived in taken):
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
             lag = coordinator.version - rollout.version
-            assert 0 <= lag <= self.settings.max_lag, f"a rollout of lag {lag} was used"
-        if self.settings.max_lag == 0 and self.settings.per_update is None:
-            lanes = sorted(arrived.rollout.lane for arrived in taken)
-            assert lanes == list(range(self.settings.lanes)), "a synchronous update has not one rollout of each lane"
-        self.updating = True
-        return out
+            assert lag == self.lag, f"a rollout of lag {lag} was used, instead of {self.lag}"
+        lanes = [arrived.rollout.lane for arrived in taken]
+        assert lanes == list(range(self.settings.lanes)), "an update has not one rollout of each lane"
+        self.updating, self.lag = True, min(self.lag + 1, self.settings.max_lag)
+        return []
 
     def check(self) -> None:
         """The rules that hold in every state."""
         coordinator, ledger = self.coordinator, self.coordinator.ledger
-        in_flight = len(coordinator.tickets) + len(coordinator.ready)
-        assert ledger.outstanding == in_flight, "the ledger does not balance"
-        waiting_steps = sum(arrived.rollout.env_steps for arrived in coordinator.ready)
+        waiting = waiting_rollouts(coordinator)
+        assert ledger.outstanding == len(coordinator.tickets) + len(waiting), "the ledger does not balance"
+        waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
         assert ledger.transitions_waiting == waiting_steps, "transitions do not balance"
-        versions = coordinator.version - coordinator._first_version + 1 + coordinator.max_lag
-        bound = coordinator.rollouts_per_update * versions
-        used = ledger.used - coordinator._used_before
-        assert coordinator._weights is None or used + in_flight <= bound, "more tickets than the bound allows"
         members = coordinator.members
+        self._check_rounds()
         for lane in coordinator.lanes:
             owners = [member.peer for member in members.values() if lane.number in member.lanes]
             assert owners == ([] if lane.owner is None else [lane.owner]), (
@@ -206,17 +210,49 @@ class Learner:
             )
             mine = {number for number, each in coordinator.tickets.items() if each.lane == lane.number}
             assert mine == lane.outstanding, "a lane does not know its tickets"
-            waiting = sum(arrived.rollout.lane == lane.number for arrived in coordinator.ready)
-            assert len(mine) + waiting <= lane.progress, "a lane is less advanced than its tickets"
-            assert (lane.progress, lane.number) in coordinator._queue._heap, "a lane gets no more tickets"
+            assert not lane.due or lane.number in coordinator._to_deal, "a lane gets no more tickets"
         for number, each in coordinator.tickets.items():
             assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
             assert coordinator.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
+            assert each.version in members[each.peer].versions, "the weights that a ticket names were not sent"
         assert sum(len(member.tickets) for member in members.values()) == len(coordinator.tickets), (
             "a ticket has two holders"
         )
         processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
         assert coordinator.membership._of_process == processes, "the processes are not those of the members"
+
+    def _check_rounds(self) -> None:
+        """Each lane has every open round once: due, with a worker, or waiting. Round u acts under what `rounds.py` says."""
+        coordinator, rounds = self.coordinator, self.coordinator._rounds
+        opened = list(rounds._versions)
+        assert opened == list(range(rounds.next, rounds.next + len(opened))), "an open round is missing"
+        assert len(opened) <= self.settings.max_lag + 1, "more rounds are open than the lag allows"
+        versions = {number: self.acts(number) for number in opened}
+        assert rounds._versions == versions, "other weights act in a round than those that were the newest"
+        found = [(each.lane, each.round, each.version) for each in coordinator.tickets.values()]
+        for number, of_round in coordinator.ready.items():
+            found += [(lane, number, arrived.rollout.version) for lane, arrived in of_round.items()]
+        found += [(lane.number, number, versions[number]) for lane in coordinator.lanes for number in lane.due]
+        every = [(lane.number, *of_round) for lane in coordinator.lanes for of_round in versions.items()]
+        assert sorted(found) == every, "a lane does not have every open round once, under its version"
+        for lane in coordinator.lanes:
+            mine = [(t.round, t.sequence) for t in coordinator.tickets.values() if t.lane == lane.number]
+            mine += [
+                (number, of_round[lane.number].rollout.sequence)
+                for number, of_round in coordinator.ready.items()
+                if lane.number in of_round and of_round[lane.number].incarnation == lane.incarnation
+            ]
+            in_order = [sequence for _, sequence in sorted(mine)]
+            assert in_order == sorted(set(in_order)), "rollouts of a lane are not collected in the order of the rounds"
+            assert all(sequence < lane.dealt for sequence in in_order), "a sequence number will be dealt twice"
+        needed = {coordinator.version, *versions.values()}
+        assert needed.issuperset(coordinator._weights) or self.updating, "the learner keeps weights that nobody needs"
+        assert set(coordinator._weights).issuperset(needed - {-1}), "weights that are needed are dropped"
+
+
+def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
+    """Those that have come and were not taken."""
+    return [arrived for of_round in coordinator.ready.values() for arrived in of_round.values()]
 
 
 # -------------------------------------------------------------------- to tuples and back
@@ -226,28 +262,29 @@ def saved(learner: Learner, now: float) -> Content:
     coordinator = learner.coordinator
     coordinator.membership.events.clear()
     learner.check()
-    lanes, membership = coordinator.lanes, coordinator.membership
+    lanes, membership, rounds = coordinator.lanes, coordinator.membership, coordinator._rounds
     tickets = sorted(coordinator.tickets.values(), key=lambda each: each.number)
     waiting_for = coordinator._placement._waiting_for
     return (
         ticket(coordinator.ledger.issued),
         coordinator.ledger.used,
         coordinator.version,
-        coordinator._held_back,
-        tuple(_lane(lane) for lane in lanes),
+        tuple(rounds._versions.values()),
+        tuple(_lane(lane, rounds.next) for lane in lanes),
+        tuple(_ticket(each, rounds.next) for each in tickets),
         tuple(
-            (ticket(t.number), t.lane, incarnation(t.lane, t.incarnation), t.version, _worker(worker_of(t.peer)))
-            for t in tickets
+            (number - rounds.next, rollout_content(each.rollout), incarnation(lane, each.incarnation))
+            for number, of_round in sorted(coordinator.ready.items())
+            for lane, each in sorted(of_round.items())
         ),
-        tuple((rollout_content(r.rollout), incarnation(r.rollout.lane, r.incarnation)) for r in coordinator.ready),
         tuple(
             _member(member, now) for member in sorted(coordinator.members.values(), key=lambda member: member.join_number)
         ),
         tuple(sorted(coordinator._placement._unplaced)),
         coordinator._placement._settled,
         None if waiting_for is None else (session(waiting_for.session), tuple(sorted(waiting_for.lanes))),
-        coordinator._oldest_ready,
-        None if coordinator._weights is None else coordinator._weights.version,
+        tuple(sorted(coordinator._to_deal)),
+        tuple(sorted(coordinator._weights)),
         session(membership._next_session),
         max(0.0, membership._none_silent_before_s - now),
         tuple(sorted(name(Kind.NONCE, nonce, worker_of(peer)) for peer, (nonce, _) in membership._refused.items())),
@@ -262,6 +299,7 @@ def saved(learner: Learner, now: float) -> Content:
             )
             for lane, (number, collected_in, sequences) in enumerate(learner.accepted)
         ),
+        learner.lag,
     )
 
 
@@ -273,11 +311,17 @@ def _worker(number: int) -> Name:
     return name(Kind.WORKER, number)
 
 
-def _lane(lane: TicketedLane) -> Content:
+def _lane(lane: TicketedLane, next_round: int) -> Content:
+    """Rounds are counted from the next one, because only their order matters."""
     owner = None if lane.owner is None else _worker(worker_of(lane.owner))
     number = incarnation(lane.number, lane.incarnation)
-    arrived = tuple(sorted(lane.out_of_order))
-    return number, owner, lane.moving, lane.progress, lane.started, lane.next_sequence, arrived
+    due = tuple(each - next_round for each in lane.due)
+    return number, owner, lane.moving, due, lane.dealt, lane.next_sequence, tuple(sorted(lane.out_of_order))
+
+
+def _ticket(each: Ticket, next_round: int) -> Content:
+    number, worker = incarnation(each.lane, each.incarnation), _worker(worker_of(each.peer))
+    return ticket(each.number), each.lane, number, each.sequence, each.round - next_round, each.version, worker
 
 
 def _member(member: CollectingMember, now: float) -> Content:
@@ -295,8 +339,7 @@ def _member(member: CollectingMember, now: float) -> Content:
         tuple(sorted(member.lanes)),
         tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items()),
         replies(member.replies),
-        member.acknowledged,
-        None if member.sending is None else (member.sending, replies(member.sending_since)),
+        tuple((version, replies(sent_at)) for version, sent_at in sorted(member.versions.items())),
         member.strikes,
         member.takeovers,
     )
@@ -308,11 +351,10 @@ def without_checkpoints(content: Content) -> Content:
 
 def loaded(content: Content, settings: Settings) -> Learner:
     """A learner at the time 0 with this content."""
-    issued, used, version, held_back, lanes, tickets, ready, members, *rest = content
-    unplaced, settled, waiting_for, oldest_ready, weights_version, next_session, none_silent, refused, *mine = rest
+    issued, used, version, versions, lanes, tickets, ready, members, *rest = content
+    unplaced, settled, waiting_for, to_deal, held, next_session, none_silent, refused, *mine = rest
     coordinator = TicketCoordinator(
         settings.run,
-        rollouts_per_update=settings.rollouts_per_update,
         max_lag=settings.max_lag,
         worker_timeout_s=TIMEOUT_S,
         first_session=next_session.value,
@@ -320,16 +362,18 @@ def loaded(content: Content, settings: Settings) -> Learner:
         version=version,
     )
     coordinator.ledger.transitions_received = len(ready)
-    coordinator._held_back, coordinator._oldest_ready = held_back, oldest_ready
-    coordinator._weights = None if weights_version is None else weights(weights_version)
-    coordinator.ready = [AcceptedRollout(rollout_of(fields), number.value) for fields, number in ready]
-    for lane, (number, owner, moving, progress, started, following, arrived) in zip(coordinator.lanes, lanes, strict=True):
+    coordinator._rounds._versions = dict(enumerate(versions))
+    coordinator._to_deal = set(to_deal)
+    coordinator._weights = {each: weights(each) for each in held}
+    for of_round, fields, number in ready:
+        arrived = AcceptedRollout(rollout_of(fields), number.value)
+        coordinator.ready.setdefault(of_round, {})[arrived.rollout.lane] = arrived
+    for lane, (number, owner, moving, due, dealt, following, out_of_order) in zip(coordinator.lanes, lanes, strict=True):
         lane.incarnation, lane.owner = number.value, None if owner is None else peer_of(owner.value)
-        lane.moving, lane.progress, lane.started = moving, progress, started
-        lane.next_sequence, lane.out_of_order = following, set(arrived)
-    coordinator._queue = LaneQueue(coordinator.lanes)
-    for number, of_lane, inc, under, worker in tickets:
-        coordinator.tickets[number.value] = Ticket(number.value, of_lane, inc.value, under, peer_of(worker.value))
+        lane.moving, lane.due, lane.dealt = moving, list(due), dealt
+        lane.next_sequence, lane.out_of_order = following, set(out_of_order)
+    for number, of_lane, inc, *fields, worker in tickets:
+        coordinator.tickets[number.value] = Ticket(number.value, of_lane, inc.value, *fields, peer_of(worker.value))
         coordinator.lanes[of_lane].outstanding.add(number.value)
     _load_members(coordinator.membership, members)
     coordinator.membership._none_silent_before_s = none_silent
@@ -345,20 +389,19 @@ def loaded(content: Content, settings: Settings) -> Learner:
         (-1 if number is None else number.value, collected_in[0].value if collected_in else None, set(sequences))
         for number, collected_in, sequences in mine[3]
     ]
+    learner.lag = mine[4]
     return learner
 
 
 def _load_members(membership: Membership[CollectingMember], members: Content) -> None:
     for join_number, fields in enumerate(members):
-        worker, nonce, attempt, number, heard, lanes, tickets, replies, acknowledged, sending, strikes, takeovers = fields
+        worker, nonce, attempt, number, heard, lanes, tickets, replies, versions, strikes, takeovers = fields
         said = hello(worker.value, nonce.value, attempt.value)
         member = CollectingMember(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
-        member.replies, member.acknowledged, member.strikes = replies.value, acknowledged, strikes
-        member.takeovers = takeovers
-        if sending is not None:
-            member.sending, member.sending_since = sending[0], sending[1].value
+        member.versions = {version: sent_at.value for version, sent_at in versions}
+        member.replies, member.strikes, member.takeovers = replies.value, strikes, takeovers
         membership.members[member.peer] = member
         membership._of_process[said.worker, said.process_nonce] = member
     membership._joins = len(members)
@@ -382,7 +425,6 @@ def first_learner(settings: Settings, kind: type[L]) -> tuple[L, list[Outgoing]]
         settings,
         TicketCoordinator(
             settings.run,
-            rollouts_per_update=settings.rollouts_per_update,
             max_lag=settings.max_lag,
             worker_timeout_s=TIMEOUT_S,
             first_session=0,

@@ -90,9 +90,9 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
         case Hello():
             attempt = name(Kind.ATTEMPT, message.attempt, worker)
             return "Hello", name(Kind.NONCE, message.process_nonce, worker), attempt
-        case Heartbeat(number, replies, version, tickets):
+        case Heartbeat(number, replies, versions, tickets):
             held = tuple(ticket(each) for each in sorted(tickets))
-            return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), version, held
+            return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), versions, held
         case Rollout():
             return "Rollout", *rollout_content(message)
         case Welcome(number, attempt):
@@ -104,7 +104,7 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
         case Weights(version):
             return "Weights", version
         case Collect(number, version, permits, received):
-            permitted = tuple((ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation)) for p in permits)
+            permitted = tuple((ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation), p.sequence) for p in permits)
             return "Collect", session(number), version, permitted, _received(received)
         case Release(number, lanes):
             return "Release", session(number), tuple((each.lane, incarnation(each.lane, each.incarnation)) for each in lanes)
@@ -125,9 +125,9 @@ def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
     match content:
         case "Hello", nonce, attempt:
             return hello(worker, nonce.value, attempt.value)
-        case "Heartbeat", number, replies, version, tickets:
+        case "Heartbeat", number, replies, versions, tickets:
             held = tuple(each.value for each in tickets)
-            return Heartbeat(number.value, replies.value, version, held, 0, {}, 0)
+            return Heartbeat(number.value, replies.value, versions, held, 0, {}, 0)
         case "Rollout", *fields:
             return rollout_of(tuple(fields))
         case "Welcome", number, attempt:
@@ -139,7 +139,7 @@ def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
         case "Weights", version:
             return weights(version)
         case "Collect", number, version, permits, received:
-            allowed = tuple(Permit(each.value, lane, inc.value) for each, lane, inc in permits)
+            allowed = tuple(Permit(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in permits)
             return Collect(number.value, version, allowed, _received_of(received))
         case "Release", number, lanes:
             return Release(number.value, tuple(LaneIncarnation(lane, inc.value) for lane, inc in lanes))

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parent.parent.parent
 COORDINATOR = "learner.rollouts.ticket_coordinator"
 LANES = "learner.rollouts.lanes"
+ROUNDS = "learner.rollouts.rounds"
 MEMBERSHIP = "learner.members.membership"
 PLACEMENT = "learner.members.lane_placement"
 SESSION = "workers.conversation.session"
@@ -45,20 +46,36 @@ class Mutation:
 
 
 MUTATIONS = {
-    "one update too far ahead": Mutation(COORDINATOR, "while room > 0:", "while room >= 0:"),
-    "a stale rollout is used": Mutation(
-        COORDINATOR, "if self.version - self._oldest_ready > self.max_lag:", "if self.version - self._oldest_ready > 9:"
+    "one round too far ahead": Mutation(ROUNDS, "self.next + 1 + self._max_lag)", "self.next + 2 + self._max_lag)"),
+    "rounds are opened twice": Mutation(ROUNDS, "range(self.next + len(self._versions), ", "range(self.next, "),
+    "a round that was taken stays open": Mutation(ROUNDS, "del self._versions[self.next]\n", "pass\n"),
+    "the newest weights act in every open round": Mutation(
+        ROUNDS,
+        "self._versions |= dict.fromkeys(opened, newest)",
+        "self._versions = dict.fromkeys([*self._versions, *opened], newest)",
     ),
-    "the bound of staleness is off by one": Mutation(
+    "a round is dealt under the newest weights": Mutation(
+        COORDINATOR, "self._rounds.version(round_number))", "self.version)"
+    ),
+    "an update counts rollouts of later rounds": Mutation(
         COORDINATOR,
-        "stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version > self.max_lag]",
-        "stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version >= self.max_lag]",
+        "if len(self.ready.get(self._rounds.next, ())) < len(self.lanes):",
+        "if self.rollouts_waiting() < len(self.lanes):",
+    ),
+    "an update takes the newest round": Mutation(
+        COORDINATOR,
+        "in sorted(self.ready.pop(self._rounds.next).items())]",
+        "in sorted(self.ready.pop(max(self.ready)).items())]",
     ),
     "a rollout is taken twice": Mutation(
-        COORDINATOR,
-        "self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]",
-        "self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update - 1 :]",
+        COORDINATOR, "self.ready.pop(self._rounds.next).items()", "self.ready[self._rounds.next].items()"
     ),
+    "a rollout waits for the wrong round": Mutation(
+        COORDINATOR, "self.ready.setdefault(ticket.round, {})", "self.ready.setdefault(self._rounds.next, {})"
+    ),
+    "a round is dealt again and again": Mutation(COORDINATOR, "            lane.due.clear()\n", "            pass\n"),
+    "the round of a lost ticket is not dealt again": Mutation(COORDINATOR, "insort(lane.due, ticket.round)", "pass"),
+    "a lane whose ticket was lost is overlooked": Mutation(COORDINATOR, "self._to_deal.add(lane.number)", "pass"),
     "a late rollout is not counted": Mutation(
         COORDINATOR, "self.ledger.transitions_late += message.env_steps", "self.ledger.transitions_late += 0"
     ),
@@ -72,18 +89,41 @@ MUTATIONS = {
     ),
     "a lost Collect is not sent again": Mutation(COORDINATOR, "out += self._collect(member, lost)", "pass"),
     "lost weights are not sent again": Mutation(
-        COORDINATOR,
-        "seen > member.sending_since:\n            member.sending = None",
-        "seen > member.sending_since:\n            pass",
+        COORDINATOR, "out = self._lost_weights(member, heartbeat)", "out: list[Outgoing] = []"
     ),
+    "weights that may be under way are sent again": Mutation(
+        COORDINATOR, "member.versions.get(v, -1) < heartbeat.replies]", "member.versions.get(v, -1) <= heartbeat.replies]"
+    ),
+    "weights that are sent again are not noted": Mutation(
+        COORDINATOR, "member.versions |= dict.fromkeys(lost, member.replies)", "pass"
+    ),
+    "weights are never sent": Mutation(COORDINATOR, " and message.version not in member.versions:", " and False:"),
+    "weights are sent with every order": Mutation(COORDINATOR, " and message.version not in member.versions:", ":"),
+    "weights are sent before the order that names them": Mutation(
+        COORDINATOR,
+        "out.append((peer, self._weights[message.version]))",
+        "out.insert(-1, (peer, self._weights[message.version]))",
+    ),
+    "the newest weights are sent to whoever holds a ticket": Mutation(
+        COORDINATOR,
+        "out.append((peer, self._weights[message.version]))",
+        "out.append((peer, self._weights[self.version]))",
+    ),
+    "the learner keeps only the newest weights": Mutation(
+        COORDINATOR, "if v == version or self._rounds.acts(v)}", "if v == version}"
+    ),
+    "the learner keeps all weights": Mutation(COORDINATOR, "if v == version or self._rounds.acts(v)}", "if True}"),
     "heartbeats are answered with the same number": Mutation(COORDINATOR, "member.replies += 1", "member.replies += 0"),
     "tickets of a lost worker are kept": Mutation(COORDINATOR, "for number in list(member.tickets):", "for number in ():"),
-    "a lost ticket still counts as an advance": Mutation(COORDINATOR, "self._queue.set_back(lane)\n", "pass\n"),
-    "a lane that was dealt a ticket does not count as started": Mutation(COORDINATOR, "lane.started = True", "pass"),
-    "a checkpoint repeats an incarnation": Mutation(
-        COORDINATOR, "lane.incarnation + lane.started for", "lane.incarnation + 0 for"
+    "two tickets of a lane have one sequence number": Mutation(LANES, "self.dealt += 1", "self.dealt = 1"),
+    "sequence numbers go on in the next incarnation": Mutation(
+        LANES,
+        "self.dealt, self.next_sequence, self.out_of_order = 0, 0, set()",
+        "self.next_sequence, self.out_of_order = 0, set()",
     ),
-    "a ticket does not advance its lane": Mutation(COORDINATOR, "self._queue.advance(lane)", "pass"),
+    "a checkpoint repeats an incarnation": Mutation(
+        COORDINATOR, "lane.incarnation + (lane.dealt > 0) for", "lane.incarnation + 0 for"
+    ),
     "lanes are placed after tickets are dealt": Mutation(
         COORDINATOR, "out = self._placement.place(self.members.values())", "out: list[Outgoing] = []"
     ),
@@ -96,8 +136,20 @@ MUTATIONS = {
     "finished work stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
     "a worker takes work while it works": Mutation(SESSION, "self._current.in_progress = work is not None", "pass"),
     "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
-    "new weights are acknowledged again and again": Mutation(
-        SESSION, "current.acknowledged_version = current.version\n", "pass\n"
+    "a worker acts under the newest weights": Mutation(
+        SESSION,
+        "Task(session, self.weights[version], assignments)",
+        "Task(session, self.weights[max(self.weights)], assignments)",
+    ),
+    "a worker drops weights that a ticket names": Mutation(SESSION, "asked = {*self.rollouts.versions(), ", "asked = {"),
+    "a worker drops the newest weights": Mutation(SESSION, ", max(self.weights, default=-1)}", "}"),
+    "a worker keeps all weights": Mutation(
+        SESSION,
+        "for version, weights in self.weights.items() if version in asked}",
+        "for version, weights in self.weights.items()}",
+    ),
+    "new weights replace all others": Mutation(
+        SESSION, "current.weights.setdefault(version, message)", "current.weights = {version: message}"
     ),
     "a Collect confirms nothing": Mutation(
         SESSION,
@@ -111,14 +163,30 @@ MUTATIONS = {
     "a rollout that has not arrived is forgotten": Mutation(
         HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"
     ),
+    "a rollout is collected before an earlier one has come": Mutation(
+        HELD, "if sequence == lane.sequence and version in versions:", "if version in versions:"
+    ),
+    "a rollout starts without its weights": Mutation(
+        HELD, "if sequence == lane.sequence and version in versions:", "if sequence == lane.sequence:"
+    ),
+    "later rollouts are collected first": Mutation(
+        HELD, "version = min(startable, default=-1)", "version = max(startable, default=-1)"
+    ),
     "rollouts of a lane are not counted": Mutation(HELD, "self.sequence += kept", "pass"),
     "the lane of a lost worker is not placed anew": Mutation(PLACEMENT, "self._unplaced |= member.lanes", "pass"),
     "a silent worker is never removed": Mutation(MEMBERSHIP, "if now - member.alive_s > timeout_s]", "if False]"),
     "messages of an earlier session are accepted": Mutation(
         SESSION, 'getattr(message, "session", self.session) != self.session:', "False:"
     ),
-    "heartbeats are due only with new weights": Mutation(
-        SESSION, "if now < self.due_s and self._current.acknowledged_version", "if self._current.acknowledged_version"
+    "heartbeats are always due": Mutation(
+        SESSION,
+        " or now < self.due_s:\n            return []\n        self.due_s",
+        ":\n            return []\n        self.due_s",
+    ),
+    "heartbeats are never due": Mutation(
+        SESSION,
+        " or now < self.due_s:\n            return []\n        self.due_s",
+        " or True:\n            return []\n        self.due_s",
     ),
     "heartbeats at half the rate needed": Mutation(
         SESSION,
@@ -170,7 +238,9 @@ def runs() -> list[Conversation]:
         Training(workers=1, lanes=1, updates=2, faults=1),
         Training(workers=1, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
         Training(workers=2, lanes=1, updates=1, faults=1),
-        Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1, per_update=1),
+        Training(workers=1, lanes=1, updates=2, faults=1, max_lag=1),
+        Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1),
+        Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1, only=("repeat down",)),
         Training(workers=1, lanes=1, updates=2, faults=2),
         Training(workers=2, lanes=2, updates=2, faults=1, only=("drop down",)),
         Training(workers=2, lanes=2, updates=1, faults=1),

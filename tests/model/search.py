@@ -67,7 +67,10 @@ class Search:
 
     def run(self, most_states: float = float("inf")) -> Report:
         world, began_s = self.world, time.process_time()
-        self._add(world.start(), -1)
+        try:
+            self._add(world.start(), -1)
+        except AssertionError as error:
+            raise RuleBroken(f"\nThen: {error}, at the start") from error
         depth, end_of_layer = 0, 1
         for number, state in enumerate(self.states):
             if number == end_of_layer:

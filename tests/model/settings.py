@@ -29,14 +29,8 @@ class Settings:
     faults: int
     """number of faults, of any kinds, at any moments"""
     max_lag: int = 0
-    per_update: int | None = None
-    """rollouts of an update; None: one of each lane"""
     only: tuple[str, ...] = ()
     """kinds of faults; empty: all"""
-
-    @property
-    def rollouts_per_update(self) -> int:
-        return self.lanes if self.per_update is None else self.per_update
 
     @property
     def few_losses(self) -> bool:
@@ -49,5 +43,5 @@ class Settings:
 
     def __str__(self) -> str:
         size = f"{self.workers} workers, {self.lanes} lanes, {self.updates} updates, {self.faults} faults"
-        size += f", max_lag {self.max_lag}, {self.rollouts_per_update} rollouts per update"
+        size += f", max_lag {self.max_lag}"
         return ", ".join([size, *[f"only {each}" for each in self.only]])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 from learner.members.membership import Outgoing
+from protocol.messages import Collect, Evaluate, Heartbeat, Weights
 from tests.model import learner_part, worker_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner, first_learner
@@ -62,10 +64,50 @@ L = TypeVar("L", bound=Learner)
 
 def learner_event(learner: L, event: Event, message: Content | None, now: float) -> tuple[L, list[Outgoing]]:
     """The learner after this event, which may be another one, and what it sends."""
+    heard = None if message is None else message_of(message, event[1], learner.settings.run)
+    sent = Sent(learner, heard)
+    after, out = _after(learner, event, heard, now)
+    sent.check(after, out)
+    return after, out
+
+
+class Sent:
+    """Rule: weights are sent after an order that names them, and again only if a Heartbeat shows that they were lost."""
+
+    def __init__(self, learner: Learner, heard: Any) -> None:
+        """Before an event. `heard`: the message that the learner receives, if any."""
+        self._learner, self._heard = learner, heard
+        self._named = {(member.session, version) for member, version in learner.named()}
+        self._sent_at = {
+            (member.session, version): replies
+            for member in learner.coordinator.members.values()
+            for version, replies in member.versions.items()
+        }
+
+    def check(self, after: Learner, out: Iterable[Outgoing]) -> None:
+        """After it, with what the learner sends."""
+        named, sent_at = (self._named, self._sent_at) if after is self._learner else (set(), {})
+        for peer, message in out:
+            if isinstance(message, Collect | Evaluate):
+                named.add((message.session, message.version))
+            if isinstance(message, Weights):
+                member = after.coordinator.members[peer]
+                which = member.session, message.version
+                assert which in named, "weights are sent that no order has named"
+                if which in sent_at:
+                    shown = isinstance(self._heard, Heartbeat) and message.version not in self._heard.versions
+                    assert shown, "weights are sent again although they were not lost"
+                    assert sent_at[which] < self._heard.replies, "weights are sent again although they may be under way"
+                sent_at[which] = member.versions[message.version]
+                assert sent_at[which] >= member.replies - isinstance(self._heard, Heartbeat), (
+                    "weights are sent and not noted"
+                )
+
+
+def _after(learner: L, event: Event, heard: Any, now: float) -> tuple[L, list[Outgoing]]:
     match event:
         case "receive", worker, _:
-            assert message is not None
-            return learner, learner.receive(worker, message_of(message, worker, learner.settings.run), now)
+            return learner, learner.receive(worker, heard, now)
         case ("publish",):
             return learner, learner.publish()
         case ("time",):

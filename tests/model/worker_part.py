@@ -14,13 +14,13 @@ from tests.model.message_content import incarnation, rollout_content, rollout_of
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
-from workers.conversation.held import REMEMBERED_TICKETS, Assignment, HeldRollouts, RolloutLane
+from workers.conversation.held import REMEMBERED_TICKETS, Assignment, HeldRollouts, Permitted, RolloutLane
 from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task, _SessionState
 from workers.conversation.states import State
 
 SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
-    _SessionState: {"rollouts", "weights", "in_progress", "replies", "acknowledged_version"},
+    _SessionState: {"rollouts", "weights", "in_progress", "replies"},
     HeldRollouts: {"_lanes"},
     RolloutLane: {"incarnation", "sequence", "asked", "answered", "finished"},
 }
@@ -66,8 +66,9 @@ class Worker:
     def handle(self, message: ToWorker, now: float) -> list[ToLearner]:
         assert self.session is not None
         held = self.session._current
-        replies = held.replies
+        replies, before = held.replies, set(held.weights)
         effects = self.session.handle(message, now)
+        assert (before & _needed(held, before)).issubset(held.weights), "a worker drops weights that it needs"
         if isinstance(message, HeartbeatReply) and held.replies > replies:
             listed = {each.lane for each in message.received}
             assert all(lane.lane in listed for lane in held.lanes()), "a worker keeps a lane that is not its own"
@@ -78,7 +79,13 @@ class Worker:
         assert self.task is not None
         task, self.task = self.task, None
         answers = fake_rollouts(task) if isinstance(task, Task) else [fake_evaluated(task)]
-        return self._turn(self.session.work_ended(answers), now)
+        held = self.session._current
+        before = set(held.weights)
+        effects = self.session.work_ended(answers)
+        assert set(held.weights) == before & _needed(held, before), (
+            "a worker keeps other weights than the newest and those named"
+        )
+        return self._turn(effects, now)
 
     def turn(self, now: float) -> list[ToLearner]:
         """Time has passed."""
@@ -116,6 +123,22 @@ class Worker:
     def _begin(self, work: Task | EvaluationTask) -> list[ToLearner]:
         """What the worker says when this work begins."""
         self.task = work
+        if isinstance(work, Task):
+            assert self.session is not None
+            held, version = self.session._current, work.weights.version
+            lanes = held.rollouts._lanes
+            for each in work.assignments:
+                lane = lanes[each.lane]
+                assert each.sequence == lane.sequence, "rollouts of a lane are not collected in their order"
+                assert lane.asked[each.ticket] == (each.sequence, version), "other weights act than the order names"
+            startable = [
+                asked.version
+                for lane in lanes.values()
+                for asked in lane.asked.values()
+                if asked.sequence == lane.sequence and asked.version in held.weights
+            ]
+            lowest = [each for each in startable if each == min(startable)]
+            assert [version] * len(work.assignments) == lowest, "others are collected than all of the lowest version"
         return []
 
     def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
@@ -130,9 +153,11 @@ class Worker:
             assert isinstance(work, Task | EvaluationTask)
             effects = effects + [Send(said) for said in self._begin(work)]
         effects = effects + current.tick(now)
-        most = self.settings.rollouts_per_update * (1 + self.settings.max_lag)
-        held = held_count(current)
+        rounds = 1 + self.settings.max_lag
+        most, held = self.settings.lanes * rounds, held_count(current)
         assert held <= most, f"a worker holds {held} rollouts, of at most {most}"
+        versions = len(current._current.weights)
+        assert versions <= rounds + 1, f"a worker holds {versions} versions, of at most {rounds + 1}"
         sent: list[ToLearner] = []
         for effect in effects:
             if isinstance(effect, Send):
@@ -159,10 +184,9 @@ def saved(worker: Worker, now: float) -> Content:
         max(current._unanswered_s - now, -TIMEOUT_S - 1.0),
         max(current.due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items()),
-        held.version,
+        tuple(sorted(held.weights)),
         held.in_progress,
         None if current.run is None else name(Kind.REPLIES, held.replies, current.session),
-        held.acknowledged_version,
     )
     task = worker.task
     if not isinstance(task, Task):
@@ -170,8 +194,15 @@ def saved(worker: Worker, now: float) -> Content:
     return nonce, flags, fields, (session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments))
 
 
+def _needed(held: _SessionState, before: set[int]) -> set[int]:
+    """The versions that a worker needs: the newest that has come, and those that unfinished tickets name."""
+    rollouts = {asked.version for lane in held.rollouts._lanes.values() for asked in lane.asked.values()}
+    evaluations = {order.version for order in held.evaluations.asked.values()}
+    return rollouts | evaluations | {max({*before, *held.weights}, default=-1)}
+
+
 def _lane(number: int, lane: RolloutLane) -> Content:
-    tickets = tuple((ticket(each), version) for each, version in lane.asked.items())
+    tickets = tuple((ticket(each), *permitted) for each, permitted in sorted(lane.asked.items()))
     kept = tuple(rollout_content(rollout) for rollout in lane.answered.values())
     finished = tuple(name(Kind.OLD_TICKET, each) for each in lane.finished)
     assert len(finished) <= REMEMBERED_TICKETS, "a worker remembers too many tickets"
@@ -189,21 +220,20 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     worker = Worker(settings, number, nonce.value, None, None, frozen, shut_out)
     if fields is None:
         return worker
-    state, of_session, attempt, heard, due, lanes, version, in_progress, replies, acknowledged = fields
+    state, of_session, attempt, heard, due, lanes, versions, in_progress, replies = fields
     who = Identity(f"w{number}", "host", 1, nonce.value, "model")
     current = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
     current.state, current._attempt = State(state), attempt.value
     current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
-    held.weights = None if version < 0 else weights(version)
+    held.weights = {version: weights(version) for version in versions}
     held.in_progress = in_progress
-    held.acknowledged_version = acknowledged
     if of_session is not None:
         current.run, current.session, held.replies = settings.run, of_session.value, replies.value
     for lane, of_incarnation, sequence, tickets, kept, finished in lanes:
         here = held.rollouts._lanes[lane] = RolloutLane(of_incarnation.value, sequence)
-        here.asked = {each.value: lowest for each, lowest in tickets}
+        here.asked = {each.value: Permitted(*permitted) for each, *permitted in tickets}
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
         here.finished.extend(each.value for each in finished)
     worker.session = current

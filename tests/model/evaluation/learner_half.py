@@ -62,10 +62,10 @@ class EvaluatingLearner(Learner):
         coordinator, settings = self.coordinator, self.settings
         evaluates = version in settings.evaluated
         self.barrier, self.rows = coordinator.ledger.issued, []
-        out = coordinator.publish(version, PARAMETERS, BUFFERS, deal=not evaluates)
-        if evaluates:
-            out += coordinator.begin_evaluation(settings.plan, self._take_rows if settings.rows else None)
-        return out
+        if not evaluates:
+            return super()._publish(version)
+        coordinator.publish(version, PARAMETERS, BUFFERS)
+        return coordinator.begin_evaluation(settings.plan, self._take_rows if settings.rows else None)
 
     def _take_rows(self, episode: int, rows: EpisodeRows) -> None:
         answer = self._now_received
@@ -73,13 +73,17 @@ class EvaluatingLearner(Learner):
         assert rows.session == getattr(answer, "session", None), "rows and answer are of two sessions"
         self.rows.append((episode, rows.first_step))
 
+    def _gather(self) -> list[Outgoing]:
+        return [] if self.coordinator.evaluation.pending else super()._gather()
+
     def _learn(self) -> list[Outgoing]:
         evaluation = self.coordinator.evaluation
-        if evaluation.pending:
-            if not evaluation.done:
-                return []
-            self._end_evaluation()
-        return super()._learn()
+        if not evaluation.pending:
+            return super()._learn()
+        if not evaluation.done:
+            return []
+        self._end_evaluation()
+        return self._gather()
 
     def _end_evaluation(self) -> None:
         plan, version = self.settings.plan, self.coordinator.version

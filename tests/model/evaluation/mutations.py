@@ -18,11 +18,19 @@ TICKETS = "learner.rollouts.evaluation_tickets"
 OF_THE_LEARNER = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),
     "a ticket that was put back is lost": Mutation(TICKETS, "heapq.heappush(self._undealt, index)", "pass"),
-    "tickets for rollouts are dealt before an evaluation": Mutation(
-        COORDINATOR, "self._held_back = not deal", "self._held_back = False"
+    "tickets for rollouts are dealt during an evaluation": Mutation(
+        COORDINATOR,
+        "return out + self._with_weights(self.evaluation.deal(",
+        "out += self._with_weights(self.evaluation.deal(",
     ),
+    "the weights of an evaluation are not sent with its orders": Mutation(
+        COORDINATOR,
+        "out + self._with_weights(self.evaluation.deal(self._evaluators()))",
+        "out + self.evaluation.deal(self._evaluators())",
+    ),
+    "the lost weights of an evaluation are not sent again": Mutation(COORDINATOR, "named.add(self.version)", "pass"),
     "a lost order to evaluate is not sent again": Mutation(
-        COORDINATOR, "out += self.evaluation.send_again(member, heartbeat)", "pass"
+        COORDINATOR, "out += self._with_weights(self.evaluation.send_again(member, heartbeat))", "pass"
     ),
     "the evaluation's tickets of a lost worker are kept": Mutation(
         COORDINATOR, "self.evaluation.removed(member.peer)", "pass"
@@ -39,7 +47,7 @@ OF_THE_LEARNER = {
 OF_THE_WORKER = {
     "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
-    "an evaluation under any weights": Mutation(HELD, "if order.version == version]", "if True]"),
+    "an evaluation under any weights": Mutation(HELD, "if order.version == newest]", "if True]"),
     "an executed order to evaluate stays": Mutation(
         HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
     ),

@@ -29,6 +29,7 @@ LARGE = [
     Evaluating(workers=2, lanes=1, updates=1, faults=1, evaluated=(1,)),
     Evaluating(workers=2, lanes=1, updates=1, faults=1, episodes=1, rows=True),
     Evaluating(workers=1, lanes=2, updates=2, faults=1, max_lag=1, evaluated=(1, 2)),
+    Evaluating(workers=2, lanes=1, updates=2, faults=1, max_lag=1, evaluated=(1,)),
     Evaluating(workers=1, lanes=1, updates=1, faults=2),
 ]
 

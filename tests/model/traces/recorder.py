@@ -27,8 +27,8 @@ COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent
 METHODS = {
     "TicketCoordinator": (
         *COMMON,
-        *("reject_rollout", "remove_worker", "refuse", "publish", "take", "not_used", "deal", "begin_evaluation"),
-        *("end_evaluation", "drain", "incarnations"),
+        *("reject_rollout", "remove_worker", "refuse", "publish", "begin_update", "take", "not_used"),
+        *("begin_evaluation", "end_evaluation", "drain", "incarnations"),
     ),
     "DescribeCoordinator": (*COMMON, "finish"),
     "Membership": ("refuse", "record_activity"),

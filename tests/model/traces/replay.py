@@ -16,6 +16,7 @@ from learner.members.describe_coordinator import DescribeCoordinator, accept_any
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from tests.model import learner_part
+from tests.model.learner_part import waiting_rollouts
 from tests.model.traces.record import Digests, Record, SaidMember, message_of
 from workers.conversation.session import Session
 
@@ -26,25 +27,48 @@ class NotAccepted(AssertionError):
     """The trace is not one of the model. The text says which call, and what was expected."""
 
 
+class ReplayedLearner(learner_part.Learner):
+    """A learner whose versions need not follow one another: an update may fail, and the best policy comes last."""
+
+    def __init__(self, settings: Any, coordinator: TicketCoordinator) -> None:
+        super().__init__(settings, coordinator)
+        self.begun: list[int] = []
+        """of each update, the version that was the newest when it began"""
+
+    def acts(self, number: int) -> int:
+        return self.begun[max(0, number - self.settings.max_lag)]
+
+
 class Rules:
     """The rules of the model, for one learner."""
 
-    def __init__(self, coordinator: TicketCoordinator, used: set[int]) -> None:
+    def __init__(self, coordinator: TicketCoordinator, max_lag: int, used: set[int]) -> None:
         """`used`: tickets whose rollouts were used before the checkpoint from which it started."""
         self.used = used
         self._coordinator = coordinator
-        settings: Any = SimpleNamespace(lanes=coordinator.run.lanes)
-        self._learner = learner_part.Learner(settings, coordinator)
+        settings: Any = SimpleNamespace(lanes=coordinator.run.lanes, max_lag=max_lag)
+        self._learner = ReplayedLearner(settings, coordinator)
+
+    def begun(self) -> None:
+        """The next update begins, unless it has."""
+        learner = self._learner
+        if len(learner.begun) == self._coordinator._rounds.next:
+            learner.begun.append(self._coordinator.version)
+
+    def published(self) -> None:
+        """The newest weights were set."""
+        self._learner.updating = False
 
     def taken(self, taken: Sequence[AcceptedRollout]) -> None:
         """The rollouts of an update."""
-        coordinator = self._coordinator
-        assert len(taken) == coordinator.rollouts_per_update, "an update has another number of rollouts"
+        lanes = [arrived.rollout.lane for arrived in taken]
+        assert lanes == list(range(self._coordinator.run.lanes)), "an update has not one rollout of each lane"
+        self._learner.updating = True
+        version = self._learner.acts(len(self._learner.begun) - 1)
         for rollout in (arrived.rollout for arrived in taken):
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
-            lag = coordinator.version - rollout.version
-            assert 0 <= lag <= coordinator.max_lag, f"a rollout of lag {lag} was used"
+            assert rollout.version == version, f"version {rollout.version} acted, instead of {version}"
 
     def check(self, accepted: Sequence[AcceptedRollout]) -> None:
         """Those that hold after every call. `accepted`: by this call."""
@@ -104,13 +128,13 @@ class Replay:
             named["accept"] = accept_any
         made = self.parts[part] = CLASSES[part](*given, **named)
         if part == "TicketCoordinator":
-            self._rules = Rules(made, {each for each in used if each < made.ledger.issued})
+            self._rules = Rules(made, named["max_lag"], {each for each in used if each < made.ledger.issued})
 
     def _call(self, record: Record, given: list[Any], named: dict[str, Any]) -> None:
         coordinator: Any = self.parts.get("TicketCoordinator", self.parts.get("DescribeCoordinator"))
         called = coordinator.membership if record.part == "Membership" else self.parts[record.part]
         given = [_member(each, coordinator) for each in given]
-        waiting = len(coordinator.ready) if record.part == "TicketCoordinator" else 0
+        waiting = waiting_rollouts(coordinator) if record.part == "TicketCoordinator" else []
         match record.method:
             case "publish":
                 version, digest = given
@@ -128,17 +152,22 @@ class Replay:
         if record.part == "TicketCoordinator":
             self._follow(record.method, result, waiting)
 
-    def _follow(self, method: str, result: Any, waiting: int) -> None:
-        """See to it that the rules hold."""
+    def _follow(self, method: str, result: Any, waiting: Sequence[AcceptedRollout]) -> None:
+        """See to it that the rules hold. `waiting`: rollouts that had come before this call."""
         assert self._rules is not None
+        if method == "begin_update":
+            self._rules.begun()
+        if method == "publish":
+            self._rules.published()
         if method == "take":
             self._taken = result or []
             if result is not None:
                 self._rules.taken(result)
         if method == "not_used":
             self._rules.used -= {arrived.rollout.ticket for arrived in self._taken}
-        accepted = self.parts["TicketCoordinator"].ready[waiting:] if method == "receive" else []
-        self._rules.check(accepted)
+        before = {arrived.rollout.ticket for arrived in waiting}
+        now = waiting_rollouts(self.parts["TicketCoordinator"])
+        self._rules.check([arrived for arrived in now if arrived.rollout.ticket not in before])
 
 
 def _member(said: Any, coordinator: Any) -> Any:
