@@ -1,7 +1,7 @@
 """One lane that a worker collects on: its env copies, their running episodes, and the random generator of its actions.
 
-It keeps what one rollout passes on to the next: the last observations, which copies have ended, the running episodes. It
-raises `EnvironmentFailed` for an environment that raises, for observations that do not fit their space, and for NaN.
+It keeps what one rollout passes on to the next: the last observations, which copies have ended, the running episodes. The
+collector steps it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from protocol.wire.plain_values import pack, unpack
 from workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
-from workers.copies.env_results import ObservationWriter
 from workers.copies.facts import Facts
+from workers.copies.row_writers import ObservationWriter
 
 
 class CollectedLane:

@@ -33,9 +33,9 @@ from workers.conversation.held import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
-from workers.copies.env_results import write_numbers
 from workers.copies.envpool_copies import EnvpoolCopies
 from workers.copies.open_lanes import OpenLanes
+from workers.copies.row_writers import write_numbers
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.env_copy import make_copy
 

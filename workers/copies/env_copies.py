@@ -1,7 +1,7 @@
-"""The env copies of one lane behind one interface: a loop over environments, or any vector environment.
+"""The env copies of a lane, or of an evaluation, behind one interface: a loop over environments, or any vector environment.
 
-Autoreset is gymnasium's NextStep: the step after an episode's end ignores the action and resets that copy. The collector
-stores what a step returns at once, so copies may return the same buffers again and again.
+Autoreset is gymnasium's NextStep: the step after an episode's end ignores the action and resets that copy. In an evaluation
+no step resets a copy. What a step returns is stored at once, so copies may return the same buffers again and again.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from protocol.wire.plain_values import unpack
 from workers.activity import EVALUATING, RESETTING, STEPPING, activity
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Autoreset, EnvLoop, Infos, Pulse
-from workers.copies.env_results import missing_leaf, read_leaves
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.copies.mask_reader import MaskReader
+from workers.copies.row_writers import missing_leaf, read_leaves
 from workers.env_copy import close_copy
 from workers.envs.reset_ahead import ResetAhead
 
@@ -40,7 +40,7 @@ Leaves = Sequence[Any]
 
 
 class StepResult(NamedTuple):
-    """Result of one step of N copies; `workers/copies/env_results.py` writes each part into an array [N, …]."""
+    """Result of one step of N copies; `workers/copies/row_writers.py` writes each part into an array [N, …]."""
 
     leaves: Leaves
     reward: Any

@@ -1,6 +1,6 @@
 """Errors of an environment, as a worker names them: what an env copy did, then whose copy it is. Pure.
 
-Rule: the line of an error names the lane, or the evaluation, once, at its beginning. Whoever shows the line adds nothing.
+Rule: the line of an error names the lane, or the evaluation, once, at its beginning. The learner puts the worker before it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The loop over the env copies of a lane. The collector and the stepper of a vector environment both use it.
+"""The loop that calls `env.step`: of rollouts and evaluations (`LoopedCopies`), and of a vector environment (`SteppedLane`).
 
 Autoreset is gymnasium's (`gymnasium.vector.AutoresetMode`). NextStep: the step after an episode's end ignores the action and
 resets that copy. SameStep: the step that ends an episode resets the copy, and returns the last observation and info inside

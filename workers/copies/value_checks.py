@@ -1,4 +1,4 @@
-"""Checks of the values of rows before they are sent: they are finite, and of their spaces. Their shapes were checked before.
+"""Checks of the values of rows before they are sent: finite, and of their spaces. `row_writers` has checked their shapes.
 
 Each raises `EnvironmentFailed`, which names the lane, or an evaluation (`lane` None), and the step and the copy of the
 first wrong value. Arrays are [rows, N, …], and row 0 is `first_step`.

@@ -32,7 +32,7 @@ from workers.collect.acting import acting_of
 from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
-from workers.copies.env_results import ObservationWriter, write_numbers
+from workers.copies.row_writers import ObservationWriter, write_numbers
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
 

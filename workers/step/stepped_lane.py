@@ -23,7 +23,7 @@ from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop, Infos, Pulse
-from workers.copies.env_results import ObservationWriter, read_leaves, write_numbers
+from workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
 
 
 class Rows(NamedTuple):

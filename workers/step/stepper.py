@@ -1,7 +1,7 @@
 """A worker's part of a vector environment: it owns lanes of env copies and executes their orders, one at a time.
 
 Orders come as messages. Orders to step may come through shared memory instead, if this process inherited it; the results are
-then written there, too. Both ways step the same lanes.
+then written there, too. Both ways step the same lanes. A lane whose copies cannot be used any more is closed.
 """
 
 from __future__ import annotations
