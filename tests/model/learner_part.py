@@ -359,8 +359,8 @@ def loaded(content: Content, settings: Settings) -> Learner:
         worker_timeout_s=TIMEOUT_S,
         first_session=next_session.value,
         ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
-        version=version,
     )
+    coordinator.version = version
     coordinator.ledger.transitions_received = len(ready)
     coordinator._rounds._versions = dict(enumerate(versions))
     coordinator._to_deal = set(to_deal)
@@ -372,8 +372,9 @@ def loaded(content: Content, settings: Settings) -> Learner:
         lane.incarnation, lane.owner = number.value, None if owner is None else peer_of(owner.value)
         lane.moving, lane.due, lane.dealt = moving, list(due), dealt
         lane.next_sequence, lane.out_of_order = following, set(out_of_order)
-    for number, of_lane, inc, *fields, worker in tickets:
-        coordinator.tickets[number.value] = Ticket(number.value, of_lane, inc.value, *fields, peer_of(worker.value))
+    for number, of_lane, inc, sequence, of_round, under, worker in tickets:
+        each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value))
+        coordinator.tickets[number.value] = each
         coordinator.lanes[of_lane].outstanding.add(number.value)
     _load_members(coordinator.membership, members)
     coordinator.membership._none_silent_before_s = none_silent
