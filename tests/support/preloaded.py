@@ -367,6 +367,7 @@ class _Parent:
 
 
 _started: dict[Imports, _Parent] = {}
+_starting = threading.Lock()  # two threads of a test may start processes
 
 
 def _adopt_orphans(adopts: bool) -> None:
@@ -376,10 +377,11 @@ def _adopt_orphans(adopts: bool) -> None:
 
 def _parent(imports: Imports) -> _Parent:
     """The parent with these imports. That of workers starts with that of learners: a learner gives workers little time."""
-    for each in (imports, *(("worker",) if imports == "learner" else ())):
-        if each not in _started:
-            _started[each] = _Parent(each)
-    return _started[imports]
+    with _starting:
+        for each in (imports, *(("worker",) if imports == "learner" else ())):
+            if each not in _started:
+                _started[each] = _Parent(each)
+        return _started[imports]
 
 
 def use_parent(connected: socket.socket) -> None:

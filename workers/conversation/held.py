@@ -56,10 +56,6 @@ class HeldEvaluations(Held[Evaluate, Evaluated]):
         due = [ticket for ticket, order in self.asked.items() if order.version == newest]
         return self.asked[min(due)] if due else None
 
-    def versions(self) -> set[int]:
-        """The versions that are asked for."""
-        return {order.version for order in self.asked.values()}
-
     def keep(self, answer: Evaluated) -> bool:
         """Keep a result, unless rows belong to it; False if it is no longer asked for."""
         order = self.asked.get(answer.ticket)

@@ -181,7 +181,7 @@ class _SessionState:
 
     def drop_weights(self) -> None:
         """Drop the weights that are neither the newest nor asked for."""
-        asked = {*self.rollouts.versions(), *self.evaluations.versions(), max(self.weights, default=-1)}
+        asked = {*self.rollouts.versions(), max(self.weights, default=-1)}  # evaluations ask for the newest
         self.weights = {version: weights for version, weights in self.weights.items() if version in asked}
 
     def keep(self, answer: Rollout | Evaluated | Answer) -> bool:
