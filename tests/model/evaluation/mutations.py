@@ -23,7 +23,7 @@ OF_THE_LEARNER = {
         "return out + self._with_weights(self.evaluation.deal(",
         "out += self._with_weights(self.evaluation.deal(",
     ),
-    "the weights of an evaluation are not sent with its orders": Mutation(
+    "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
         "out + self._with_weights(self.evaluation.deal(self._evaluators()))",
         "out + self.evaluation.deal(self._evaluators())",
