@@ -47,7 +47,7 @@ def test_a_learner_trains_with_clients_that_are_killed_and_started_again(stage: 
     assert [client.ends() for client in (again, clients[1])] == [0, 0]
     assert "left: " in again.said()
     ledger = runs.ledger()
-    assert ledger["issued"] == ledger["used"] + ledger["lost"] + ledger["stale"] + ledger["outstanding"]
+    assert ledger["issued"] == ledger["used"] + ledger["lost"] + ledger["outstanding"]
     assert runs.rows()[-1]["rollout/ep_rew_mean"] > 40, "a random policy gets 22"
 
 
