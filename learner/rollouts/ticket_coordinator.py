@@ -318,18 +318,21 @@ class TicketCoordinator:
             return [(peer, Drain(one_line(self.membership.draining or "")))]
         out = self._lost_weights(member, heartbeat)
         out += self._collect(member, lost)
-        out += self._with_weights(self.evaluation.send_again(member, heartbeat))
+        out += self.evaluation.send_again(member, heartbeat)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()
 
     def _lost_weights(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         """The weights that this worker's tickets name and that were lost on the way, as its heartbeat shows."""
+        sent = member.versions.items()
+        # What it does not list was dropped or lost, unless it may still be on its way.
+        held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}
         named = {self.tickets[number].version for number in heartbeat.tickets if number in member.tickets}
         if member.peer in self.evaluation.holders:
             named.add(self.version)
-        lost = [v for v in sorted(named - {*heartbeat.versions}) if member.versions.get(v, -1) < heartbeat.replies]
-        member.versions |= dict.fromkeys(lost, member.replies)
+        lost = sorted(named - held.keys())
+        member.versions = held | dict.fromkeys(lost, member.replies)
         return [(member.peer, self._weights[version]) for version in lost]
 
     def _with_weights(self, orders: list[Outgoing]) -> list[Outgoing]:
@@ -356,7 +359,7 @@ class TicketCoordinator:
             permits = tuple(Permit(each.number, each.lane, each.incarnation, each.sequence) for each in chosen)
             member.tickets |= {ticket.number: member.replies for ticket in chosen}
             out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
-        return self._with_weights(out)
+        return out
 
     def _removed(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
@@ -381,7 +384,7 @@ class TicketCoordinator:
             return []
         out = self._placement.place(self.members.values())
         if self.evaluation.pending:
-            return out + self._with_weights(self.evaluation.deal(self._evaluators()))
+            return self._with_weights(out + self.evaluation.deal(self._evaluators()))
         dealt: dict[bytes, list[int]] = {}
         for lane in [self.lanes[number] for number in sorted(self._to_deal)]:
             if lane.owner is None or lane.moving:
@@ -395,7 +398,7 @@ class TicketCoordinator:
             self._to_deal.remove(lane.number)
         for peer, numbers in dealt.items():
             out += self._collect(self.members[peer], numbers)
-        return out
+        return self._with_weights(out)
 
     def _evaluators(self) -> list[CollectingMember]:
         """Those who may play evaluations: with a limit of copies, the first to join, because a worker keeps its copies."""

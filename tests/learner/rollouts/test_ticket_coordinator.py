@@ -667,6 +667,21 @@ def test_lost_weights_are_said_again_only_when_a_reply_said_after_them_has_been_
     assert len(of(learner.beats(A, versions=[], replies=2), Weights)) == 1
 
 
+def test_weights_that_a_worker_has_dropped_are_sent_again_with_the_next_order_that_names_them() -> None:
+    learner = Learner(lanes=2, max_lag=1)
+    learner.joins(A)
+    learner.joins(B)
+    for version in (1, 2):
+        learner.update_round(version)
+    assert lanes_of(learner, A) == {0}  # the other lane lives with B
+    learner.delivers(learner.tickets(A)[0])
+    learner.beats(A)
+    learner.beats(A, versions=[2])
+    outs = learner.balanced(learner.coordinator.remove_worker("b", "killed"))  # its rounds are under versions 1 and 2
+    assert [collect.version for collect in of(outs, Collect, A)] == [1, 2]
+    assert [weights.version for weights in of(outs, Weights, A)] == [1]
+
+
 def test_weights_that_only_finished_tickets_name_are_not_said_again() -> None:
     """Its worker has dropped them."""
     learner = Learner(lanes=1, max_lag=1)
