@@ -317,8 +317,9 @@ class TicketCoordinator:
         if member.state is MemberState.DRAINING:
             return [(peer, Drain(one_line(self.membership.draining or "")))]
         out = self._lost_weights(member, heartbeat)
-        out += self._collect(member, lost)
-        out += self.evaluation.send_again(member, heartbeat)
+        again = self._collect(member, lost)
+        again += self.evaluation.send_again(member, heartbeat)
+        out += self._with_weights(again)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()

@@ -87,15 +87,17 @@ MUTATIONS = {
         "        lane.arrived(rollout.sequence)\n        self._placement",
         "        self._placement",
     ),
-    "a lost Collect is not sent again": Mutation(COORDINATOR, "out += self._collect(member, lost)", "pass"),
+    "a lost Collect is not sent again": Mutation(
+        COORDINATOR, "again = self._collect(member, lost)", "again: list[Outgoing] = []"
+    ),
     "lost weights are not sent again": Mutation(
         COORDINATOR, "out = self._lost_weights(member, heartbeat)", "out: list[Outgoing] = []"
     ),
     "weights that may be under way are sent again": Mutation(
-        COORDINATOR, "member.versions.get(v, -1) < heartbeat.replies]", "member.versions.get(v, -1) <= heartbeat.replies]"
+        COORDINATOR, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
     ),
     "weights that are sent again are not noted": Mutation(
-        COORDINATOR, "member.versions |= dict.fromkeys(lost, member.replies)", "pass"
+        COORDINATOR, "member.versions = held | dict.fromkeys(lost, member.replies)", "member.versions = held"
     ),
     "weights are never sent": Mutation(COORDINATOR, " and message.version not in member.versions:", " and False:"),
     "weights are sent with every order": Mutation(COORDINATOR, " and message.version not in member.versions:", ":"),
@@ -159,7 +161,9 @@ MUTATIONS = {
     "an asked-for rollout is not sent again": Mutation(
         SESSION, "return [Send(answer) for answer in again if answer is not None]", "return []"
     ),
-    "a finished ticket is forgotten": Mutation(HELD, " or permit.ticket in lane.finished:", ":"),
+    "a finished ticket is forgotten": Mutation(
+        HELD, " or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):", ":"
+    ),
     "a rollout that has not arrived is forgotten": Mutation(
         HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"
     ),

@@ -14,7 +14,7 @@ from tests.model.message_content import incarnation, rollout_content, rollout_of
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
-from workers.conversation.held import REMEMBERED_TICKETS, Assignment, HeldRollouts, Permitted, RolloutLane
+from workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
 from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task, _SessionState
 from workers.conversation.states import State
 
@@ -22,7 +22,7 @@ SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
     _SessionState: {"rollouts", "weights", "in_progress", "replies"},
     HeldRollouts: {"_lanes"},
-    RolloutLane: {"incarnation", "sequence", "asked", "answered", "finished"},
+    RolloutLane: {"incarnation", "sequence", "asked", "answered"},
 }
 NOT_SAVED: dict[type, set[str]] = {
     Session: {"_statistics", "_join_timeout_s", "_rejoin_timeout_s", "_joining_s", "_backoff_s", "_reason"},
@@ -204,9 +204,7 @@ def _needed(held: _SessionState, before: set[int]) -> set[int]:
 def _lane(number: int, lane: RolloutLane) -> Content:
     tickets = tuple((ticket(each), *permitted) for each, permitted in sorted(lane.asked.items()))
     kept = tuple(rollout_content(rollout) for rollout in lane.answered.values())
-    finished = tuple(name(Kind.OLD_TICKET, each) for each in lane.finished)
-    assert len(finished) <= REMEMBERED_TICKETS, "a worker remembers too many tickets"
-    return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept, finished
+    return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept
 
 
 def _work(assignment: Assignment) -> Content:
@@ -231,11 +229,10 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     held.in_progress = in_progress
     if of_session is not None:
         current.run, current.session, held.replies = settings.run, of_session.value, replies.value
-    for lane, of_incarnation, sequence, tickets, kept, finished in lanes:
+    for lane, of_incarnation, sequence, tickets, kept in lanes:
         here = held.rollouts._lanes[lane] = RolloutLane(of_incarnation.value, sequence)
         here.asked = {each.value: Permitted(*permitted) for each, *permitted in tickets}
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
-        here.finished.extend(each.value for each in finished)
     worker.session = current
     if work is not None:
         assignments = tuple(Assignment(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in work[2])

@@ -134,7 +134,6 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (packing, "MIN_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice as long as the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello messages, at most",
-    (held, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
     (ticket_coordinator, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
     (membership, "REMEMBERED"): "refused processes that the learner remembers, so that they do not come back",
     (membership, "MAX_MEMBERS"): "workers of one learner",

@@ -41,7 +41,7 @@ from protocol.messages import (
 from protocol.specs import StepSpec
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 from workers.conversation.connection_rules import wait_limits_s
-from workers.conversation.held import KEPT_RESULTS, REMEMBERED_TICKETS
+from workers.conversation.held import KEPT_RESULTS
 from workers.conversation.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
@@ -403,14 +403,6 @@ def test_the_worker_holds_at_most_what_the_learner_has_outstanding() -> None:
             arrived += len(collected(session))
             assert held_count(session) <= 5
     assert arrived == issued == 500
-
-
-def test_the_number_of_remembered_tickets_is_bounded() -> None:
-    session = ready()
-    for ticket in range(200):
-        session.handle(collect((ticket, 0), first=ticket, received=lanes(0, below=ticket)), 0.1)
-        collected(session)
-    assert len(session._current.rollouts._lanes[0].finished) <= REMEMBERED_TICKETS == 64
 
 
 # -------------------------------------------------------------------- weights

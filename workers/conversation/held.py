@@ -11,14 +11,12 @@ the answer was lost. How long it is kept bounds the memory of a worker:
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from protocol.messages import Answer, Evaluate, Evaluated, LaneIncarnation, Order, Permit, Received, Rollout
 
-REMEMBERED_TICKETS = 64  # finished tickets of a lane, to recognize a late repeat of their Collect
 KEPT_RESULTS = 8  # a learner gives a worker at most two evaluations at a time, so only the last two results can be missing
 
 Asked = TypeVar("Asked")
@@ -138,7 +136,6 @@ class RolloutLane(_HeldLane[Permitted, Rollout]):
     """A ticket asks for a rollout. They are collected in the order of their sequence."""
 
     sequence: int = 0  # of the next rollout
-    finished: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_TICKETS))
 
     def keep(self, answer: Rollout) -> bool:
         """Keep a collected rollout; False if its ticket was withdrawn in the meantime."""
@@ -155,8 +152,8 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
     def take(self, permit: Permit, version: int) -> Rollout | None:
         """Take a ticket to collect under this version. Returns a rollout to send again, if any."""
         lane = self._opened(permit.lane, permit.incarnation)
-        if lane is None or permit.ticket in lane.finished:
-            return None
+        if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
+            return None  # a late repeat: the learner has this rollout
         return lane.take(permit.ticket, Permitted(permit.sequence, version))
 
     def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
@@ -186,7 +183,6 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
             for ticket, rollout in list(lane.answered.items()):
                 if rollout.sequence < of_lane.next_sequence or rollout.sequence in of_lane.out_of_order:
                     del lane.answered[ticket]
-                    lane.finished.append(ticket)
 
 
 @dataclass

@@ -20,17 +20,17 @@ OF_THE_LEARNER = {
     "a ticket that was put back is lost": Mutation(TICKETS, "heapq.heappush(self._undealt, index)", "pass"),
     "tickets for rollouts are dealt during an evaluation": Mutation(
         COORDINATOR,
-        "return out + self._with_weights(self.evaluation.deal(",
-        "out += self._with_weights(self.evaluation.deal(",
+        "return self._with_weights(out + self.evaluation.deal(self._evaluators()))",
+        "out += self._with_weights(self.evaluation.deal(self._evaluators()))",
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
-        "out + self._with_weights(self.evaluation.deal(self._evaluators()))",
+        "self._with_weights(out + self.evaluation.deal(self._evaluators()))",
         "out + self.evaluation.deal(self._evaluators())",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(COORDINATOR, "named.add(self.version)", "pass"),
     "a lost order to evaluate is not sent again": Mutation(
-        COORDINATOR, "out += self._with_weights(self.evaluation.send_again(member, heartbeat))", "pass"
+        COORDINATOR, "again += self.evaluation.send_again(member, heartbeat)", "pass"
     ),
     "the evaluation's tickets of a lost worker are kept": Mutation(
         COORDINATOR, "self.evaluation.removed(member.peer)", "pass"
