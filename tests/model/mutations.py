@@ -245,10 +245,10 @@ def runs() -> list[Conversation]:
         Training(workers=1, lanes=1, updates=2, faults=1, max_lag=1),
         Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1),
         Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1, only=("repeat down",)),
+        Training(workers=1, lanes=1, updates=2, faults=3, only=("repeat down", "freeze")),
         Training(workers=1, lanes=1, updates=2, faults=2),
         Training(workers=2, lanes=2, updates=2, faults=1, only=("drop down",)),
         Training(workers=2, lanes=2, updates=1, faults=1),
-        Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("repeat down", "freeze")),
         Training(workers=2, lanes=2, updates=2, faults=2, only=("drop down", "kill, reported")),
     ]
 
