@@ -99,6 +99,12 @@ MUTATIONS = {
     "weights that are sent again are not noted": Mutation(
         COORDINATOR, "member.versions = held | dict.fromkeys(lost, member.replies)", "member.versions = held"
     ),
+    "weights that a heartbeat does not list count as held": Mutation(
+        COORDINATOR, "member.versions = held | dict", "member.versions |= dict"
+    ),
+    "a Collect is sent again without the weights that it names": Mutation(
+        COORDINATOR, "out += self._with_weights(again)", "out += again"
+    ),
     "weights are never sent": Mutation(COORDINATOR, " and message.version not in member.versions:", " and False:"),
     "weights are sent with every order": Mutation(COORDINATOR, " and message.version not in member.versions:", ":"),
     "weights are sent before the order that names them": Mutation(

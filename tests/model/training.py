@@ -102,6 +102,11 @@ class Sent:
                 assert sent_at[which] >= member.replies - isinstance(self._heard, Heartbeat), (
                     "weights are sent and not noted"
                 )
+        heard = self._heard
+        for member in after.coordinator.members.values():
+            if isinstance(heard, Heartbeat) and member.session == heard.session:
+                held = {version for version, at in member.versions.items() if at < heard.replies}
+                assert held.issubset(heard.versions), "weights that a worker lacks count as held"
 
 
 def _after(learner: L, event: Event, heard: Any, now: float) -> tuple[L, list[Outgoing]]:
