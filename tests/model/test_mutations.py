@@ -9,9 +9,9 @@ from tests.model.mutations import MUTATIONS, check_that_they_fit, find
 
 def test_a_mistake_is_found_and_told_as_a_story() -> None:
     """One mistake that only liveness shows, in every `make test`, so that it is known that the checker can fail."""
-    story = find("an asked-for rollout is not sent again")
+    story = find("a lost Collect is not sent again")
     assert "Collect(session 0, 0, ((ticket 0, 0, incarnation 0:0, 0),)," in story
-    assert "Rollout(session 0, 0, ticket 0, 0, 0) of worker 0 is lost." in story
+    assert " to worker 0 is lost." in story
     assert story.endswith("Then: and so on: the run never reaches its target")
 
 

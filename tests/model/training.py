@@ -90,6 +90,7 @@ class Sent:
         for peer, message in out:
             if isinstance(message, Collect | Evaluate):
                 named.add((message.session, message.version))
+                assert message.version in after.coordinator.members[peer].versions, "an order is sent without its weights"
             if isinstance(message, Weights):
                 member = after.coordinator.members[peer]
                 which = member.session, message.version
