@@ -53,12 +53,6 @@ RUNS: dict[str, tuple[str, ...]] = {
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
     "per": (f"train CartPole-v1 --algo dqn --replay prioritized --n-step 3 --normalize-observations {REPLAY}",),
-    "ppo at lag 1": (f"train CartPole-v1 --algo ppo --max-lag 1 {ON_POLICY}",),
-    "impala at lag 2": (f"train CartPole-v1 --algo impala --max-lag 2 {ON_POLICY}",),
-    "lstm at lag 2": (f"train workers.envs.toy:Recall-v0 --algo ppo --core lstm --core-size 16 --max-lag 2 {ON_POLICY}",),
-    "masks at lag 1": (f"train Taxi-v4 --algo a2c --action-masks info --max-lag 1 {ON_POLICY}",),
-    "dqn at lag 1": (f"train CartPole-v1 --algo dqn --max-lag 1 {REPLAY}",),
-    "sac at lag 2": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 --max-lag 2 {REPLAY}",),
     "prior": (f"train CartPole-v1 --algo dqn --prior {RECORDED} --prior-steps 20 {REPLAY}",),
     "record": (
         f"train CartPole-v1 --algo a2c --record {RECORDED} {ON_POLICY}",
@@ -67,6 +61,8 @@ RUNS: dict[str, tuple[str, ...]] = {
     ),
 }
 """The commands of each run, in one folder. COMMON is added to `train`, and RUN is its run folder."""
+LAGS = {"ppo": 1, "a2c": 2, "impala": 2, "dqn": 1, "sac": 2, "lstm": 2, "masks": 1}
+RUNS |= {f"{name} at lag {lag}": (f"{RUNS[name][0]} --max-lag {lag}",) for name, lag in LAGS.items()}
 TIMES = ("stage/", "time/fps", "time/time_elapsed", "ledger/transitions_received", "ledger/transitions_waiting")
 EVALUATED = ("env_steps", "updates", "return_mean_100", "evaluation", "best")
 PARTS = ("policy", "metrics", "evaluation", "dataset", "checkpoint")

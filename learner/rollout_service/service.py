@@ -43,9 +43,8 @@ class RolloutService:
         """Set the newest weights. The arrays must not change afterwards.
 
         `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first,
-        or because others may follow. `env_attributes`:
-        attributes that each env copy gets before its next rollout, packed. Raises `RunError` if a parameter is too large for
-        the dtype in which weights are sent.
+        or because others may follow. `env_attributes`: attributes that each env copy gets before its next rollout, packed.
+        Raises `RunError` if a parameter is too large for the dtype in which weights are sent.
         """
         self._hub.publish(version, parameters, buffers, deal=deal, env_attributes=env_attributes)
 
