@@ -63,7 +63,7 @@ class CollectingMember(Member):
     """A worker as the learner of a run sees it."""
 
     versions: dict[int, int] = field(default_factory=dict)
-    """Versions of the weights that were sent to the worker; for each, the value of `replies` when it was sent last."""
+    """Versions that were sent to the worker, unless it is known to lack them; for each, `replies` when it was sent last."""
     strikes: int = 0
     """Number of the worker's rollouts and messages that could not be used."""
 
