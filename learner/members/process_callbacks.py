@@ -28,3 +28,5 @@ class ProcessCallbacks:
     """Failures of those workers, which the learner takes out."""
     expected: int = 0
     """Number of processes that the user asked for. 0: any number."""
+    most_copies: int = 0
+    """The most env copies that their machine has room for. 0: any number."""

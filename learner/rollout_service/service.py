@@ -130,7 +130,8 @@ def rollout_service(
         ledger=ledger,
         incarnations=incarnations,
     )
-    coordinator.max_env_copies = config.max_env_copies
+    limits = [most for most in (config.max_env_copies, processes.most_copies) if most]
+    coordinator.max_env_copies = min(limits, default=0)
     settings = HubSettings(
         config.no_workers_timeout_s,
         config.stall_timeout_s,

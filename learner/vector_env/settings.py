@@ -35,6 +35,8 @@ class VectorEnvSettings:
     timeout_s: float = 60.0
     worker_timeout_s: float = 5.0
     """A worker elsewhere is lost if it is silent for this long while the learner listens."""
+    max_env_failures: int = 3
+    """Number of deaths of workers in the environment's code that `make_vec` survives, as `FailureCount` counts them."""
     copy: bool = True
     render_mode: str | None = None
     kwargs: dict[str, Scalar] = field(default_factory=dict)
@@ -53,6 +55,8 @@ class VectorEnvSettings:
             raise UsageError(f"timeout: expected a number of seconds above 0, got {self.timeout_s!r}")
         if self.workers is not None and self.workers < 0:
             raise UsageError(f"workers: expected at least 0, got {self.workers}")
+        if self.max_env_failures < 0:
+            raise UsageError(f"max_env_failures: expected at least 0, got {self.max_env_failures}")
 
     @property
     def envs(self) -> list[EnvLike | EnvSpec]:

@@ -9,14 +9,11 @@ import logging
 from contextlib import ExitStack
 from pathlib import Path
 
-import msgspec
-
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.config.validation import check_copies, idle_workers, workers_to_wait_for
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
-from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption, unless_finished
 from learner.run import (
     Run,
@@ -29,7 +26,7 @@ from learner.run import (
 )
 from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
+from millrace.launch.local_worker_options import local_processes, no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
 from workers.slots import LIMIT_VARIABLE, copies_per_machine
 from workers.supervise.supervisor import STOP_WITHIN_S, Supervisor
@@ -47,9 +44,7 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
     env = env or named_environment(config)
-    if most := copies_per_machine():  # all copies of the run are on this machine
-        check_copies(config, LIMIT_VARIABLE, most)
-        config = msgspec.structs.replace(config, max_env_copies=min(most, config.max_env_copies or most))
+    check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all copies of the run are on this machine
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 
@@ -67,9 +62,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         supervisor = Supervisor(endpoint.starter(flags), config.workers, timeouts=config.call_timeouts())
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
-        processes = ProcessCallbacks(
-            supervisor.poll, supervisor.activities, lower_priority=supervisor.lower_priority, expected=config.workers
-        )
+        processes = local_processes(supervisor, config.workers)
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
         with interrupts, one_thread():

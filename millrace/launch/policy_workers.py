@@ -22,7 +22,7 @@ from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import WorkerFlags
+from millrace.launch.local_worker_options import WorkerFlags, local_processes
 from millrace.launch.vector import listen
 from workers.copies.split_vector_env import SplitVectorEnv
 from workers.supervise.supervisor import Supervisor
@@ -86,7 +86,7 @@ def _player(
     else:
         supervisor = Supervisor(endpoint.starter(_own_logs(stack)), which.workers, timeouts=which.settings.call_timeouts())
         stack.callback(supervisor.stop, 2.0)
-        processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=which.workers)
+        processes = local_processes(supervisor, which.workers)
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
 
 

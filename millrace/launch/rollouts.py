@@ -19,7 +19,7 @@ from learner.rollout_service.service import RolloutService, describe_settings, r
 from learner.rollout_service.spec import rollout_spec
 from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import stopped_on_error, worker_cores
+from millrace.launch.local_worker_options import local_processes, stopped_on_error, worker_cores
 from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
@@ -66,7 +66,7 @@ def start(
         start_worker = endpoint.starter(lambda name: ([*timeouts, *core_flags(cores, name)], None))
         supervisor = Supervisor(start_worker, config.workers, timeouts=config.call_timeouts())
         resources.callback(supervisor.stop)
-        processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)
+        processes = local_processes(supervisor, config.workers)
     with ExitStack() as starting:
         if supervisor is not None:
             starting.enter_context(stopped_on_error(supervisor))

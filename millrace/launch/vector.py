@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from gymnasium.vector import AutoresetMode
 from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, accept_any
 from learner.members.endpoint import BindSettings
+from learner.members.events import Failed
+from learner.members.failure_count import FailureCount
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
@@ -25,9 +28,10 @@ from learner.vector_env.spec import RequestedCopies, requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, open_endpoint
-from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
+from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags, local_processes
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
+from protocol.bounds import MAX_LINE, one_line
 from protocol.cpu_cores import usable_cores
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -59,6 +63,7 @@ def make_vec(
     autoreset_mode: AutoresetMode | str = "NextStep",
     on_worker_loss: Literal["truncate", "raise"] = "truncate",
     timeout: float = 60.0,
+    max_env_failures: int = 3,
     copy: bool = True,
     render_mode: str | None = None,
     wrappers: Sequence[WrapperLike] = (),
@@ -87,6 +92,8 @@ def make_vec(
         on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
             and continues with new copies on another worker. "raise" raises `WorkerLost`.
         timeout: seconds that a worker may take to answer; then it is given up.
+        max_env_failures: how many deaths of workers in the environment's code are survived, counted as in a training run: in
+            a row and, in proportion to env copies and hours, within an hour.
         copy: return copies of the observations. Without it the next step overwrites them.
         render_mode: passed on to the environment.
         wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
@@ -100,8 +107,8 @@ def make_vec(
     Raises:
         UsageError: an argument is wrong.
         NoWorkers: too few workers joined in time.
-        EnvironmentFailed: an environment raised, and the error has the worker's traceback; or env copies differ in their
-            spaces.
+        EnvironmentFailed: an environment raised, and the error has the worker's traceback; or it ended its worker too often;
+            or env copies differ in their spaces.
         WorkerLost: see `on_worker_loss`.
 
     >>> import millrace
@@ -123,11 +130,13 @@ def make_vec(
         autoreset_mode=autoreset_mode,
         on_worker_loss=on_worker_loss,
         timeout_s=timeout,
+        max_env_failures=max_env_failures,
         copy=copy,
         render_mode=render_mode,
         kwargs=kwargs,
         wrappers=wrappers,
     )
+    deaths = _Deaths(FailureCount(settings.max_env_failures, len(settings.envs), time.monotonic()))
     timeouts = _call_timeouts(settings.timeout_s)
     flags = timeout_flags(timeouts)
     local_workers = settings.local_workers
@@ -142,6 +151,8 @@ def make_vec(
     try:
         started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
         made = started.vector_env(started.describe(describe))
+        made.call_on_death(deaths.died)
+        made.watch(deaths.check)
         made.wait_for(local_workers or settings.lane_count, join_timeout_s)
         made.make_copies()
         return made
@@ -150,6 +161,28 @@ def make_vec(
         if isinstance(error, EnvironmentFailed) and error.detail:
             error.add_note(error.detail)
         raise
+
+
+class _Deaths:
+    """Ends a vector environment whose environment ends its workers too often."""
+
+    def __init__(self, failures: FailureCount) -> None:
+        self._failures = failures
+        self._error: EnvironmentFailed | None = None
+
+    def died(self, event: Failed) -> None:
+        """Count the death of a worker in the environment's code."""
+        lanes = event.lanes or (event.worker,)
+        for lane in event.lanes if event.stepped else ():
+            self._failures.collected(lane)  # every step is a result of its own
+        if why := self._failures.failed(lanes, event.stepped, time.monotonic()):
+            line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
+            self._error = EnvironmentFailed(one_line(line, 4 * MAX_LINE))
+
+    def check(self) -> None:
+        """Raise `EnvironmentFailed` if there were too many deaths."""
+        if self._error is not None:
+            raise self._error
 
 
 @dataclass(frozen=True)
@@ -218,9 +251,7 @@ class StartedVectorEnv:
         spec, processes = self.listening.requested.to_describe, ProcessCallbacks()
         spec = spec if env is None else msgspec.structs.replace(spec, env=env)
         if self.supervisor is not None:
-            processes = ProcessCallbacks(
-                self.supervisor.poll, self.supervisor.activities, expected=self.listening.settings.local_workers
-            )
+            processes = local_processes(self.supervisor, self.listening.settings.local_workers)
         return described_by_workers(self.listening.endpoint.link, spec, settings, processes, check_interrupt, accept=accept)
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:

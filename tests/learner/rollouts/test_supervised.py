@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import pytest
 
+from learner.config.rollout_config import RolloutConfig
 from learner.members.events import WorkerLeft, WorkerProcessFailed
+from learner.members.process_callbacks import ProcessCallbacks
+from learner.rollout_service.service import rollout_service
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
 from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
 from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
+from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
-from tests.support.fake_ends import BUFFERS, PARAMETERS
+from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.fake_link import FakeLink
 
 A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
 NONCE = 1000 * len("host") + 1  # as `Learner.joins` makes it
@@ -276,3 +282,10 @@ def test_with_a_limit_of_copies_as_few_workers_play_evaluations_as_it_allows(mos
     learner.coordinator.max_env_copies = most and most + learner.coordinator.run.lanes * learner.coordinator.run.copies - 1
     learner.balanced(learner.coordinator.begin_evaluation(EvaluationPlan(seeds=(1, 2, 3, 4), copies=2, most_steps=10)))
     assert set(learner.coordinator.evaluation.holders) == evaluators
+
+
+@pytest.mark.parametrize(("of_run", "of_machine", "least"), [(0, 0, 0), (9, 0, 9), (0, 7, 7), (9, 7, 7), (7, 9, 7)])
+def test_a_run_keeps_within_its_own_limit_of_copies_and_its_machine_s(of_run: int, of_machine: int, least: int) -> None:
+    config, processes = RolloutConfig(max_env_copies=of_run), ProcessCallbacks(most_copies=of_machine)
+    service = rollout_service(config, run_spec(), cast(LearnerLink, FakeLink()), processes, lambda: None)
+    assert service._hub.coordinator.max_env_copies == least

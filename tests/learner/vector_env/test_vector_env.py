@@ -428,6 +428,7 @@ def test_with_more_lanes_than_workers_all_lanes_are_placed_at_once() -> None:
     env.close()
 
 
-def test_a_negative_number_of_workers_is_refused_in_one_line() -> None:
-    with pytest.raises(UsageError, match=r"^workers: expected at least 0, got -1$"):
-        millrace.make_vec("CartPole-v1", 2, workers=-1)
+@pytest.mark.parametrize("name", ["workers", "max_env_failures"])
+def test_a_negative_number_is_refused_in_one_line(name: str) -> None:
+    with pytest.raises(UsageError, match=rf"^{name}: expected at least 0, got -1$"):
+        millrace.make_vec("CartPole-v1", 2, **{name: -1})  # type: ignore[arg-type]
