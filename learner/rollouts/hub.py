@@ -336,8 +336,8 @@ class Hub:
         return status(self.coordinator, self._progress, now, self.waiting(now))
 
     def _on_event(self, event: Event) -> None:
-        """Count the failures of environments and of the user's policy together; the last decides the kind of the error."""
-        if not isinstance(event, Failed) or event.spare:
+        """Count the failures of environments and of the user's policy together; that which is one too many is the error."""
+        if not isinstance(event, Failed) or event.spare or self._failure is not None:
             return
         if why := self._failures.failed(event.lanes or (event.worker,), event.stepped, self._clock()):
             kind = PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed

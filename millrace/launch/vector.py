@@ -171,7 +171,9 @@ class _Deaths:
         self._error: EnvironmentFailed | None = None
 
     def died(self, event: Failed) -> None:
-        """Count the death of a worker in the environment's code."""
+        """Count the death of a worker in the environment's code. That which is one too many is the error."""
+        if self._error is not None:
+            return
         lanes = event.lanes or (event.worker,)
         for lane in event.lanes if event.stepped else ():
             self._failures.collected(lane)  # every step is a result of its own
