@@ -23,7 +23,7 @@ from protocol.messages import ToLearner
 from protocol.rollout import Rollout
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_worker, encode
-from workers.conversation.session import Effect, Identity, Leave, Send, Session, Task
+from workers.conversation.session import Effect, Identity, Leave, Send, Session, RolloutTask
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 STEPS, COPIES = 32, 8  # T, N: 9 KB
@@ -91,13 +91,13 @@ class Simulated:
         except zmq.Again:
             pass
         while (task := self._session.next_work()) is not None:
-            assert isinstance(task, Task)
+            assert isinstance(task, RolloutTask)
             if self._arrivals[task.weights.version, self._number] == 0.0:
                 self._arrivals[task.weights.version, self._number] = now
             self._do(self._session.work_ended(self._rollouts(task)))
         self.tick(now)
 
-    def _rollouts(self, task: Task) -> list[Rollout]:
+    def _rollouts(self, task: RolloutTask) -> list[Rollout]:
         if self._canned is None:
             assert isinstance(self._session.run, RunSpec)
             self._canned = canned(self._session.run)

@@ -47,9 +47,10 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "env_copy": {"activity", "slots"},
     "envs": {"env_copy"},
     "copies": {"activity", "env_copy", "envs"},
-    "collect": {"activity", "conversation", "copies", "env_copy"},
-    "evaluate": {"activity", "collect", "copies"},
-    "step": {"activity", "copies"},
+    "acting": set[str](),
+    "collect": {"activity", "acting", "conversation", "copies", "env_copy"},
+    "evaluate": {"acting", "activity", "copies"},
+    "vector_env": {"activity", "copies"},
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}

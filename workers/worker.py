@@ -40,12 +40,12 @@ from workers.conversation.session import (
     EvaluationTask,
     Identity,
     Leave,
+    RolloutTask,
     Send,
     Session,
     SharedOrders,
     StartSession,
     Statistics,
-    Task,
     Work,
 )
 from workers.conversation.states import State
@@ -53,7 +53,7 @@ from workers.describe import describing
 from workers.evaluate.evaluator import Evaluator
 from workers.exit_codes import EXIT_UNSUITABLE
 from workers.slots import NoSlot, slots
-from workers.step.stepper import Stepper
+from workers.vector_env.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 
@@ -63,10 +63,10 @@ IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the pare
 AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
-MakeCollector = Callable[[RunSpec], tuple[Collector, Evaluator]]
+MakeActors = Callable[[RunSpec], tuple[Collector, Evaluator]]
 
 
-def make_local_collector(run: RunSpec) -> tuple[Collector, Evaluator]:
+def make_local_actors(run: RunSpec) -> tuple[Collector, Evaluator]:
     """A collector and an evaluator that have env copies of their own and share a policy."""
     policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else OwnPolicy(run.policy, run.extras)
     return Collector(run, policy), Evaluator(run, policy)
@@ -101,7 +101,7 @@ class WorkerOptions:
     """Shared memory and wake pipes, for a vector environment on this machine."""
     exit_code: Callable[[int, str], int] = _same_exit_code
     """Exit code of the process, from that of the conversation and the reason for leaving."""
-    make_collector: MakeCollector = make_local_collector
+    make_actors: MakeActors = make_local_actors
     """Makes the collector and the evaluator of a run, with the policy that acts."""
 
 
@@ -171,7 +171,7 @@ class Worker:
             self._pulse(work)
 
         match work:
-            case Task(session, weights, assignments):
+            case RolloutTask(session, weights, assignments):
                 return self._loaded_collector(weights).collect(assignments, weights.version, session, pulse)
             case EvaluationTask(weights, order):
                 self._loaded_collector(weights)
@@ -341,7 +341,7 @@ class Worker:
             match run:
                 case RunSpec():
                     activity().begin(MAKING)  # the policy may import torch and the user's modules, which takes long
-                    self._collector, self._evaluator = self._options.make_collector(run)
+                    self._collector, self._evaluator = self._options.make_actors(run)
                     activity().begin(WAITING)
                     self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():

@@ -16,14 +16,14 @@ from protocol.wire.worker_link import WorkerLink
 from workers.activity import Activity, ActivityReader, share_activity
 from workers.conversation.session import Leave, Session
 from workers.supervise.ending import Ending
-from workers.worker import MakeCollector, Worker, WorkerOptions, identity, make_local_collector
+from workers.worker import MakeActors, Worker, WorkerOptions, identity, make_local_actors
 
 
 class WorkerThread:
     """A worker in a thread of this process. A thread cannot be killed."""
 
     def __init__(
-        self, address: str, name: str, context: zmq.Context[Any], make_collector: MakeCollector = make_local_collector
+        self, address: str, name: str, context: zmq.Context[Any], make_actors: MakeActors = make_local_actors
     ) -> None:
         self.name, self._identity = name, identity(name)
         self.process_nonce = self._identity.process_nonce
@@ -31,7 +31,7 @@ class WorkerThread:
         self._reader = ActivityReader(self._page)
         self._stop_requests = 0
         self._left: Leave | None = None
-        self._make_collector = make_collector
+        self._make_actors = make_actors
         self._thread = threading.Thread(target=self._run, args=(address, context), name=name, daemon=True)
         self._thread.start()
 
@@ -40,7 +40,7 @@ class WorkerThread:
         session = Session(self._identity, time.monotonic())
         link = WorkerLink(address, self.name, context)
         options = WorkerOptions(
-            code=AllowedCode.CALLABLES, stop_requests=lambda: self._stop_requests, make_collector=self._make_collector
+            code=AllowedCode.CALLABLES, stop_requests=lambda: self._stop_requests, make_actors=self._make_actors
         )
         with suppress(zmq.ContextTerminated):  # the run has ended, and a thread could not be killed
             self._left = Worker(link, session, options).run()

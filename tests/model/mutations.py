@@ -146,8 +146,8 @@ MUTATIONS = {
     "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
     "a worker acts under the newest weights": Mutation(
         SESSION,
-        "Task(session, self.weights[version], assignments)",
-        "Task(session, self.weights[max(self.weights)], assignments)",
+        "RolloutTask(session, self.weights[version], assignments)",
+        "RolloutTask(session, self.weights[max(self.weights)], assignments)",
     ),
     "a worker drops weights that a ticket names": Mutation(SESSION, "asked = {*self.rollouts.versions(), ", "asked = {"),
     "a worker drops the newest weights": Mutation(SESSION, ", max(self.weights, default=-1)}", "}"),

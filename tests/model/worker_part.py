@@ -15,7 +15,7 @@ from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
 from workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
-from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task, _SessionState
+from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, RolloutTask, Send, Session, _SessionState
 from workers.conversation.states import State
 
 SAVED: dict[type, set[str]] = {
@@ -43,7 +43,7 @@ class Worker:
     """of its process; a later process has a larger one"""
     session: Session | None = None
     """None: its process has ended"""
-    task: Task | EvaluationTask | None = None
+    task: RolloutTask | EvaluationTask | None = None
     frozen: bool = False
     shut_out: bool = False
     """whether its key was revoked: the learner hears nothing of it"""
@@ -78,7 +78,7 @@ class Worker:
         assert self.session is not None
         assert self.task is not None
         task, self.task = self.task, None
-        answers = fake_rollouts(task) if isinstance(task, Task) else [fake_evaluated(task)]
+        answers = fake_rollouts(task) if isinstance(task, RolloutTask) else [fake_evaluated(task)]
         held = self.session._current
         before = set(held.weights)
         effects = self.session.work_ended(answers)
@@ -120,10 +120,10 @@ class Worker:
 
     # ---------------------------------------------------------------- inside
 
-    def _begin(self, work: Task | EvaluationTask) -> list[ToLearner]:
+    def _begin(self, work: RolloutTask | EvaluationTask) -> list[ToLearner]:
         """What the worker says when this work begins."""
         self.task = work
-        if isinstance(work, Task):
+        if isinstance(work, RolloutTask):
             assert self.session is not None
             held, version = self.session._current, work.weights.version
             lanes = held.rollouts._lanes
@@ -150,7 +150,7 @@ class Worker:
         work = current.next_work()
         if work is not None:
             assert self.task is None, "a worker does two pieces of work at the same time"
-            assert isinstance(work, Task | EvaluationTask)
+            assert isinstance(work, RolloutTask | EvaluationTask)
             effects = effects + [Send(said) for said in self._begin(work)]
         effects = effects + current.tick(now)
         rounds = 1 + self.settings.max_lag
@@ -189,7 +189,7 @@ def saved(worker: Worker, now: float) -> Content:
         None if current.run is None else name(Kind.REPLIES, held.replies, current.session),
     )
     task = worker.task
-    if not isinstance(task, Task):
+    if not isinstance(task, RolloutTask):
         return nonce, flags, fields, None
     return nonce, flags, fields, (session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments))
 
@@ -236,5 +236,5 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     worker.session = current
     if work is not None:
         assignments = tuple(Assignment(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in work[2])
-        worker.task = Task(work[0].value, weights(work[1]), assignments)
+        worker.task = RolloutTask(work[0].value, weights(work[1]), assignments)
     return worker

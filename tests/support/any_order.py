@@ -26,7 +26,7 @@ from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_
 from protocol.wire.wake_up import WakePipe
 from tests.support.described import described
 from tests.support.fake_link import FakeLink
-from workers.step.stepper import Stepper
+from workers.vector_env.stepper import Stepper
 
 Choose = Callable[[int], int]
 """Chooses one of so many."""

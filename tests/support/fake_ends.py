@@ -23,7 +23,7 @@ from protocol.env_spec import EnvSpec
 from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker
 from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task
+from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, RolloutTask
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
@@ -55,7 +55,7 @@ def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: i
     )
 
 
-def fake_rollouts(task: Task) -> list[Rollout]:
+def fake_rollouts(task: RolloutTask) -> list[Rollout]:
     """What a collector would have made of this task."""
     return [fake_rollout(task.session, a.lane, a.ticket, task.weights.version, a.sequence) for a in task.assignments]
 
@@ -110,7 +110,7 @@ class FakeWorker:
 
     name: bytes
     session: Session
-    task: Task | EvaluationTask | None = None
+    task: RolloutTask | EvaluationTask | None = None
     frozen: bool = False
     inbox: list[ToWorker] = field(default_factory=list)
 
@@ -231,19 +231,19 @@ class World:
             worker.task = None
             self.say(worker, session.work_ended([]))
         if worker.task is None and (task := session.next_work()) is not None:
-            assert isinstance(task, Task | EvaluationTask)
+            assert isinstance(task, RolloutTask | EvaluationTask)
             worker.task = task
             self.at(self.random.uniform(0.01, 0.4), lambda: self._finish(worker, task))
         self.say(worker, session.tick(self.now))
 
-    def _finish(self, worker: FakeWorker, task: Task | EvaluationTask) -> None:
+    def _finish(self, worker: FakeWorker, task: RolloutTask | EvaluationTask) -> None:
         if worker.task is not task or self.workers.get(worker.name) is not worker:
             return
         if worker.frozen:
             self.at(0.5, lambda: self._finish(worker, task))
             return
         worker.task = None
-        if isinstance(task, Task):
+        if isinstance(task, RolloutTask):
             self.say(worker, worker.session.work_ended(fake_rollouts(task)))
         else:
             order = task.order

@@ -28,7 +28,7 @@ from workers.describe import describing
 from workers.envs.reset_ahead import ResetAhead
 from workers.envs.toy import Countdown
 from workers.evaluate.evaluator import open_looped_copies
-from workers.step.stepper import Stepper
+from workers.vector_env.stepper import Stepper
 
 MODULE = __name__
 

@@ -51,11 +51,11 @@ from workers.conversation.session import (
     EvaluationTask,
     Identity,
     Leave,
+    RolloutTask,
     Send,
     Session,
     StartSession,
     Statistics,
-    Task,
 )
 from workers.conversation.states import TABLE, State
 from workers.exit_codes import EXIT_UNSUITABLE
@@ -117,9 +117,9 @@ def ready(*messages: ToWorker, version: int | None = 0) -> Session:
     return session
 
 
-def task_of(session: Session) -> Task:
+def task_of(session: Session) -> RolloutTask:
     task = session.next_work()
-    assert isinstance(task, Task)
+    assert isinstance(task, RolloutTask)
     return task
 
 

@@ -23,7 +23,7 @@ from tests.support.bit_equality import bit_equal
 from tests.support.described import step_spec
 from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
-from workers.step.stepper import Stepper
+from workers.vector_env.stepper import Stepper
 
 
 def call(stepper: Stepper, name: str, arguments: Any, *, assign: bool = False) -> Returned:

@@ -45,7 +45,7 @@ from workers.conversation.session import Leave, Session
 from workers.evaluate.evaluator import Evaluator
 from workers.exit_codes import EXIT_UNSUITABLE
 from workers.slots import Slots
-from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_collector
+from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
 
@@ -148,7 +148,7 @@ def test_a_collector_that_cannot_be_made_is_a_failure_that_the_learner_hears() -
 
     link = FakeLink(said_to_a_worker(RUN))
     session = Session(replace(identity("w0"), process_nonce=0), 0.0)
-    options = WorkerOptions(make_collector=no_device)
+    options = WorkerOptions(make_actors=no_device)
     assert Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run().exit_code == 1
     failure = link.heard()[-1]
     assert isinstance(failure, Failure)
@@ -185,7 +185,7 @@ def test_a_worker_that_makes_its_policy_is_not_silent() -> None:
         raise ImportError("no module my_encoder")
 
     link = FakeLink(said_to_a_worker(RUN))
-    options = WorkerOptions(make_collector=slow_imports)
+    options = WorkerOptions(make_actors=slow_imports)
     session = Session(replace(identity("w0"), process_nonce=0), 0.0)
     Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run()
     assert doing == ["making"]
@@ -256,10 +256,10 @@ def test_only_the_time_in_which_a_joining_worker_listens_is_time_without_an_answ
         closed_at.append(link.now)
 
     def slow_to_close(run: RunSpec) -> tuple[Collector, Evaluator]:
-        collector, evaluator = make_local_collector(run)
+        collector, evaluator = make_local_actors(run)
         monkeypatch.setattr(collector.lanes, "close", close)
         return collector, evaluator
 
     session = Session(replace(identity("w0"), process_nonce=0), 0.0, rejoin_timeout_s=150.0)
-    Worker(cast(WorkerLink, link), session, WorkerOptions(make_collector=slow_to_close), clock=lambda: link.now).run()
+    Worker(cast(WorkerLink, link), session, WorkerOptions(make_actors=slow_to_close), clock=lambda: link.now).run()
     assert [(at - closed_at[0]) // CONNECT_AGAIN_S for at in link.made_at] == [1, 2]

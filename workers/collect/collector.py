@@ -26,8 +26,8 @@ from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
+from workers.acting import RolloutActions, acting_of
 from workers.activity import MAKING, activity
-from workers.collect.acting import RolloutActions, acting_of
 from workers.collect.collected_lane import CollectedLane
 from workers.conversation.held import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies

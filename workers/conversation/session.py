@@ -85,7 +85,7 @@ Effect = Send | StartSession | CloseLanes | Leave
 
 
 @dataclass(frozen=True)
-class Task:
+class RolloutTask:
     """Rollouts to collect together, all under these weights."""
 
     session: int
@@ -113,7 +113,7 @@ class SharedOrders:
     session: int
 
 
-Work = Task | EvaluationTask | Order
+Work = RolloutTask | EvaluationTask | Order
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class _SessionState:
         if (evaluation := self.evaluations.next(self.weights)) is not None:
             return EvaluationTask(self.weights[evaluation.version], evaluation)
         version, assignments = self.rollouts.startable(self.weights)
-        return Task(session, self.weights[version], assignments) if assignments else self.orders.next()
+        return RolloutTask(session, self.weights[version], assignments) if assignments else self.orders.next()
 
     def drop_weights(self) -> None:
         """Drop the weights that are neither the newest nor asked for."""

@@ -28,7 +28,7 @@ from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 from protocol.specs import RunSpec
-from workers.collect.acting import acting_of
+from workers.acting import acting_of
 from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse

@@ -15,7 +15,7 @@ from tests.model.conversation import Content
 from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
 from tests.model.worker_part import Worker
 from tests.support.fake_ends import fake_rows
-from workers.conversation.session import EvaluationTask, Task
+from workers.conversation.session import EvaluationTask, RolloutTask
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
@@ -39,7 +39,7 @@ class EvaluatingWorker(Worker):
         last_rows = _rows(self.task.order, EPISODE_STEPS - 1) if isinstance(self.task, EvaluationTask) else []
         return [*last_rows, *super().finish(now)]
 
-    def _begin(self, work: Task | EvaluationTask) -> list[ToLearner]:
+    def _begin(self, work: RolloutTask | EvaluationTask) -> list[ToLearner]:
         first_rows = super()._begin(work)
         if isinstance(work, EvaluationTask):
             order = work.order

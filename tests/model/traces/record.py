@@ -19,7 +19,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from protocol.arrays import Array
 from protocol.messages import Rollout, ToLearner, ToWorker, Weights
 from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
-from workers.conversation.session import CloseLanes, EvaluationTask, Leave, Send, StartSession, Task
+from workers.conversation.session import CloseLanes, EvaluationTask, Leave, RolloutTask, Send, StartSession
 
 SUFFIX = ".trace"
 KEPT_WEIGHTS = 64  # digests of weights: the learner of a soak must not grow by them
@@ -113,8 +113,8 @@ class Digests:
                 return "CloseLanes", lanes
             case Leave():
                 return "Leave", value.exit_code, value.reason
-            case Task():
-                return "Task", value.session, value.weights.version, value.assignments
+            case RolloutTask():
+                return "RolloutTask", value.session, value.weights.version, value.assignments
             case EvaluationTask():
                 return "EvaluationTask", value.weights.version, self.of(value.order)
             case AcceptedRollout():

@@ -27,7 +27,7 @@ from workers.activity import STEPPING, activity
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Infos, Pulse
 from workers.copies.open_lanes import OpenLanes
-from workers.step.stepped_lane import Rows, SteppedLane, new_rows
+from workers.vector_env.stepped_lane import Rows, SteppedLane, new_rows
 
 
 class Stepper:
