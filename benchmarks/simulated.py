@@ -23,7 +23,7 @@ from protocol.messages import ToLearner
 from protocol.rollout import Rollout
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_worker, encode
-from workers.conversation.session import Effect, Identity, Leave, Send, Session, RolloutTask
+from workers.conversation.session import Effect, Identity, Leave, RolloutTask, Send, Session
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 STEPS, COPIES = 32, 8  # T, N: 9 KB

@@ -23,7 +23,7 @@ from protocol.env_spec import EnvSpec
 from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker
 from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, Send, Session, RolloutTask
+from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, RolloutTask, Send, Session
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
