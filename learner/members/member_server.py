@@ -15,10 +15,11 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
+from learner.members.coordinator import Coordinator
 from learner.members.events import (
     EnvironmentRaised,
     Event,
@@ -32,13 +33,13 @@ from learner.members.events import (
 from learner.members.join_limiter import JoinLimiter
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
-from learner.members.membership import Membership, Outgoing
+from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import SentUnusable
 from protocol.address import advertised_address, name_for_people
 from protocol.bounds import one_line
 from protocol.errors import BadMessage, NoWorkers
-from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights, WorkerExit
+from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
 from protocol.wire.codec import Buffer, encode
 from protocol.wire.learner_link import LearnerLink
 
@@ -51,28 +52,6 @@ SHORT_TURN_S = 0.003  # at least so much, also in a short turn
 FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
 LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way
 STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
-
-
-class MemberCoordinator(Protocol):
-    """The pure part of a hub: messages in, answers out."""
-
-    membership: Membership[Any]
-
-    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
-        """Count a message that could not be read, and answer it."""
-        ...
-
-    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """Remove a member whose key was revoked."""
-        ...
-
-    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
-        """Remove a worker whose process has ended."""
-        ...
-
-    def remove_silent(self, now: float) -> list[Outgoing]:
-        """Remove the members that have been silent for too long."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -107,7 +86,7 @@ class MemberServer:
     def __init__(
         self,
         link: LearnerLink,
-        coordinator: MemberCoordinator,
+        coordinator: Coordinator[Any],
         callbacks: ServerCallbacks,
         processes: ProcessCallbacks,
         settings: ServerSettings | None = None,

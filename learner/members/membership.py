@@ -210,7 +210,7 @@ class Membership(Generic[M]):
         """why the workers were asked to leave; None while they were not"""
         self.progress = 0
         """how often a member has reported more env steps, or more calls of the environment that have returned"""
-        self._run, self._member_class, self._on_removed, self._is_spare = run, member_class, on_removed, is_spare
+        self._run, self._member_class, self._on_removed, self.is_spare = run, member_class, on_removed, is_spare
         self._next_session = first_session
         self._joins = 0
         self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
@@ -345,7 +345,7 @@ class Membership(Generic[M]):
         member = self._of_process.get((worker, worker_exit.process_nonce))
         if member is not None and (key is None or key == key_of_peer(member.peer)):
             if worker_exit.failed:
-                spare = self._is_spare(member)
+                spare = self.is_spare(member)
                 self.events.append(member.failed(WorkerProcessFailed, f"its process {reason}", spare=spare))
             self.remove(member, TimedOut, reason)
             return True

@@ -18,39 +18,29 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 
-from learner.members.events import EnvironmentRaised, Event, PolicyRaised
+from learner.members.coordinator import Coordinator
+from learner.members.events import Failed, PolicyRaised
 from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.membership import Member, Membership, Outgoing
-from learner.members.states import MemberState, SentUnusable
+from learner.members.states import SentUnusable
 from learner.rollouts.evaluation_tickets import EvaluationPlan, EvaluationTickets, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.rounds import Rounds
-from protocol.bounds import one_line
 from protocol.messages import (
-    Alive,
     Array,
     Collect,
-    Described,
-    Drain,
     EpisodeRows,
     Evaluate,
     Evaluated,
     Failure,
-    Goodbye,
     Heartbeat,
-    HeartbeatReply,
-    Hello,
     Permit,
     Received,
-    Refuse,
     Rejoin,
-    Returned,
     Rollout,
-    Stepped,
     ToLearner,
     Weights,
-    WorkerExit,
     WorkerStatus,
 )
 from protocol.specs import RunSpec
@@ -73,7 +63,7 @@ class CollectingMember(Member):
         return msgspec.structs.replace(super().status(now), version=max(held, default=-1), strikes=self.strikes)
 
 
-class TicketCoordinator:
+class TicketCoordinator(Coordinator[CollectingMember]):
     """Members, lanes, tickets and the ledger."""
 
     def __init__(
@@ -90,13 +80,13 @@ class TicketCoordinator:
 
         `incarnations`: the first of each lane; there may be more or fewer of them than lanes.
         """
+        membership = Membership(
+            run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, self.lanes)
+        )
+        super().__init__(membership, worker_timeout_s)
         self.run = run
         self.ledger = ledger or Ledger()
         self.version = -1  # until `publish`
-        self.worker_timeout_s = worker_timeout_s
-        self.membership: Membership[CollectingMember] = Membership(
-            run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, self.lanes)
-        )
         self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(run.lanes)]
         self._absent = list(incarnations[run.lanes :])  # incarnations of lanes that the run had, and may have again
         self.tickets: dict[int, Ticket] = {}
@@ -110,61 +100,16 @@ class TicketCoordinator:
         self._to_deal = set[int]()  # lanes with rounds that are to be dealt
         self._weights: dict[int, Weights] = {}  # by version: the newest, and those that act in open rounds
 
-    @property
-    def members(self) -> dict[bytes, CollectingMember]:
-        """Members by routing id."""
-        return self.membership.members
-
-    @property
-    def events(self) -> list[Event]:
-        """Events that were not logged yet."""
-        return self.membership.events
-
     # ---------------------------------------------------------------- in
 
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
         """Answer a message. A rollout must have passed `protocol.rollout.validate`; else call `reject_rollout`."""
-        if isinstance(message, Hello):
-            return self._join(peer, message, now)
-        if isinstance(message, Alive):
-            answer, removed = self.membership.hear_supervisor(peer, message, now)
-            return [*answer, *(self._deal() if removed else [])]
-        if isinstance(message, Rollout):
-            self.ledger.transitions_received += message.env_steps
-        member = self.membership.member_of_session(peer, message, now)
-        if member is None:
-            if isinstance(message, Rollout):
-                self.ledger.transitions_late += message.env_steps
-            return self.membership.answer_ended_session(peer, message)
-        match message:
-            case Rollout():
-                return self._rollout(member, message)
-            case Heartbeat():
-                return self._heartbeat(member, message)
-            case Evaluated():
-                return self._checked(member, self.evaluation.take(member, message), now)
-            case EpisodeRows():
-                return self._checked(member, self.evaluation.take_rows(member, message), now)
-            case Stepped() | Returned() | Described():
-                return []  # answers to orders that a run does not give
-            case Goodbye(_, reason):
-                self.membership.remove(member, Goodbye, f"left: {reason}")
-                return self._deal()
-            case Failure(_, error, traceback, lane, of_policy):
-                # No worker can blame a policy that is not the user's.
-                kind = PolicyRaised if of_policy and self.run.policy.own is not None else EnvironmentRaised
-                spare = is_spare(member, self.lanes)
-                self.events.append(member.failed(kind, error, traceback, lane=lane, spare=spare))
-                self.membership.remove(member, Failure, "failed")
-                return self._deal()
+        return super().receive(peer, message, now)
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Count a message that could not be read, and answer it."""
         self.ledger.messages_bad += 1
-        member = self.members.get(peer)
-        if member is None:
-            return [(peer, Refuse(one_line(f"not understood: {why}")))]
-        return self._strike(member, why, now) + self._deal()
+        return super().reject_message(peer, why, now)
 
     def reject_rollout(self, peer: bytes, rollout: Rollout, why: str, now: float) -> list[Outgoing]:
         """Count a rollout that cannot be used. Its ticket is lost."""
@@ -174,7 +119,8 @@ class TicketCoordinator:
         self.ledger.transitions_invalid += steps
         if member is None or member.session != rollout.session:
             return [(peer, Rejoin(rollout.session))]
-        out = self._strike(member, why, now)
+        member.heard_s = now
+        out = self._unusable(member, why)
         if rollout.ticket in member.tickets:
             ticket = self.tickets[rollout.ticket]
             self.lanes[ticket.lane].arrived(ticket.sequence)  # so that its worker drops it
@@ -188,21 +134,6 @@ class TicketCoordinator:
     def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
         """Refuse a worker that holds tickets and does nothing with them: they are dealt again."""
         return self.membership.refuse(member, SentUnusable, why) + self._deal()
-
-    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
-        """A process of this program has ended."""
-        return self._deal() if self.membership.record_exit(worker_exit) else []
-
-    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """A member's key was revoked: send it the reason and remove it at once, even if it holds tickets."""
-        return self.membership.revoke(peer, why) + self._deal()
-
-    def remove_silent(self, now: float) -> list[Outgoing]:
-        """Remove workers that were silent for longer than `worker_timeout_s`.
-
-        Call it only when every message that has arrived was given to `receive`.
-        """
-        return self._deal() if self.membership.remove_silent(now, self.worker_timeout_s) else []
 
     # ---------------------------------------------------------------- the learner's side
 
@@ -256,10 +187,6 @@ class TicketCoordinator:
         """Number of rollouts that have come and were not taken."""
         return sum(map(len, self.ready.values()))
 
-    def drain(self, reason: str) -> list[Outgoing]:
-        """Ask every worker to leave; deal no more tickets."""
-        return self.membership.drain(reason)
-
     def incarnations(self) -> list[int]:
         """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
         return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
@@ -271,35 +198,49 @@ class TicketCoordinator:
         lane = self.lanes[arrived.rollout.lane]
         return replace(arrived, fresh=not lane.use(arrived.incarnation, arrived.rollout.sequence))
 
-    def _join(self, peer: bytes, hello: Hello, now: float) -> list[Outgoing]:
-        welcome, member = self.membership.join(peer, hello, now)
-        if member is None:
-            return welcome
+    def _joined(self) -> list[Outgoing]:
         self._placement.joined()
-        return welcome + self._deal()
+        return self._deal()
 
-    def _strike(self, member: CollectingMember, why: str, now: float) -> list[Outgoing]:
-        """Count something that could not be used; after too many the worker is refused."""
-        member.heard_s = now
+    def _unusable(self, member: CollectingMember, why: str) -> list[Outgoing]:
+        """Count what could not be used; after too much of it the worker is refused."""
         member.strikes += 1
-        return self.membership.refuse(member, SentUnusable, why) if member.strikes >= STRIKES else []
+        return super()._unusable(member, why) if member.strikes >= STRIKES else []
 
-    def _checked(self, member: CollectingMember, why: str, now: float) -> list[Outgoing]:
-        """After an answer of an evaluation was taken; `why` it could not be used, if so."""
-        return (self._strike(member, why, now) if why else []) + self._deal()
+    def _kind(self, failure: Failure) -> type[Failed]:
+        # No worker can blame a policy that is not the user's.
+        return PolicyRaised if failure.of_policy and self.run.policy.own is not None else super()._kind(failure)
+
+    def _late(self, message: ToLearner) -> None:
+        if isinstance(message, Rollout):
+            self.ledger.transitions_received += message.env_steps
+            self.ledger.transitions_late += message.env_steps
+
+    def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
+        match message:
+            case Rollout():
+                return self._rollout(member, message)
+            case Evaluated():
+                why = self.evaluation.take(member, message)
+            case EpisodeRows():
+                why = self.evaluation.take_rows(member, message)
+            case _:
+                return []  # answers to orders that a run does not give
+        return (self._unusable(member, why) if why else []) + self._deal()
 
     def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         ticket = self.tickets.get(rollout.ticket)
         if ticket is None:
+            self.ledger.transitions_received += rollout.env_steps
             self.ledger.transitions_duplicate += rollout.env_steps
             return []
         expected = ticket.peer, ticket.lane, ticket.version, ticket.sequence
         if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:
-            self.ledger.transitions_received -= rollout.env_steps  # `reject_rollout` counts it
             expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
             got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
             why = f"ticket {ticket.number}: expected {expects}, got {got}"
             return self.reject_rollout(member.peer, rollout, why, member.heard_s)
+        self.ledger.transitions_received += rollout.env_steps
         del self.tickets[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)
@@ -310,19 +251,12 @@ class TicketCoordinator:
         return self._deal()
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        """Answer a heartbeat. If it shows that messages were lost on the way, send them again."""
         self.ledger.late_actions += member.new_late_actions(heartbeat)
-        lost = member.record_heartbeat(heartbeat)
-        peer = member.peer
-        if member.state is MemberState.DRAINING:
-            return [(peer, Drain(one_line(self.membership.draining or "")))]
+        return super()._heartbeat(member, heartbeat)
+
+    def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         out = self._lost_weights(member, heartbeat)
-        again = self._collect(member, lost)
-        again += self.evaluation.send_again(member, heartbeat)
-        out += self._with_weights(again)
-        member.replies += 1
-        out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
-        return out + self._deal()
+        return out + self._with_weights(self._collect(member, lost) + self.evaluation.send_again(member, heartbeat))
 
     def _lost_weights(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         """The weights that this worker's tickets name and that were lost on the way, as its heartbeat shows."""
@@ -348,8 +282,8 @@ class TicketCoordinator:
                 member.versions = needed | {message.version: member.replies}
         return out
 
-    def _received(self, lanes: set[int]) -> tuple[Received, ...]:
-        mine = [self.lanes[number] for number in lanes]
+    def _received(self, member: CollectingMember) -> tuple[Received, ...]:
+        mine = [self.lanes[number] for number in member.lanes]
         return tuple(Received(lane.number, lane.incarnation, lane.next_sequence, tuple(lane.out_of_order)) for lane in mine)
 
     def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Outgoing]:
@@ -359,7 +293,7 @@ class TicketCoordinator:
             chosen = [self.tickets[number] for number in tickets if self.tickets[number].version == version]
             permits = tuple(Permit(each.number, each.lane, each.incarnation, each.sequence) for each in chosen)
             member.tickets |= {ticket.number: member.replies for ticket in chosen}
-            out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
+            out.append((member.peer, Collect(member.session, version, permits, self._received(member))))
         return out
 
     def _removed(self, member: CollectingMember, why: str) -> None:

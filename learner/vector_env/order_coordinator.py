@@ -9,37 +9,25 @@ messages, where they are too long for the shared memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from learner.members.events import EnvironmentRaised, Failed
+from learner.members.coordinator import Coordinator
+from learner.members.events import Failed
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
-from learner.members.states import MemberState, SentUnusable, TimedOut
-from protocol.bounds import one_line
+from learner.members.states import TimedOut
 from protocol.errors import BadMessage
 from protocol.messages import (
-    Alive,
     Answer,
     Call,
-    Described,
-    Drain,
-    EpisodeRows,
-    Evaluated,
-    Failure,
-    Goodbye,
     Heartbeat,
-    HeartbeatReply,
-    Hello,
     LaneIncarnation,
     Order,
     Received,
-    Refuse,
     Returned,
-    Rollout,
     Stepped,
     ToLearner,
-    WorkerExit,
 )
 from protocol.rows.stepped import wrong_rows
 from protocol.specs import StepSpec
@@ -63,13 +51,13 @@ class OrderedLane(PlacedLane):
         self.incarnation += 1
 
 
-class OrderCoordinator:
+class OrderCoordinator(Coordinator[Member]):
     """Members, lanes, orders and their answers."""
 
     def __init__(self, spec: StepSpec, first_session: int, worker_timeout_s: float = math.inf) -> None:
+        membership = Membership(spec, Member, self._removed, first_session, lambda member: is_spare(member, self.lanes))
+        super().__init__(membership, worker_timeout_s)
         self.spec = spec
-        self.worker_timeout_s = worker_timeout_s
-        self.membership: Membership[Member] = Membership(spec, Member, self._removed, first_session)
         self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
         """Orders that were sent and not answered, by ticket."""
@@ -86,73 +74,10 @@ class OrderCoordinator:
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
 
-    @property
-    def members(self) -> dict[bytes, Member]:
-        """Members by routing id."""
-        return self.membership.members
-
-    # ---------------------------------------------------------------- in
-
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message."""
-        if isinstance(message, Hello):
-            return self.membership.join(peer, message, now)[0]
-        if isinstance(message, Alive):
-            return self.membership.hear_supervisor(peer, message, now)[0]
-        member = self.membership.member_of_session(peer, message, now)
-        if member is None:
-            return self.membership.answer_ended_session(peer, message)
-        match message:
-            case Stepped() | Returned():
-                return self._answer(member, message)
-            case Heartbeat():
-                return self._heartbeat(member, message)
-            case Goodbye(_, reason):
-                self.membership.remove(member, Goodbye, f"left: {reason}")
-            case Failure(_, error, traceback, lane):
-                spare = is_spare(member, self.lanes)
-                failure = member.failed(EnvironmentRaised, error, traceback, lane=lane, spare=spare)
-                if not spare:
-                    self.failures.append(failure)
-                self.membership.events.append(failure)
-                self.membership.remove(member, Failure, "failed")
-            case Rollout() | Described() | Evaluated() | EpisodeRows():
-                why = f"it sent {type(message).__name__}, which a vector environment does not ask for"
-                return self.membership.refuse(member, SentUnusable, why)
-        return []
-
-    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
-        """A message that could not be read, or an answer that does not fit: its sender is refused."""
-        member = self.members.get(peer)
-        if member is None:
-            return [(peer, Refuse(one_line(f"not understood: {why}")))]
-        return self.membership.refuse(member, SentUnusable, why)
-
-    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """A member's key was revoked: send it the reason and remove it at once, even if it holds orders."""
-        return self.membership.revoke(peer, why)
-
     def give_up(self, member: Member, why: str) -> list[Outgoing]:
         """Remove this worker, for which the learner waits no longer, and no other of its name: keys may share names."""
         self.membership.remove(member, TimedOut, why)
         return []
-
-    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
-        """A process of this program has ended."""
-        self.membership.record_exit(worker_exit)
-        return []
-
-    def remove_silent(self, now: float) -> list[Outgoing]:
-        """Remove workers that were silent for longer than `worker_timeout_s`.
-
-        Call it only when every message that has arrived was given to `receive`.
-        """
-        self.membership.remove_silent(now, self.worker_timeout_s)
-        return []
-
-    def drain(self, reason: str) -> list[Outgoing]:
-        """Ask every worker to leave."""
-        return self.membership.drain(reason)
 
     # ---------------------------------------------------------------- the vector environment's side
 
@@ -200,42 +125,41 @@ class OrderCoordinator:
 
     # ---------------------------------------------------------------- inside
 
-    def _answer(self, member: Member, answer: Answer) -> list[Outgoing]:
-        if answer.ticket < 0:
-            return self._long_infos(member, answer)
-        order = self.orders.get(answer.ticket)
-        if order is None or answer.ticket not in member.tickets:
+    def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
+        if not isinstance(message, Stepped | Returned):
+            return self._unusable(member, f"it sent {type(message).__name__}, which a vector environment does not ask for")
+        if message.ticket < 0:
+            return self._long_infos(member, message)
+        order = self.orders.get(message.ticket)
+        if order is None or message.ticket not in member.tickets:
             return []  # this answer has come before
         try:
-            check(answer, order, self.spec)
+            check(message, order, self.spec)
         except BadMessage as error:
-            return self.reject_message(member.peer, str(error), member.heard_s)
-        del self.orders[answer.ticket], member.tickets[answer.ticket]
-        self.answers[answer.lane] = answer
+            return self._unusable(member, str(error))
+        del self.orders[message.ticket], member.tickets[message.ticket]
+        self.answers[message.lane] = message
         return []
 
     def _long_infos(self, member: Member, answer: Answer) -> list[Outgoing]:
         """Infos of a step through shared memory. They count only if they belong to the lane's newest order."""
         if not isinstance(answer, Stepped):
-            why = "answer to an order through shared memory: expected Stepped, got Returned"
-            return self.reject_message(member.peer, why, member.heard_s)
+            return self._unusable(member, "answer to an order through shared memory: expected Stepped, got Returned")
         mine = answer.lane in member.lanes and self.lanes[answer.lane].incarnation == answer.incarnation
         if mine and self.shared_orders.get(answer.lane) == -answer.ticket:
             self.infos[answer.lane] = bytes(answer.infos.data)
         return []
 
-    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
-        """Answer a heartbeat. Send again the orders that it shows to be lost on the way."""
-        lost = member.record_heartbeat(heartbeat)
-        if member.state is MemberState.DRAINING:
-            return [(member.peer, Drain(one_line(self.membership.draining or "")))]
-        out: list[Outgoing] = []
-        for ticket in lost:
-            member.tickets[ticket] = member.replies
-            out.append((member.peer, self.orders[ticket]))
-        member.replies += 1
-        lanes = tuple(Received(lane, self.lanes[lane].incarnation, 0) for lane in sorted(member.lanes))
-        return [*out, (member.peer, HeartbeatReply(member.session, member.replies, lanes))]
+    def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
+        member.tickets |= dict.fromkeys(lost, member.replies)
+        return [(member.peer, self.orders[ticket]) for ticket in lost]
+
+    def _received(self, member: Member) -> tuple[Received, ...]:
+        return tuple(Received(lane, self.lanes[lane].incarnation, 0) for lane in sorted(member.lanes))
+
+    def _failed(self, failed: Failed) -> None:
+        if not failed.spare:
+            self.failures.append(failed)
 
     def _removed(self, member: Member, why: str) -> None:
         for ticket in member.tickets:

@@ -46,7 +46,7 @@ SAVED: dict[type, set[str]] = {
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "max_env_copies", "worker_timeout_s", "evaluation", "_absent"},
-    Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "_is_spare"}
+    Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
     | {"_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
         "joined_s",

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parent.parent.parent
 COORDINATOR = "learner.rollouts.ticket_coordinator"
+MEMBERS = "learner.members.coordinator"
 LANES = "learner.rollouts.lanes"
 ROUNDS = "learner.rollouts.rounds"
 MEMBERSHIP = "learner.members.membership"
@@ -88,7 +89,7 @@ MUTATIONS = {
         "        self._placement",
     ),
     "a lost Collect is not sent again": Mutation(
-        COORDINATOR, "again = self._collect(member, lost)", "again: list[Outgoing] = []"
+        COORDINATOR, "self._collect(member, lost) + self.evaluation", "self.evaluation"
     ),
     "lost weights are not sent again": Mutation(
         COORDINATOR, "out = self._lost_weights(member, heartbeat)", "out: list[Outgoing] = []"
@@ -103,7 +104,7 @@ MUTATIONS = {
         COORDINATOR, "member.versions = held | dict", "member.versions |= dict"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
-        COORDINATOR, "out += self._with_weights(again)", "out += again"
+        COORDINATOR, "out + self._with_weights(self._collect(member, lost) + ", "out + (self._collect(member, lost) + "
     ),
     "weights are never sent": Mutation(COORDINATOR, " and message.version not in member.versions:", " and False:"),
     "weights are sent with every order": Mutation(COORDINATOR, " and message.version not in member.versions:", ":"),
@@ -121,7 +122,7 @@ MUTATIONS = {
         COORDINATOR, "if v == version or self._rounds.acts(v)}", "if v == version}"
     ),
     "the learner keeps all weights": Mutation(COORDINATOR, "if v == version or self._rounds.acts(v)}", "if True}"),
-    "heartbeats are answered with the same number": Mutation(COORDINATOR, "member.replies += 1", "member.replies += 0"),
+    "heartbeats are answered with the same number": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
     "tickets of a lost worker are kept": Mutation(COORDINATOR, "for number in list(member.tickets):", "for number in ():"),
     "two tickets of a lane have one sequence number": Mutation(LANES, "self.dealt += 1", "self.dealt = 1"),
     "sequence numbers go on in the next incarnation": Mutation(

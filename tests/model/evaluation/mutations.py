@@ -30,7 +30,7 @@ OF_THE_LEARNER = {
     ),
     "the lost weights of an evaluation are not sent again": Mutation(COORDINATOR, "named.add(self.version)", "pass"),
     "a lost order to evaluate is not sent again": Mutation(
-        COORDINATOR, "again += self.evaluation.send_again(member, heartbeat)", "pass"
+        COORDINATOR, " + self.evaluation.send_again(member, heartbeat)", ""
     ),
     "the evaluation's tickets of a lost worker are kept": Mutation(
         COORDINATOR, "self.evaluation.removed(member.peer)", "pass"

@@ -17,14 +17,15 @@ if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
 COORDINATOR = "learner.vector_env.order_coordinator"
+MEMBERS = "learner.members.coordinator"
 HUB = "learner.vector_env.step_hub"
 LOST = "learner.vector_env.lost_lanes"
 
 OF_THE_LEARNER = {
-    "a lost order is not sent again": Mutation(COORDINATOR, "out.append((member.peer, self.orders[ticket]))", "pass"),
-    "heartbeats of a vector environment are answered alike": Mutation(
-        COORDINATOR, "member.replies += 1", "member.replies += 0"
+    "a lost order is not sent again": Mutation(
+        COORDINATOR, "return [(member.peer, self.orders[ticket]) for ticket in lost]", "return []"
     ),
+    "heartbeats of a vector environment are answered alike": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
     "a lost lane is not reported": Mutation(COORDINATOR, "if self.lanes[lane].started:", "if False:"),
     "an order does not start its lane": Mutation(COORDINATOR, "record.started = True", "pass"),
     "answers to the last orders are kept": Mutation(COORDINATOR, "self.answers.clear()", "pass"),
@@ -32,7 +33,7 @@ OF_THE_LEARNER = {
         COORDINATOR, "            del self.orders[ticket]\n", "            pass\n"
     ),
     "an answer leaves its order open": Mutation(
-        COORDINATOR, "del self.orders[answer.ticket], member.tickets[answer.ticket]", "pass"
+        COORDINATOR, "del self.orders[message.ticket], member.tickets[message.ticket]", "pass"
     ),
     "an order that was sent waits on": Mutation(HUB, "del self._waiting_orders[lane]", "pass"),
     "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),

@@ -89,19 +89,19 @@ class Heard(OrderCoordinator):
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
-        self.events: list[tuple[Any, ...]] = []
+        self.noted: list[tuple[Any, ...]] = []
         self.orders_sent: list[tuple[Any, ...]] = []
 
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        self.events.append(("receive", peer, message, now))
+        self.noted.append(("receive", peer, message, now))
         return super().receive(peer, message, now)
 
     def remove_silent(self, now: float) -> list[Outgoing]:
-        self.events.append(("remove_silent", now))
+        self.noted.append(("remove_silent", now))
         return super().remove_silent(now)
 
     def rebalance(self) -> list[Outgoing]:
-        self.events.append(("call", "reset"))
+        self.noted.append(("call", "reset"))
         return super().rebalance()
 
     def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
@@ -126,7 +126,7 @@ def real_calls(settings: Stepping, fate: random.Random, outcomes: Counter[str]) 
 
     def noted_turn(timeout_s: float) -> None:
         turn(timeout_s)
-        heard.events.append(("turn", wire.now))
+        heard.noted.append(("turn", wire.now))
 
     hub._turn = noted_turn  # type: ignore[method-assign]
     space = gymnasium.spaces.Box(-1, 1000, (1,), np.float32)
@@ -137,7 +137,7 @@ def real_calls(settings: Stepping, fate: random.Random, outcomes: Counter[str]) 
         call = settings.calls[at]
         try:
             if call != "reset":
-                heard.events.append(("call", call))
+                heard.noted.append(("call", call))
             match call:
                 case "reset":
                     env.reset(seed=[at] * LANES)
@@ -158,7 +158,7 @@ def real_calls(settings: Stepping, fate: random.Random, outcomes: Counter[str]) 
 def told(settings: Stepping, heard: Heard) -> Caller:
     """The model's program after the same events."""
     caller = Caller(OrderCoordinator(settings.run, 0, TIMEOUT_S), settings, 0.0)
-    for event in heard.events:
+    for event in heard.noted:
         match event:
             case "receive", peer, message, now:
                 caller.now = now

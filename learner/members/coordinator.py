@@ -1,0 +1,160 @@
+"""The learner's half of every conversation, as far as all are alike. Pure: messages and `now` in, messages out.
+
+Rule: what a member sends in its session goes to the part that knows what it means; what belongs to an ended session is
+answered by Rejoin. A membership ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with
+its key. Then what the member held is taken back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the
+way is sent again, before the reply.
+
+A subclass says what differs: what an answer means, what is dealt, what a loss means, and what becomes of a wrong answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Generic
+
+from learner.members.events import EnvironmentRaised, Event, Failed
+from learner.members.membership import M, Membership, Outgoing
+from learner.members.states import MemberState, SentUnusable
+from protocol.bounds import one_line
+from protocol.messages import (
+    Alive,
+    Drain,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    Received,
+    Refuse,
+    ToLearner,
+    WorkerExit,
+)
+
+
+class Coordinator(Generic[M]):
+    """The members, and what they are answered."""
+
+    def __init__(self, membership: Membership[M], worker_timeout_s: float) -> None:
+        self.membership = membership
+        self.worker_timeout_s = worker_timeout_s
+
+    @property
+    def members(self) -> dict[bytes, M]:
+        """Members by routing id."""
+        return self.membership.members
+
+    @property
+    def events(self) -> list[Event]:
+        """Events that were not logged yet."""
+        return self.membership.events
+
+    # ---------------------------------------------------------------- in
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message."""
+        if isinstance(message, Hello):
+            welcome, joined = self.membership.join(peer, message, now)
+            return welcome if joined is None else welcome + self._joined()
+        if isinstance(message, Alive):
+            answer, exits = self.membership.hear_supervisor(peer, message, now)
+            return [*answer, *(self._ended(exits) if exits else [])]
+        member = self.membership.member_of_session(peer, message, now)
+        if member is None:
+            self._late(message)
+            return self.membership.answer_ended_session(peer, message)
+        match message:
+            case Heartbeat():
+                return self._heartbeat(member, message)
+            case Goodbye(_, reason):
+                return self._goodbye(member, reason)
+            case Failure(_, error, traceback, lane):
+                spare = self.membership.is_spare(member)
+                failed = member.failed(self._kind(message), error, traceback, lane=lane, spare=spare)
+                self.events.append(failed)
+                self.membership.remove(member, Failure, "failed")
+                self._failed(failed)
+                return self._deal()
+        return self._answer(member, message)
+
+    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
+        """Answer a message that could not be read."""
+        member = self.members.get(peer)
+        if member is None:
+            return [(peer, Refuse(one_line(f"not understood: {why}")))]
+        member.heard_s = now
+        return self._unusable(member, why) + self._deal()
+
+    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
+        """A member's key was revoked: send it the reason and remove it at once, whatever it holds."""
+        return self.membership.revoke(peer, why) + self._deal()
+
+    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
+        """A process of this program has ended."""
+        return self._ended([worker_exit]) if self.membership.record_exit(worker_exit) else []
+
+    def remove_silent(self, now: float) -> list[Outgoing]:
+        """Remove workers that were silent for longer than `worker_timeout_s`.
+
+        Call it only when every message that has arrived was given to `receive`.
+        """
+        return self._deal() if self.membership.remove_silent(now, self.worker_timeout_s) else []
+
+    def drain(self, reason: str) -> list[Outgoing]:
+        """Ask every worker to leave; nothing is dealt any more."""
+        return self.membership.drain(reason)
+
+    # ---------------------------------------------------------------- what differs
+
+    def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
+        """Take what a member sent beside heartbeats and its last words."""
+        raise NotImplementedError
+
+    def _deal(self) -> list[Outgoing]:
+        """Give out what no worker has. Called after each event that may have changed who can take it."""
+        return []
+
+    def _joined(self) -> list[Outgoing]:
+        """A worker has joined."""
+        return self._deal()
+
+    def _late(self, message: ToLearner) -> None:
+        """Count what belongs to an ended session."""
+
+    def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
+        """What this heartbeat shows to be lost on the way. `lost`: among the tickets that the member holds."""
+        return []
+
+    def _received(self, member: M) -> tuple[Received, ...]:
+        """The lanes of this member, and what has come of them."""
+        return ()
+
+    def _unusable(self, member: M, why: str) -> list[Outgoing]:
+        """A member sent what could not be used."""
+        return self.membership.refuse(member, SentUnusable, why)
+
+    def _goodbye(self, member: M, reason: str) -> list[Outgoing]:
+        """A member leaves."""
+        self.membership.remove(member, Goodbye, f"left: {reason}")
+        return self._deal()
+
+    def _kind(self, failure: Failure) -> type[Failed]:
+        """Whose fault a failure is."""
+        return EnvironmentRaised
+
+    def _failed(self, failed: Failed) -> None:
+        """A member has failed, and was removed."""
+
+    def _ended(self, exits: Sequence[WorkerExit]) -> list[Outgoing]:
+        """The processes of members have ended, and these were removed."""
+        return self._deal()
+
+    # ---------------------------------------------------------------- inside
+
+    def _heartbeat(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
+        lost = member.record_heartbeat(heartbeat)
+        if member.state is MemberState.DRAINING:
+            return [(member.peer, Drain(one_line(self.membership.draining or "")))]
+        out = self._again(member, heartbeat, lost)
+        member.replies += 1
+        return [*out, (member.peer, HeartbeatReply(member.session, member.replies, self._received(member))), *self._deal()]
