@@ -311,16 +311,6 @@ class Membership(Generic[M]):
         """Remove a member whose key was revoked, at once, whatever it holds."""
         return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
 
-    def remove_worker(self, worker: str, why: str) -> bool:
-        """Remove a worker by name, as when its process is known to be dead. False if it was no longer a member."""
-        member = next((member for member in self.members.values() if member.hello.worker == worker), None)
-        if member is not None:
-            self.remove(member, TimedOut, why)
-        elif worker in self._removed_for_silence:  # now it is known why it was silent
-            del self._removed_for_silence[worker]
-            self.events.append(WorkerLeft(worker, why, 0, False))
-        return member is not None
-
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
         """Record what a supervisor says of members that use the same key as it does, and whose nonce it knows.
 

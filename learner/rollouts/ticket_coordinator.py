@@ -127,10 +127,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             self._lose(member, rollout.ticket)
         return out + self._deal()
 
-    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
-        """A worker's process is known to be dead: do not wait for its silence."""
-        return self._deal() if self.membership.remove_worker(worker, why) else []
-
     def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
         """Refuse a worker that holds tickets and does nothing with them: they are dealt again."""
         return self.membership.refuse(member, SentUnusable, why) + self._deal()

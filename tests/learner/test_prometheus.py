@@ -37,7 +37,7 @@ from protocol.policy.policy import make_policy
 from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import A, B, C, Learner
-from tests.support.fake_ends import run_spec
+from tests.support.fake_ends import process_ends, run_spec
 from workers.collect.collector import Collector
 
 Labels = tuple[tuple[str, str], ...]
@@ -115,7 +115,7 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     assert learning.coordinator.take()
     hub._weight_age.used([0, 0, 3])
     learning.publish(1)
-    learning.coordinator.remove_worker("a", "was killed")
+    process_ends(learning.coordinator, "a", "was killed")
     learning.coordinator.reject_message(B, "rubbish", 0.0)
     found = scraped.metrics()
     ledger = learning.coordinator.ledger.counts()

@@ -11,16 +11,18 @@ import itertools
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from learner.members.coordinator import Coordinator
 from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec
-from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker
+from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker, WorkerExit
 from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, RolloutTask, Send, Session
@@ -53,6 +55,12 @@ def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: i
         valid=np.ones((1, 1), bool),
         state=np.zeros((1, 0), np.float32),
     )
+
+
+def process_ends(coordinator: Coordinator[Any], worker: str, why: str = "killed", nonce: int = -1) -> list[Outgoing]:
+    """The learner hears that the process of this worker has ended. `nonce`: of one that is no member any more."""
+    nonces = [each.hello.process_nonce for each in coordinator.members.values() if each.hello.worker == worker]
+    return coordinator.process_ended(WorkerExit(worker, nonces[0] if nonces else nonce, why, failed=False))
 
 
 def fake_rollouts(task: RolloutTask) -> list[Rollout]:
@@ -372,7 +380,7 @@ class World:
             name = self.random.choice(sorted(self.workers))
             del self.workers[name]
             if self.random.random() < 0.5:  # the host sees it at once; else only silence tells
-                self.to_workers(self.coordinator.remove_worker(name.decode(), "killed"))
+                self.to_workers(process_ends(self.coordinator, name.decode(), "killed"))
             self.at(self.random.uniform(0.1, 8.0), lambda: self.spawn(name) if name not in self.workers else None)
 
     def _freeze_one(self) -> None:

@@ -12,6 +12,7 @@ import pytest
 from learner.members.key_revocation import KeyRevocation
 from protocol.messages import Heartbeat
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.fake_ends import process_ends
 
 FEW, MANY = 8, 512
 
@@ -79,7 +80,7 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
     def waiting(workers: int) -> Learner:
         learner = crowd(2 * workers)
         for number in range(workers):  # half of them leave; the others have two lanes each, until somebody comes
-            learner.coordinator.remove_worker(f"w{number}", "gone")
+            process_ends(learner.coordinator, f"w{number}", "gone")
         learner.joins(b"newcomer", pid=9998)  # is given the lane whose rollout has come
         learner.joins(b"another", pid=9999)
         assert sum(lane.moving for lane in learner.coordinator.lanes) == 1

@@ -26,6 +26,7 @@ from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.worker_link import WorkerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.fake_ends import process_ends
 
 PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)
 
@@ -234,7 +235,7 @@ def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event(
     learner = Learner()
     learner.joins(b"a")
     late = learner.rollout_of(learner.tickets()[0])
-    learner.coordinator.remove_worker("a", "was killed")
+    process_ends(learner.coordinator, "a", "was killed")
     learner.coordinator.events.clear()
     learner.says(b"a", late)
     assert learner.coordinator.events == [RejoinRequested("a", late.session, 1)]

@@ -46,7 +46,7 @@ from protocol.messages import (
 )
 from protocol.space_spec import EnvDescription, MultiBinarySpace
 from protocol.wire.codec import decode_to_worker, encode
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
 
 M = TypeVar("M")
 A, B, C = b"a", b"b", b"c"
@@ -397,7 +397,7 @@ def test_a_lane_that_is_to_move_finishes_what_it_was_dealt_and_the_others_go_on(
 def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
-    assert learner.balanced(learner.coordinator.remove_worker("a", "killed")) == []
+    assert learner.balanced(process_ends(learner.coordinator, "a", "killed")) == []
     assert learner.coordinator.begin_update() == []
     outs = learner.joins(B)
     assert {(permit.lane, permit.incarnation) for permit in permits(outs)} == {(0, 1), (1, 1)}
@@ -419,7 +419,7 @@ def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() 
     learner = Learner(lanes=1)
     learner.joins(A)
     rollout = learner.rollout_of(0)
-    learner.coordinator.remove_worker("a", "killed")
+    process_ends(learner.coordinator, "a", "killed")
     assert learner.says(A, rollout) == [(A, Rejoin(100))]
     assert (learner.coordinator.ledger.transitions_late, learner.coordinator.ready) == (1, {})
 
@@ -461,7 +461,7 @@ def test_a_lost_workers_tickets_and_lanes_are_dealt_to_the_living_with_a_higher_
     (lost,) = learner.tickets(A)
     lane = learner.coordinator.tickets[lost].lane
     before = learner.coordinator.lanes[lane].incarnation
-    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed"))
+    outs = learner.balanced(process_ends(learner.coordinator, "a", "killed"))
     assert [(p.lane, p.incarnation) for p in permits(outs, B)] == [(lane, before + 1)]
     assert lost not in learner.coordinator.tickets
     assert lanes_of(learner, B) == {0, 1}
@@ -472,7 +472,7 @@ def test_a_new_life_of_a_lane_has_received_nothing() -> None:
     learner.joins(A)
     learner.update()
     learner.joins(B)
-    outs = learner.coordinator.remove_worker("a", "killed")
+    outs = process_ends(learner.coordinator, "a", "killed")
     (collect,) = of(outs, Collect, B)
     assert collect.received == (Received(0, 1, 0, ()),)
 
@@ -537,7 +537,7 @@ def test_a_lane_has_one_owner_whoever_comes_and_goes() -> None:
     learner = Learner(lanes=5)
     for step, peer in enumerate([A, B, C, A, B, A, C, B] * 4):
         if peer in learner.coordinator.members and step % 3:
-            learner.balanced(learner.coordinator.remove_worker(peer.decode(), "killed"))
+            learner.balanced(process_ends(learner.coordinator, peer.decode(), "killed"))
         else:
             learner.joins(peer, pid=step)
         if learner.coordinator.members:
@@ -569,7 +569,7 @@ def test_a_worker_that_nothing_asks_for_gets_no_weights_until_something_does() -
     learner.joins(A)
     assert kinds(learner.joins(B), B) == [Welcome]
     learner.update()
-    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed"))
+    outs = learner.balanced(process_ends(learner.coordinator, "a", "killed"))
     assert kinds(outs, B) == [Collect, Weights]
     assert [weights.version for weights in of(outs, Weights, B)] == [1]
 
@@ -580,7 +580,7 @@ def test_a_lane_that_moves_takes_the_weights_of_its_rounds_along() -> None:
     learner.joins(A)
     learner.joins(B)
     learner.update_round(1)
-    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed"))
+    outs = learner.balanced(process_ends(learner.coordinator, "a", "killed"))
     assert [collect.version for collect in of(outs, Collect, B)] == [0, 1]
     assert [weights.version for weights in of(outs, Weights, B)] == [0, 1]
 
@@ -677,7 +677,7 @@ def test_weights_that_a_worker_has_dropped_are_sent_again_with_the_next_order_th
     learner.delivers(learner.tickets(A)[0])
     learner.beats(A)
     learner.beats(A, versions=[2])
-    outs = learner.balanced(learner.coordinator.remove_worker("b", "killed"))  # its rounds are under versions 1 and 2
+    outs = learner.balanced(process_ends(learner.coordinator, "b", "killed"))  # its rounds are under versions 1 and 2
     assert [collect.version for collect in of(outs, Collect, A)] == [1, 2]
     assert [weights.version for weights in of(outs, Weights, A)] == [1]
 
@@ -936,9 +936,9 @@ def test_gone_does_not_wait_for_silence() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.joins(B)
-    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed by signal 9"))
+    outs = learner.balanced(process_ends(learner.coordinator, "a", "killed by signal 9"))
     assert [permit.lane for permit in permits(outs, B)] == [0]
-    assert learner.coordinator.remove_worker("a", "again") == []
+    assert process_ends(learner.coordinator, "a", "again") == []
 
 
 # -------------------------------------------------------------------- the ledger and the checkpoint
@@ -949,7 +949,7 @@ def test_every_ticket_ends_as_used_or_lost() -> None:
     learner = Learner(lanes=2, max_lag=1)
     learner.joins(A)
     learner.update_round(1)
-    learner.coordinator.remove_worker("a", "killed")
+    process_ends(learner.coordinator, "a", "killed")
     learner.joins(B)
     learner.update_round(2)
     counts = learner.coordinator.ledger.counts()
@@ -981,7 +981,7 @@ def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() ->
     assert learner.coordinator.incarnations() == [0, 0]
     learner.publish(0)
     assert learner.coordinator.incarnations() == [1, 1]
-    learner.coordinator.remove_worker("a", "killed")
+    process_ends(learner.coordinator, "a", "killed")
     assert learner.coordinator.incarnations() == [1, 1]
 
 
@@ -998,7 +998,7 @@ def test_no_life_is_lived_twice_across_resumes() -> None:
             assert not fresh & lives
             lives |= fresh
             learner.update()
-            learner.coordinator.remove_worker(peer.decode(), "killed")
+            process_ends(learner.coordinator, peer.decode(), "killed")
         version, ledger = learner.coordinator.version, msgspec.structs.replace(learner.coordinator.ledger)
         incarnations = learner.coordinator.incarnations()
         ledger.lost += ledger.outstanding
@@ -1120,12 +1120,12 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
     learner.balanced(learner.coordinator.remove_silent(learner.now))
     learner.coordinator.events.clear()
     for _ in range(2):
-        learner.balanced(learner.coordinator.remove_worker("a", "was ended: too slow"))
+        learner.balanced(process_ends(learner.coordinator, "a", "was ended: too slow", nonce=4001))
     assert learner.coordinator.events == [WorkerLeft("a", "was ended: too slow", 0, False)]
     learner.joins(b"b", attempt=2)
     learner.says(b"b", Goodbye(learner.session(b"b"), "told to stop", ()))
     learner.coordinator.events.clear()
-    learner.balanced(learner.coordinator.remove_worker("b", "ended with exit code 0"))
+    learner.balanced(process_ends(learner.coordinator, "b", "ended with exit code 0", nonce=4001))
     assert learner.coordinator.events == []
 
 

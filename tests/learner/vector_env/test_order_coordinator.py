@@ -31,6 +31,7 @@ from protocol.messages import (
 )
 from protocol.specs import Leaf, StepSpec
 from protocol.wire.plain_values import pack
+from tests.support.fake_ends import process_ends
 
 A, B = b"a", b"b"
 TIMEOUT_S = 5.0
@@ -174,7 +175,7 @@ def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
     made.remove_silent(TIMEOUT_S + 1)
     assert list(made.members) == [A]
     assert made.lost == {1: "worker b (host) silent for 5 s"}
-    made.membership.remove_worker("b", "was killed by SIGKILL")
+    process_ends(made, "b", "was killed by SIGKILL", nonce=1)
     assert made.membership.take_events()[-1] == WorkerLeft("b", "was killed by SIGKILL", 0, False)
 
 

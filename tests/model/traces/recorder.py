@@ -27,7 +27,7 @@ COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent
 METHODS = {
     "TicketCoordinator": (
         *COMMON,
-        *("reject_rollout", "remove_worker", "refuse", "publish", "begin_update", "take", "not_used"),
+        *("reject_rollout", "refuse", "publish", "begin_update", "take", "not_used"),
         *("begin_evaluation", "end_evaluation", "drain", "incarnations"),
     ),
     "DescribeCoordinator": (*COMMON, "finish"),
