@@ -22,8 +22,10 @@ ENVIRONMENTS = ROOT / ".versions"
 LOWEST = "lowest"
 NEED_NEWER = re.compile(r"(ale-py|sb3-contrib|stable-baselines3)\b")
 """Packages of `dev` that need newer versions than ours of what we also need. Their tests are skipped without them."""
-NEED_OLDER = ("mpmath<1.4", "pyparsing<3.3")
-"""The lowest torch (by sympy) and matplotlib use names of these packages that are deprecated since."""
+NEED_OLDER = ("mpmath>=1.3,<1.4", "pyparsing>=3.1,<3.3")
+"""The lowest torch (by sympy) and matplotlib use names of these packages that are deprecated since. The lowest versions of
+these packages are older than this Python.
+"""
 ASKS = """
 import platform, numpy, torch
 print("Python", platform.python_version(), "torch", torch.__version__, "numpy", numpy.__version__)

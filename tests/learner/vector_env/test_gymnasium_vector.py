@@ -115,7 +115,7 @@ def test_copies_of_different_spaces_are_refused_before_the_first_reset(
     with pytest.raises(EnvironmentFailed, match=r"copy 3: its observations .*all copies must have the same") as raised:
         inproc(makes, None, lanes=2)
     assert "\n" not in str(raised.value)
-    with pytest.raises(RuntimeError):
+    with pytest.raises((RuntimeError, AssertionError)):  # the latter by gymnasium 1.3
         SyncVectorEnv(makes)
 
 
@@ -128,10 +128,11 @@ def test_bounds_that_differ_by_rounding_are_the_same() -> None:
 
 
 def test_the_metadata_of_the_environment_is_not_changed() -> None:
+    before = dict(gymnasium.make("CartPole-v1").metadata)
     with inproc("CartPole-v1", autoreset_mode="NextStep") as a, inproc("CartPole-v1", autoreset_mode="SameStep") as b:
         assert a.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
         assert b.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    assert "autoreset_mode" not in gymnasium.make("CartPole-v1").metadata
+    assert gymnasium.make("CartPole-v1").metadata == before
 
 
 # ---------------------------------------------------------------- reset and step
