@@ -10,6 +10,7 @@ A subclass says what differs: what an answer means, what is dealt, what a loss m
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic
 
@@ -32,7 +33,7 @@ from protocol.messages import (
 )
 
 
-class Coordinator(Generic[M]):
+class Coordinator(ABC, Generic[M]):
     """The members, and what they are answered."""
 
     def __init__(self, membership: Membership[M], worker_timeout_s: float) -> None:
@@ -106,9 +107,9 @@ class Coordinator(Generic[M]):
 
     # ---------------------------------------------------------------- what differs
 
+    @abstractmethod
     def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
         """Take what a member sent beside heartbeats and its last words."""
-        raise NotImplementedError
 
     def _deal(self) -> list[Outgoing]:
         """Give out what no worker has. Called after each event that may have changed who can take it."""

@@ -14,6 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from learner.members.events import Failed
+from protocol.bounds import MAX_LINE, one_line
+
 MOST_IN_A_ROW = 10
 AFTER_STEPS = 0.25
 HOUR_S = 3600.0
@@ -47,6 +50,11 @@ class FailureCount:
         hint = "; shorter rollouts may help" if stepped else ""
         why = f" (one after env steps counts as {AFTER_STEPS:g}{hint})" if in_a_row % 1 else ""
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
+
+    def line(self, event: Failed, now: float) -> str:
+        """Count this failure. Returns the line of the error that ends the run, or an empty string."""
+        why = self.failed(event.lanes or (event.worker,), event.stepped, now)
+        return one_line(f"worker {event.worker} ({event.host}): {event.error}; {why}", 4 * MAX_LINE) if why else ""
 
     def collected(self, lane: int) -> None:
         """A rollout of this lane has arrived."""

@@ -31,7 +31,7 @@ from learner.run_folder.progress import Progress
 from protocol.address import name_for_people
 from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
-from protocol.bounds import MAX_LINE, Stages, one_line
+from protocol.bounds import Stages, one_line
 from protocol.errors import BadRollout, EnvironmentFailed, PolicyFailed, Stalled
 from protocol.messages import Evaluated, Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
@@ -339,10 +339,9 @@ class Hub:
         """Count the failures of environments and of the user's policy together; that which is one too many is the error."""
         if not isinstance(event, Failed) or event.spare or self._failure is not None:
             return
-        if why := self._failures.failed(event.lanes or (event.worker,), event.stepped, self._clock()):
+        if line := self._failures.line(event, self._clock()):
             kind = PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed
-            line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
-            self._failure = kind(one_line(line, 4 * MAX_LINE), event.traceback)
+            self._failure = kind(line, event.traceback)
 
     def _check_members(self) -> None:
         """Raise `NoWorkers` when there was no member for too long."""

@@ -64,7 +64,10 @@ class CollectingMember(Member):
 
 
 class TicketCoordinator(Coordinator[CollectingMember]):
-    """Members, lanes, tickets and the ledger."""
+    """Members, lanes, tickets and the ledger.
+
+    A rollout that `receive` is given must have passed `protocol.rollout.validate`; else call `reject_rollout`.
+    """
 
     def __init__(
         self,
@@ -101,10 +104,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self._weights: dict[int, Weights] = {}  # by version: the newest, and those that act in open rounds
 
     # ---------------------------------------------------------------- in
-
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message. A rollout must have passed `protocol.rollout.validate`; else call `reject_rollout`."""
-        return super().receive(peer, message, now)
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Count a message that could not be read, and answer it."""

@@ -31,7 +31,6 @@ from millrace.launch.endpoint import Endpoint, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags, local_processes
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
-from protocol.bounds import MAX_LINE, one_line
 from protocol.cpu_cores import usable_cores
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -174,12 +173,10 @@ class _Deaths:
         """Count the death of a worker in the environment's code. That which is one too many is the error."""
         if self._error is not None:
             return
-        lanes = event.lanes or (event.worker,)
         for lane in event.lanes if event.stepped else ():
             self._failures.collected(lane)  # every step is a result of its own
-        if why := self._failures.failed(lanes, event.stepped, time.monotonic()):
-            line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
-            self._error = EnvironmentFailed(one_line(line, 4 * MAX_LINE))
+        if line := self._failures.line(event, time.monotonic()):
+            self._error = EnvironmentFailed(line)
 
     def check(self) -> None:
         """Raise `EnvironmentFailed` if there were too many deaths."""
