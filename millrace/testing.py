@@ -1,4 +1,4 @@
-"""Tests of what a user writes. `check_algorithm` is the conformance test of an algorithm; use it with pytest or by itself.
+"""Tests of what a user writes. `check_algorithm` finds the mistakes of an algorithm; use it with pytest or by itself.
 
 >>> from millrace.algorithms import PPO
 >>> from millrace.testing import check_algorithm
@@ -44,7 +44,7 @@ def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) ->
 
     Raises `AlgorithmMistakes`, which is an AssertionError, with one line for each mistake.
     """
-    from learner.conformance.algorithm_check import mistakes
+    from learner.algorithm_check.mistakes import mistakes
 
     if found := list(mistakes(algorithm, settings, learns=learns)):
         raise AlgorithmMistakes(algorithm.__name__, found)

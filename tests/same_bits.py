@@ -28,7 +28,7 @@ import h5py
 import torch
 from safetensors.numpy import load_file
 
-from learner.conformance.same_bits import first_difference
+from learner.algorithm_check.same_bits import first_difference
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 
 ROOT = Path(__file__).parents[1]

@@ -11,7 +11,6 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import pytest
@@ -28,7 +27,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "config": {"run_folder"},
     "algorithms": {"config"},
     "callbacks": {"config", "run_folder"},
-    "conformance": {"algorithms", "config", "torch_setup"},
+    "algorithm_check": {"algorithms", "config", "torch_setup"},
     "members": set[str](),
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},
@@ -52,14 +51,26 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "evaluate": {"acting", "activity", "copies"},
     "vector_env": {"activity", "copies"},
 }
+MILLRACE = {  # the same for each folder of the public package
+    "cli": {"conformance", "import_conflict", "launch", "playing", "terminal"},
+    "conformance": set[str](),
+    "integrations": set[str](),
+    "launch": {"arguments", "cli", "own_policy", "policies"},
+}
+ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}
 ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
 """functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""
 TORCH_IN_PROTOCOL = "protocol/policy/"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
+CHECKS_A_CLIENT = "millrace/conformance/conform.py"
 RANDOM_STREAMS = "protocol/random_streams.py"
-HAS_RANDOM_NUMBERS_OF_ITS_OWN = ("learner/conformance/", "workers/envs/toy.py")  # from constants, not from a run's seed
+HAS_RANDOM_NUMBERS_OF_ITS_OWN = (  # from constants, not from a run's seed
+    "learner/algorithm_check/",
+    "millrace/conformance/",
+    "workers/envs/toy.py",
+)
 SLOW_TO_IMPORT = {"torch", "matplotlib", "tensorboard"}
 MOST_FILES = 16  # in a folder
 MOST_PARAMETERS = 8  # of a function; self and cls do not count
@@ -168,18 +179,26 @@ def test_no_files_import_each_other_in_a_circle() -> None:
     assert not circles({source: files_imported(source, files) for source in files.values()})
 
 
-@pytest.mark.parametrize(("package", "place"), [*product(["learner"], LEARNER), *product(["workers"], WORKERS)])
+@pytest.mark.parametrize(("package", "place"), [(package, place) for package, rooms in ROOMS.items() for place in rooms])
 def test_a_room_imports_only_what_it_may(package: str, place: str) -> None:
-    allowed = {"learner": LEARNER, "workers": WORKERS}[package][place] | {place}
+    allowed = ROOMS[package][place] | {place}
     files = sources(f"{package}/{place}") or [f"{package}/{place}.py"]
     for source in files:
         places = {name.split(".")[1] for name in modules_imported(source) if name.startswith(f"{package}.")}
         assert places <= allowed, source
 
 
-@pytest.mark.parametrize(("package", "rule"), [("learner", LEARNER), ("workers", WORKERS)])
-def test_no_room_is_without_a_rule(package: str, rule: Mapping[str, set[str]]) -> None:
-    assert {path.parent.name for path in (ROOT / package).glob("*/__init__.py")} <= set(rule)
+@pytest.mark.parametrize("package", ROOMS)
+def test_no_room_is_without_a_rule(package: str) -> None:
+    assert {path.parent.name for path in (ROOT / package).glob("*/__init__.py")} <= set(ROOMS[package])
+
+
+def test_the_checks_of_a_client_are_pure() -> None:
+    """One file connects them to a socket, a process and the clock."""
+    for source in sources("millrace/conformance"):
+        if source != CHECKS_A_CLIENT:
+            assert not imported(source) & {"learner", "zmq", "socket", "subprocess", "threading", "time"}, source
+            assert CHECKS_A_CLIENT not in files_imported(source, {module(CHECKS_A_CLIENT): CHECKS_A_CLIENT}), source
 
 
 def test_torch_stays_with_the_learner() -> None:

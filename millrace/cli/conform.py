@@ -6,12 +6,12 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from learner.conformance.client.examiner import Check, Result
-from learner.conformance.client.learner import Settings
-from learner.conformance.client.profiles import PROFILES
-from learner.conformance.client.report import as_data, explanation, line_of, summary
 from millrace.cli.arguments import Arguments
-from millrace.conform import ADDRESS_VARIABLE, Client, conform
+from millrace.conformance.conform import ADDRESS_VARIABLE, Client, conform
+from millrace.conformance.examiner import Check, Result
+from millrace.conformance.learner import Settings
+from millrace.conformance.profiles import PROFILES
+from millrace.conformance.report import as_data, explanation, line_of, summary
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.key_folder import TOKEN_VARIABLE

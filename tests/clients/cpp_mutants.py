@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from learner.conformance.client import rules
-from learner.conformance.client.rules import Rule
+from millrace.conformance import rules
+from millrace.conformance.rules import Rule
 
 
 class Mutant(NamedTuple):

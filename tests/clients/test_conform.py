@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from learner.conformance.client.learner import Settings
-from learner.conformance.client.profiles import PROFILES
-from learner.conformance.client.report import explanation
-from learner.conformance.client.script import Ended
-from millrace.conform import Client, _Process, conform
+from millrace.conformance.conform import Client, _Process, conform
+from millrace.conformance.learner import Settings
+from millrace.conformance.profiles import PROFILES
+from millrace.conformance.report import explanation
+from millrace.conformance.script import Ended
 from protocol.env_spec import EnvSpec
 from tests.system.processes import ROOT
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from learner.conformance.client.learner import Settings
-from learner.conformance.client.profiles import PROFILES
-from learner.conformance.client.report import explanation
-from millrace.conform import Client, conform
+from millrace.conformance.conform import Client, conform
+from millrace.conformance.learner import Settings
+from millrace.conformance.profiles import PROFILES
+from millrace.conformance.report import explanation
 from protocol.env_spec import EnvSpec
 from tests.clients.conftest import CPP
 from tests.clients.cpp_mutants import MUTANTS, Mutant

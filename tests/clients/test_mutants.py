@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import pytest
 
-from learner.conformance.client import rules
-from learner.conformance.client.examiner import Result
-from learner.conformance.client.learner import Settings
-from learner.conformance.client.profiles import PROFILES
-from learner.conformance.client.report import explanation
-from learner.conformance.client.rules import Rule
-from millrace.conform import Client, conform
+from millrace.conformance import rules
+from millrace.conformance.conform import Client, conform
+from millrace.conformance.examiner import Result
+from millrace.conformance.learner import Settings
+from millrace.conformance.profiles import PROFILES
+from millrace.conformance.report import explanation
+from millrace.conformance.rules import Rule
 from protocol.env_spec import EnvSpec
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(120)]

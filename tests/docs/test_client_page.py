@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from learner.conformance.client.profiles import PROFILES
+from millrace.conformance.profiles import PROFILES
 from tests.clients.client_page import shown_files, steps
 from tests.system.processes import ROOT
 

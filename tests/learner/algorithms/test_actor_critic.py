@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.actor_critic import ActorCritic
 from learner.algorithms.minibatches import LossInput, Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
-from learner.conformance.same_bits import first_difference
 from protocol.errors import RunError
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec

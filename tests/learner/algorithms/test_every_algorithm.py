@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from learner.algorithm_check.mistakes import RULES, Subject, weights_have_the_policy_s_shape
+from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
 from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.conformance.algorithm_check import RULES, Subject, weights_have_the_policy_s_shape
-from learner.conformance.same_bits import first_difference
 from protocol.errors import RunError
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_action_masks import masked_batch, spec_of

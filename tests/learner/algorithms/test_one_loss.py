@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms import algorithm_class, dqn, losses
 from learner.algorithms.replay.off_policy import CriticLoss
 from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.conformance.same_bits import first_difference
 from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse
 
 SETTINGS: dict[str, dict[str, Any]] = {

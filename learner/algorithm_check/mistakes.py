@@ -20,12 +20,8 @@ import msgspec
 import numpy as np
 import torch
 
-from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.algorithm import wrong_weights
-from learner.config.algorithm_names import name_of, settings_record
-from learner.config.hyperparameters import AlgorithmConfig
-from learner.conformance.same_bits import first_difference
-from learner.conformance.toy_batches import (
+from learner.algorithm_check.same_bits import first_difference
+from learner.algorithm_check.toy_batches import (
     ACTIONS,
     CHOICES,
     OBSERVATION,
@@ -35,6 +31,10 @@ from learner.conformance.toy_batches import (
     with_other_invalid_rows,
     with_rewards,
 )
+from learner.algorithms import Algorithm, algorithm_class
+from learner.algorithms.algorithm import wrong_weights
+from learner.config.algorithm_names import name_of, settings_record
+from learner.config.hyperparameters import AlgorithmConfig
 from learner.torch_setup import one_thread
 from protocol.bounds import one_line
 from protocol.errors import UsageError, first_line

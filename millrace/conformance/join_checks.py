@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from learner.conformance.client import rules
-from learner.conformance.client.learner import Learner
-from learner.conformance.client.script import Broken, Heard, Script, Wait, brief
+from millrace.conformance import rules
+from millrace.conformance.learner import Learner
+from millrace.conformance.script import Broken, Heard, Script, Wait, brief
 from protocol.bounds import MAX_LINE
 from protocol.envs.description import DescribedEnv, read_description
 from protocol.errors import BadMessage, UsageError

@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.conformance.client import collect_checks, rules
-from learner.conformance.client.examiner import CHECK_S, Check, Examiner
-from learner.conformance.client.join_checks import describe_spec, leaves_when_refused_later
-from learner.conformance.client.learner import Learner, Settings
-from learner.conformance.client.profiles import PROFILES
-from learner.conformance.client.report import as_data, explanation, line_of, summary
-from learner.conformance.client.rules import Rule
-from learner.conformance.client.script import (
+from millrace.conformance import collect_checks, rules
+from millrace.conformance.examiner import CHECK_S, Check, Examiner
+from millrace.conformance.join_checks import describe_spec, leaves_when_refused_later
+from millrace.conformance.learner import Learner, Settings
+from millrace.conformance.profiles import PROFILES
+from millrace.conformance.report import as_data, explanation, line_of, summary
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import (
     Broken,
     Effect,
     EndClient,
@@ -29,7 +29,7 @@ from learner.conformance.client.script import (
     StartClient,
     Wait,
 )
-from learner.conformance.client.watch import Watch, check_stepped
+from millrace.conformance.watch import Watch, check_stepped
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.messages import (

@@ -12,11 +12,11 @@ import msgpack
 import numpy as np
 from msgspec.structs import replace
 
-from learner.conformance.client import rules
-from learner.conformance.client.join_checks import described
-from learner.conformance.client.learner import Learner
-from learner.conformance.client.script import Broken, Heard, Script, Skipped, Wait, brief
-from learner.conformance.client.watch import resets_too_early
+from millrace.conformance import rules
+from millrace.conformance.join_checks import described
+from millrace.conformance.learner import Learner
+from millrace.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
+from millrace.conformance.watch import resets_too_early
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from learner.conformance.client import rules
-from learner.conformance.client.rules import Rule
-from learner.conformance.client.script import (
+from millrace.conformance import rules
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import (
     AskToStop,
     Broken,
     CutConnection,
@@ -28,7 +28,7 @@ from learner.conformance.client.script import (
     Wait,
     brief,
 )
-from learner.conformance.client.watch import Watch
+from millrace.conformance.watch import Watch
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.messages import (

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from learner.conformance.client import rules
-from learner.conformance.client.lane_rows import LaneRows
-from learner.conformance.client.rules import Rule
-from learner.conformance.client.script import Broken, brief
+from millrace.conformance import rules
+from millrace.conformance.lane_rows import LaneRows
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import Broken, brief
 from protocol.errors import BadRollout
 from protocol.messages import (
     Call,

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from learner.conformance.client import rules
-from learner.conformance.client.learner import Learner, Settings
-from learner.conformance.client.rules import Rule
-from learner.conformance.client.script import Broken, Effect, Event, Script, Skipped, Wait
+from millrace.conformance import rules
+from millrace.conformance.learner import Learner, Settings
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import Broken, Effect, Event, Script, Skipped, Wait
 
 CHECK_S = 40.0  # longest time that one check may take
 

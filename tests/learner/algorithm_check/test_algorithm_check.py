@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
-from learner.conformance.same_bits import first_difference
 from millrace.algorithms import (
     PPO,
     ActorCritic,

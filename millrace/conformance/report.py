@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-from learner.conformance.client.examiner import Result
-from learner.conformance.client.rules import DOCUMENT
+from millrace.conformance.examiner import Result
+from millrace.conformance.rules import DOCUMENT
 
 WIDTH = 110
 NUMBER = re.compile(r"\d{3,}")  # shapes and exit codes have fewer digits

@@ -1,4 +1,4 @@
-"""Batches for the conformance test, made in this process: noise with ends of both kinds, and the identity environment.
+"""Batches for the check of an algorithm, made in this process: noise with ends of both kinds, and the identity environment.
 
 Both keep the row format (`protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use. Pure:
 weights and a generator in, a batch out.

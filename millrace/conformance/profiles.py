@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from learner.conformance.client import collect_checks, join_checks, step_checks
-from learner.conformance.client.examiner import Check
+from millrace.conformance import collect_checks, join_checks, step_checks
+from millrace.conformance.examiner import Check
 
 JOINING = [
     Check("says Hello first, under its own name", join_checks.says_hello),

@@ -11,12 +11,12 @@ import msgpack
 import numpy as np
 from msgspec.structs import replace
 
-from learner.conformance.client import rules
-from learner.conformance.client.join_checks import described
-from learner.conformance.client.learner import Learner
-from learner.conformance.client.rules import Rule
-from learner.conformance.client.script import Broken, Ended, Event, Heard, Script, Skipped, Wait, brief
-from learner.conformance.client.watch import resets_too_early
+from millrace.conformance import rules
+from millrace.conformance.join_checks import described
+from millrace.conformance.learner import Learner
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import Broken, Ended, Event, Heard, Script, Skipped, Wait, brief
+from millrace.conformance.watch import resets_too_early
 from protocol.arrays import Floats
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError

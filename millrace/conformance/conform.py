@@ -1,6 +1,6 @@
 """Checks a client, a worker in any language: opens the learner's port, starts the client, and lets the examiner decide.
 
-Rule: this file decides nothing about the conversation (`learner/conformance/client`). It only sends, receives, starts and
+Rule: this file decides nothing about the conversation (`examiner.py`). It only sends, receives, starts and
 ends processes, each with a deadline. No process that it started outlives it.
 """
 
@@ -21,9 +21,10 @@ from pathlib import Path
 
 import zmq
 
-from learner.conformance.client.examiner import Check, Examiner, Result
-from learner.conformance.client.learner import Settings
-from learner.conformance.client.script import (
+from learner.members.bound import bind
+from millrace.conformance.examiner import Check, Examiner, Result
+from millrace.conformance.learner import Settings
+from millrace.conformance.script import (
     AskToStop,
     CutConnection,
     Effect,
@@ -34,7 +35,6 @@ from learner.conformance.client.script import (
     Send,
     StartClient,
 )
-from learner.members.bound import bind
 from protocol.bounds import escaped
 from protocol.errors import UsageError
 from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring

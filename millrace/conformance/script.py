@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from learner.conformance.client.rules import Rule
+from millrace.conformance.rules import Rule
 from protocol.errors import BadMessage
 from protocol.messages import Inquire, ToLearner
 from protocol.wire.codec import Buffer

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from learner.conformance.client import rules
-from learner.conformance.client.script import Broken
+from millrace.conformance import rules
+from millrace.conformance.script import Broken
 from protocol.messages import Weights
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import make_policy

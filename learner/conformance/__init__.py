@@ -1,1 +1,0 @@
-"""The conformance test of an algorithm: `millrace.testing.check_algorithm`."""

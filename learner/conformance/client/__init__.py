@@ -1,1 +1,0 @@
-"""The conformance test of a client, a worker in any language: `millrace conform`. Pure; `millrace.conform` runs it."""

@@ -1,0 +1,1 @@
+"""The conformance test of a client, a worker in any language: `millrace conform`."""
