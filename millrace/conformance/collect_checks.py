@@ -12,10 +12,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from millrace.conformance import rules
-from millrace.conformance.join_checks import described
-from millrace.conformance.learner import Learner
+from millrace.conformance.join_checks import POLE_GAINS, described, heartbeats, over_a_new_connection, time_limit
+from millrace.conformance.learner import QUIET_S, Learner
 from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, Ended, Event, Heard, Script, Skipped, Wait, brief
+from millrace.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
 from millrace.conformance.watch import resets_too_early
 from protocol.arrays import Floats
 from protocol.envs.spaces import action_spec, observation_leaves
@@ -28,11 +28,9 @@ from protocol.messages import (
     Evaluated,
     Goodbye,
     Heartbeat,
-    HeartbeatReply,
     Hello,
     LaneIncarnation,
     Permit,
-    Received,
     Refuse,
     Rejoin,
     Release,
@@ -49,11 +47,7 @@ TIMED_STEPS = 200  # T of a rollout that tells how fast the client is
 LONG_S, LONGEST_STEPS = 1.0, 50_000  # duration of a long rollout; its most steps
 NET = (16, 16)
 LONG_NET = (256, 256)  # of long rollouts: a compiled client would make 50,000 steps by a small one in a few milliseconds
-QUIET_S = 0.7
-MOST_LIMIT_STEPS = 2000  # of a time limit that the check walks to
 EVALUATED_STEPS = 40
-POLE_GAINS = (0.1, 0.2, 1.0, 0.6)
-"""balance the pole of a cart"""
 
 
 class Collecting:
@@ -77,15 +71,14 @@ class Collecting:
         """The next ticket, for this lane."""
         sequence = self._sequences[lane, incarnation]
         self._sequences[lane, incarnation] += 1
-        return Permit(self.learner.ticket(), lane, incarnation, sequence)
+        return Permit(next(self.learner.tickets), lane, incarnation, sequence)
 
     def order(self, *permits: Permit, version: int = 1) -> None:
         """Send a Collect, without the weights that it names."""
-        self.learner.send(Collect(self.learner.session, version, permits, self.learner.of_lanes()))
+        self.learner.send(Collect(self.learner.session, version, permits, self.learner.watch.received()))
 
     def give(self, weights: Weights) -> None:
         """Send these weights, unless their version was sent in this session."""
-        assert self.learner.watch is not None
         if weights.version not in self.learner.watch.versions:
             self.learner.send(weights)
 
@@ -94,25 +87,34 @@ class Collecting:
         self.order(*permits, version=version)
         self.give(self.weights(version))
 
+    @property
+    def rollout_s(self) -> float:
+        """How long the client takes for a rollout, in a session of `collecting_at_length`."""
+        return self.learner.step_s * self.run.rollout_steps
+
+    def begin(self, *permits: Permit) -> Script[None]:
+        """Deal permits of rollouts that last, and wait until the first is in progress."""
+        self.deal(*permits)
+        yield Wait(self.rollout_s / 5)
+
     def rollout(self, permit: Permit, rule: Rule = rules.TICKETS) -> Script[Rollout]:
         """The rollout of a permit that was dealt. If none comes, this rule is broken."""
         text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
         within_s = 2 * self.learner.settings.patience_s
         return (yield from self.learner.expect(Rollout, rule, text, within_s=within_s, ticket=permit.ticket))
 
-    def collect(self, permit: Permit, version: int = 1) -> Script[Rollout]:
-        """Deal one permit and wait for its rollout."""
+    def collect(self, permit: Permit | None = None, version: int = 1) -> Script[Rollout]:
+        """Deal one permit, or the next of lane 0, and wait for its rollout."""
+        permit = permit or self.permit()
         self.deal(permit, version=version)
         return (yield from self.rollout(permit))
 
     def nothing_of(self, permit: Permit, rule: Rule, whose: str) -> Script[None]:
         """No rollout of this permit has arrived in this session, and none arrives."""
-        watch = self.learner.watch
-        assert watch is not None
         expected = f"no rollout of ticket {permit.ticket}, {whose}"
-        if permit.ticket in watch.rollouts:
-            raise Broken(rule, expected, brief(watch.rollouts[permit.ticket]))
-        yield from self.learner.quiet(Rollout, QUIET_S, rule, expected)
+        if (found := self.learner.watch.answers.get(permit.ticket)) is not None:
+            raise Broken(rule, expected, brief(found))
+        yield from self.learner.quiet(Rollout, rule, expected)
 
 
 def run_spec(learner: Learner, steps: int = STEPS, net: tuple[int, ...] = NET) -> Script[RunSpec]:
@@ -149,15 +151,13 @@ def collecting(
 
 def collecting_at_length(learner: Learner) -> Script[Collecting]:
     """A session with rollouts that last, so that something can happen while one is in progress."""
-    if not learner.long_steps:
+    if not learner.step_s:
         session = yield from collecting(learner, TIMED_STEPS, net=LONG_NET)
-        yield from session.collect(session.permit())  # opens the lane
+        yield from session.collect()  # opens the lane
         began_s = learner.now
-        yield from session.collect(session.permit())
-        step_s = max(learner.now - began_s, 1e-3) / TIMED_STEPS
-        learner.long_steps = min(max(int(LONG_S / step_s), STEPS), LONGEST_STEPS)
-        learner.long_s = step_s * learner.long_steps
-    return (yield from collecting(learner, learner.long_steps, net=LONG_NET))
+        yield from session.collect()
+        learner.step_s = max(learner.now - began_s, 1e-3) / TIMED_STEPS
+    return (yield from collecting(learner, min(max(int(LONG_S / learner.step_s), STEPS), LONGEST_STEPS), net=LONG_NET))
 
 
 # ------------------------------------------------------------------------------------------------------------- rollouts
@@ -167,7 +167,7 @@ def collects(learner: Learner) -> Script[None]:
     """Rollouts of one lane, one after the other."""
     session = yield from collecting(learner)
     for _ in range(4):
-        yield from session.collect(session.permit())
+        yield from session.collect()
 
 
 def _repeats(one: Rollout, other: Rollout) -> bool:
@@ -181,7 +181,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
     ends = 0
     around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
     for _ in range(40):
-        rollout = yield from session.collect(session.permit())
+        rollout = yield from session.collect()
         ends += len(rollout.episodes)
         for t, n in np.argwhere(rollout.terminated[:-1]):
             last, first = (b"".join(leaf[row, n].tobytes() for leaf in rollout.obs) for row in (t + 1, t + 2))
@@ -200,10 +200,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
     """Weights that act well, until the time limit."""
-    env = yield from described(learner)
-    longest = env.max_episode_steps
-    if longest is None or longest > MOST_LIMIT_STEPS:
-        raise Skipped("the environment has no time limit" if longest is None else f"its time limit is {longest} steps")
+    longest = yield from time_limit(learner)
     session = yield from collecting(learner, steps=longest + 10)
     reached = False
     for _ in range(2):
@@ -248,11 +245,11 @@ def _balancing(session: Collecting) -> Floats:
 def waits_for_weights(learner: Learner) -> Script[None]:
     """A permit under weights that have not come yet, while older ones are held."""
     session = yield from collecting(learner)
-    yield from session.collect(session.permit())
+    yield from session.collect()
     permit = session.permit()
     session.order(permit, version=2)
     text = f"no rollout of ticket {permit.ticket} before the Weights of version 2"
-    yield from learner.quiet(Rollout, QUIET_S, rules.VERSION, text)
+    yield from learner.quiet(Rollout, rules.VERSION, text)
     session.give(session.weights(2))
     yield from session.rollout(permit, rules.VERSION)
 
@@ -264,7 +261,7 @@ def acts_under_the_named_version(learner: Learner) -> Script[None]:
     session.order(older, version=3)
     session.give(session.weights(5))
     text = f"no rollout of ticket {older.ticket} before the Weights of version 3, which it names"
-    yield from learner.quiet(Rollout, QUIET_S, rules.VERSION, text)
+    yield from learner.quiet(Rollout, rules.VERSION, text)
     session.give(session.weights(3))
     yield from session.rollout(older, rules.VERSION)
     session.order(newer, version=5)
@@ -285,11 +282,11 @@ def holds_two_versions(learner: Learner) -> Script[None]:
 def collects_in_order(learner: Learner) -> Script[None]:
     """The Collect of a rollout was lost; that of the next one has come, under weights that are held."""
     session = yield from collecting(learner)
-    yield from session.collect(session.permit())
+    yield from session.collect()
     lost, later = session.permit(), session.permit()
     session.deal(later)
     text = f"no rollout of sequence {later.sequence} before that of sequence {lost.sequence}"
-    yield from learner.quiet(Rollout, QUIET_S, rules.IN_ORDER, text)
+    yield from learner.quiet(Rollout, rules.IN_ORDER, text)
     session.deal(lost)
     for permit in (lost, later):
         yield from session.rollout(permit, rules.IN_ORDER)
@@ -309,9 +306,8 @@ def drops_weights(learner: Learner) -> Script[None]:
     """Rollouts under one version after the other; at last nothing is asked for."""
     session = yield from collecting(learner)
     for version in (1, 2, 3):
-        yield from session.collect(session.permit(), version=version)
-    for _ in range(2):
-        beat = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+        yield from session.collect(version=version)
+    beat = yield from heartbeats(learner, 2)
     if beat.versions != (3,):
         raise Broken(rules.HOLDS_WEIGHTS, "version 3 only, the newest: no ticket is left", f"{list(beat.versions)}")
 
@@ -323,11 +319,10 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
     session.deal(permit)
     for version in range(2, 20):  # their orders were lost
         session.give(session.weights(version))
-        yield from learner.let_pass(learner.long_s / 10)
-    assert learner.watch is not None
-    if permit.ticket not in learner.watch.rollouts:
+        yield Wait(session.rollout_s / 10)
+    if permit.ticket not in learner.watch.answers:
         yield from session.rollout(permit)
-    yield from session.collect(session.permit(), version=version)
+    yield from session.collect(version=version)
 
 
 def takes_rounded_weights(learner: Learner) -> Script[None]:
@@ -344,7 +339,7 @@ def takes_rounded_weights(learner: Learner) -> Script[None]:
 def sends_again(learner: Learner) -> Script[None]:
     """A rollout was lost: the learner asks for its ticket again."""
     session = yield from collecting(learner)
-    learner.received = {0: Received(0, 0, 0)}
+    learner.watch.confirms = False
     permit = session.permit()
     yield from session.collect(permit)
     for _ in range(2):
@@ -352,7 +347,7 @@ def sends_again(learner: Learner) -> Script[None]:
         yield from learner.expect(
             Rollout, rules.ROLLOUT_ONCE, f"the rollout of ticket {permit.ticket} again", ticket=permit.ticket
         )
-    yield from session.collect(session.permit())
+    yield from session.collect()
 
 
 def forgets_what_arrived(learner: Learner) -> Script[None]:
@@ -360,20 +355,19 @@ def forgets_what_arrived(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     permit = session.permit()
     yield from session.collect(permit)
-    for _ in range(2):
-        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from heartbeats(learner, 2)
     session.deal(permit)
-    yield from learner.quiet(Rollout, QUIET_S, rules.RECEIVED, f"no rollout of ticket {permit.ticket} after it was received")
-    yield from session.collect(session.permit())
+    yield from learner.quiet(Rollout, rules.RECEIVED, f"no rollout of ticket {permit.ticket} after it was received")
+    yield from session.collect()
 
 
 def says_no_rollout_twice(learner: Learner) -> Script[None]:
     """Nothing is asked for after a rollout, and its arrival is not yet confirmed."""
     session = yield from collecting(learner)
-    learner.received = {0: Received(0, 0, 0)}
+    learner.watch.confirms = False
     permit = session.permit()
     yield from session.collect(permit)
-    yield from learner.quiet(Rollout, 1.0, rules.ROLLOUT_ONCE, "one rollout of a ticket that was dealt once")
+    yield from learner.quiet(Rollout, rules.ROLLOUT_ONCE, "one rollout of a ticket that was dealt once", for_s=1.0)
 
 
 def collects_two_lanes(learner: Learner) -> Script[None]:
@@ -396,14 +390,14 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
 def starts_a_lane_again(learner: Learner) -> Script[None]:
     """A higher incarnation, then a permit of the lower one."""
     session = yield from collecting(learner)
-    before = yield from session.collect(session.permit())
+    before = yield from session.collect()
     after = yield from session.collect(session.permit(incarnation=2))
     if _repeats(before, after):
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
         raise Broken(rules.INDEPENDENT, "other episodes in incarnation 2", got)
     _, old = session.permit(incarnation=1), session.permit(incarnation=1)  # `old`: of the sequence that is next
     session.deal(old)
-    yield from learner.quiet(Rollout, QUIET_S, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
+    yield from learner.quiet(Rollout, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
 
 
@@ -414,11 +408,10 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     lost, kept = session.permit(0), session.permit(1)
     session.order(lost, kept, version=2)
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
-    learner.release(0)
     session.give(session.weights(2))
     yield from session.rollout(kept)
     yield from session.nothing_of(lost, rules.RELEASE, "whose lane was released")
-    found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    found = yield from heartbeats(learner, 1)
     if lost.ticket in found.tickets:
         raise Broken(rules.RELEASE, "no tickets of the released lane in a Heartbeat", f"ticket {lost.ticket}")
     yield from session.collect(session.permit(0, incarnation=1), version=2)
@@ -429,9 +422,8 @@ def closes_unlisted_lanes(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     lost, kept = session.permit(0), session.permit(1)
     session.order(lost, kept, version=2)
-    learner.unlisted.add(0)
-    for _ in range(3):
-        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
+    yield from heartbeats(learner, 3)
     session.give(session.weights(2))
     yield from session.rollout(kept)
     yield from session.nothing_of(lost, rules.UNLISTED, "whose lane is not listed")
@@ -441,13 +433,14 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
     """A copy of an old HeartbeatReply does not list the lane that came after it."""
     session = yield from collecting(learner)
     learner.answers_heartbeats = False
-    yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
-    learner.send(HeartbeatReply(learner.session, 6, ()))
+    yield from heartbeats(learner, 1)
+    early = [learner.watch.reply(6), learner.watch.reply(2)]
+    learner.send(early[0])
     permit = session.permit()
     session.order(permit, version=2)
-    learner.send(HeartbeatReply(learner.session, 6, ()))
-    learner.send(HeartbeatReply(learner.session, 2, ()))
-    yield from learner.let_pass(0.3)
+    for late in early:
+        learner.send(late)
+    yield Wait(0.3)
     session.give(session.weights(2))
     learner.answers_heartbeats = True
     text = f"the rollout of ticket {permit.ticket}: late copies of replies 6 and 2 close no lane"
@@ -460,13 +453,12 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
 def forgets_the_session_before(learner: Learner) -> Script[None]:
     """Rejoin while it collects: nothing of the session before comes, and its weights are forgotten."""
     session = yield from collecting_at_length(learner)
-    session.deal(session.permit(0), session.permit(1))
-    yield from learner.let_pass(learner.long_s / 5)
+    yield from session.begin(session.permit(0), session.permit(1))
     again = yield from collecting(learner, net=LONG_NET)
     permit = again.permit()
     again.order(permit)
     text = "no rollout before the first Weights of the session"
-    yield from learner.quiet(Rollout, 2 * QUIET_S, rules.SESSION, text)
+    yield from learner.quiet(Rollout, rules.SESSION, text, for_s=2 * QUIET_S)
     again.give(again.weights(1))
     yield from again.rollout(permit)
 
@@ -475,37 +467,32 @@ def collects_over_a_new_connection(learner: Learner) -> Script[None]:
     """The connection is cut while it collects; the learner asks for the ticket again."""
     session = yield from collecting_at_length(learner)
     permit = session.permit()
-    session.deal(permit)
-    yield from learner.let_pass(learner.long_s / 5)
-    learner.cut()
-    found = yield Wait(10, lambda event: isinstance(event, Heard) and isinstance(event.message, Heartbeat | Rollout))
-    if found is None:
-        raise Broken(rules.CONNECTION, "the client over a new connection, in the same session", "nothing within 10 s")
-    assert learner.watch is not None
-    if permit.ticket not in learner.watch.rollouts:
+    yield from session.begin(permit)
+    yield from over_a_new_connection(learner, Rollout)
+    if permit.ticket not in learner.watch.answers:
         session.order(permit)
         learner.send(session.weights(1))
         yield from session.rollout(permit)
-    yield from session.collect(session.permit())
+    yield from session.collect()
 
 
 def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
     """A Collect with an extra field, Weights with a missing frame, and a Collect for another session."""
     session = yield from collecting(learner)
-    yield from session.collect(session.permit())
+    yield from session.collect()
     permit = session.permit()
-    head = msgpack.unpackb(bytes(encode(Collect(learner.session, 1, (permit,), learner.of_lanes()))[0]))
+    head = msgpack.unpackb(bytes(encode(Collect(learner.session, 1, (permit,), learner.watch.received()))[0]))
     learner.send_unreadable(
         permit.ticket,
         [msgpack.packb([*head, "one field too many"])],
         [msgpack.packb(head[:-1])],
         [encode(session.weights(9))[0]],
     )
-    of_other = replace(permit, ticket=learner.ticket())
+    of_other = replace(permit, ticket=next(learner.tickets))
     learner.send(Collect(learner.session + 1000, 1, (of_other,), ()))
     text = "no rollout for a Collect with a field too many or too few, or of another session"
-    yield from learner.quiet(Rollout, QUIET_S, rules.IGNORE_UNREADABLE, text)
-    yield from session.collect(replace(permit, ticket=learner.ticket()))
+    yield from learner.quiet(Rollout, rules.IGNORE_UNREADABLE, text)
+    yield from session.collect(replace(permit, ticket=next(learner.tickets)))
 
 
 def beats_while_it_collects(learner: Learner) -> Script[None]:
@@ -513,7 +500,7 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
     session = yield from collecting(learner, steps=1000)
     until_s = learner.now + 2 * 1.5 + 8 * learner.settings.heartbeat_s
     while learner.now < until_s:
-        yield from session.collect(session.permit())
+        yield from session.collect()
 
 
 def evaluates(learner: Learner) -> Script[None]:
@@ -532,11 +519,11 @@ def evaluates(learner: Learner) -> Script[None]:
 def evaluates_one_version(learner: Learner) -> Script[None]:
     """An evaluation under weights that have not come yet, while older ones are held."""
     session = yield from collecting(learner)
-    yield from session.collect(session.permit())
+    yield from session.collect()
     order = _evaluation(learner, version=2)
     learner.send(order)
     text = f"no Evaluated for ticket {order.ticket} before version 2"
-    yield from learner.quiet(Evaluated, QUIET_S, rules.EVALUATE_VERSION, text)
+    yield from learner.quiet(Evaluated, rules.EVALUATE_VERSION, text)
     session.give(session.weights(2))
     text = f"Evaluated for ticket {order.ticket}"
     yield from learner.expect(Evaluated, rules.EVALUATE, text, within_s=2 * learner.settings.patience_s, ticket=order.ticket)
@@ -547,14 +534,14 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     answer = yield from _evaluate(session, _evaluation(learner, send_rows=True))
     if isinstance(answer, Goodbye):
-        yield from learner.left(rules.DECLINED, 2, "Goodbye")
+        yield from learner.left(rules.DECLINED, "Goodbye", (2,))
         raise Skipped(f"it declines: {answer.reason}")
 
 
 def _evaluation(
     learner: Learner, *, version: int = 1, most_steps: int = EVALUATED_STEPS, send_rows: bool = False
 ) -> Evaluate:
-    return Evaluate(learner.session, learner.ticket(), version, (1, 2), True, most_steps, send_rows, False)
+    return Evaluate(learner.session, next(learner.tickets), version, (1, 2), True, most_steps, send_rows, False)
 
 
 def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated | Goodbye]:
@@ -562,23 +549,20 @@ def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated | Goodby
     session.learner.send(order)
     session.give(session.weights(order.version))
     rows: dict[int, int] = {}
-    kinds = EpisodeRows | Evaluated | Goodbye if order.send_rows else EpisodeRows | Evaluated
-    within_s = 2 * session.learner.settings.patience_s
+    kinds: tuple[type[EpisodeRows | Evaluated | Goodbye], ...] = (EpisodeRows, Evaluated)
+    if order.send_rows:
+        kinds = (*kinds, Goodbye)
+    text, within_s = f"Evaluated for ticket {order.ticket}", 2 * session.learner.settings.patience_s
     while True:
-        found = yield Wait(within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kinds))
-        if found is None:
-            raise Broken(rules.EVALUATE, f"Evaluated for ticket {order.ticket}", f"none within {within_s:g} s")
-        assert isinstance(found, Heard)
-        match found.message:
-            case Goodbye() as goodbye:
-                return goodbye
-            case EpisodeRows() as part:
-                if part.first_step != rows.get(part.episode, 0):
-                    expected = f"rows of episode {part.episode} from step {rows.get(part.episode, 0)}"
-                    raise Broken(rules.EVALUATE, expected, f"from step {part.first_step}")
-                rows[part.episode] = part.first_step + len(part.reward)
-            case Evaluated() as answer:
-                break
+        answer = yield from session.learner.expect(kinds, rules.EVALUATE, text, within_s=within_s)
+        if isinstance(answer, Goodbye):
+            return answer
+        if isinstance(answer, Evaluated):
+            break
+        if answer.first_step != rows.get(answer.episode, 0):
+            expected = f"rows of episode {answer.episode} from step {rows.get(answer.episode, 0)}"
+            raise Broken(rules.EVALUATE, expected, f"from step {answer.first_step}")
+        rows[answer.episode] = answer.first_step + len(answer.reward)
     if not len(answer.episodes) == len(answer.cut) == 2:
         raise Broken(rules.EVALUATE, "2 episodes for 2 seeds", f"{len(answer.episodes)}")
     for number, (episode, cut) in enumerate(zip(answer.episodes, answer.cut, strict=True)):
@@ -600,67 +584,56 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     """Drain while one ticket is collected and another waits."""
     session = yield from collecting_at_length(learner)
     permits = [session.permit(), session.permit()]
-    session.deal(*permits)
+    yield from session.begin(*permits)
     waits = session.permit(1)
     session.order(waits, version=9)
-    yield from learner.let_pass(learner.long_s / 5)
     learner.send(Drain("the run is over"))
-    assert learner.watch is not None
-    early = set(learner.watch.rollouts)
-    arrived: set[int] = set()
+    early = set(learner.watch.answers)
+    within_s = 2 * learner.settings.patience_s
     while True:
-        within_s = 2 * learner.settings.patience_s
-        found = yield Wait(within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, Rollout | Goodbye))
-        if found is None:
-            raise Broken(rules.DRAIN, "Goodbye after Drain", f"none within {within_s:g} s")
-        assert isinstance(found, Heard)
-        match found.message:
-            case Rollout() as rollout:
-                arrived.add(rollout.ticket)
-            case Goodbye() as goodbye:
-                break
-    unfinished = {permit.ticket for permit in (*permits, waits)} - arrived - early
-    if (listed := set(goodbye.tickets)) != unfinished:
+        found = yield from learner.expect((Rollout, Goodbye), rules.DRAIN, "Goodbye after Drain", within_s=within_s)
+        if isinstance(found, Goodbye):
+            break
+    arrived = learner.watch.answers.keys()
+    unfinished = {permit.ticket for permit in (*permits, waits)} - arrived
+    if (listed := set(found.tickets)) != unfinished:
         raise Broken(rules.DRAIN, f"Goodbye with the unfinished tickets {sorted(unfinished)}", f"{sorted(listed)}")
-    if len(arrived) > 1:
-        raise Broken(rules.DRAIN, "no new rollout after Drain: at most the one in progress", f"{len(arrived)} rollouts")
-    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")
+    if (late := len(arrived - early)) > 1:
+        raise Broken(rules.DRAIN, "no new rollout after Drain: at most the one in progress", f"{late} rollouts")
+    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
+
+
+def _draining(learner: Learner) -> Script[Collecting]:
+    """A session in which the client is told to drain while it collects."""
+    session = yield from collecting_at_length(learner)
+    yield from session.begin(session.permit())
+    learner.send(Drain("the run is over"))
+    return session
 
 
 def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
     """A Collect, and a copy of the Welcome, after Drain."""
-    session = yield from collecting_at_length(learner)
-    first, second = session.permit(), session.permit(1)
-    session.deal(first)
-    yield from learner.let_pass(learner.long_s / 5)
-    learner.send(Drain("the run is over"))
-    session.order(second)
-    text = "Goodbye after Drain"
+    session = yield from _draining(learner)
+    late = session.permit(1)
+    session.order(late)
     within_s = 2 * learner.settings.patience_s
-    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, text, within_s=within_s)
-    assert learner.watch is not None
-    if second.ticket in learner.watch.rollouts or second.ticket in goodbye.tickets:
-        got = "its rollout" if second.ticket in learner.watch.rollouts else "that ticket in Goodbye"
-        raise Broken(rules.DRAINING_IGNORES, f"nothing of ticket {second.ticket}, which came after Drain", got)
-    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")
+    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain", within_s=within_s)
+    if late.ticket in learner.watch.answers or late.ticket in goodbye.tickets:
+        got = "its rollout" if late.ticket in learner.watch.answers else "that ticket in Goodbye"
+        raise Broken(rules.DRAINING_IGNORES, f"nothing of ticket {late.ticket}, which came after Drain", got)
+    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
 
 
 def leaves_when_refused_while_it_drains(learner: Learner) -> Script[None]:
     """Refuse after Drain: the client may have left already."""
-    session = yield from collecting_at_length(learner)
-    session.deal(session.permit())
-    yield from learner.let_pass(learner.long_s / 5)
-    learner.send(Drain("the run is over"))
+    yield from _draining(learner)
     learner.send(Refuse("the test refuses this worker"))
     yield from _ends(learner, (0, 2), "Drain and Refuse")
 
 
 def leaves_when_unknown_while_it_drains(learner: Learner) -> Script[None]:
     """Rejoin after Drain: the learner does not know the session any more."""
-    session = yield from collecting_at_length(learner)
-    session.deal(session.permit())
-    yield from learner.let_pass(learner.long_s / 5)
-    learner.send(Drain("the run is over"))
+    yield from _draining(learner)
     learner.send(Rejoin(learner.session))
     yield from _ends(learner, (0, 1), "Drain and Rejoin")
 
@@ -668,15 +641,10 @@ def leaves_when_unknown_while_it_drains(learner: Learner) -> Script[None]:
 def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
     """The client ends; a Goodbye may come before."""
     within_s = 2 * learner.settings.patience_s
-    learner.allows_hello = True  # so that a Hello is this check's, and no Heartbeat is due
-    learner.allows_another_process = True
+    learner.may_leave = True  # so that a Hello is this check's
     before = learner.hello
     assert before is not None
-
-    def is_answer(event: Event) -> bool:
-        return isinstance(event, Ended) or (isinstance(event, Heard) and isinstance(event.message, Goodbye | Hello))
-
-    found = yield Wait(within_s, is_answer)
+    found = yield Wait(within_s, lambda event: isinstance(event, Ended) or isinstance(event.message, Goodbye | Hello))
     match found:
         case Ended(code) if code in codes:
             return
@@ -685,7 +653,7 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
         case Heard(_, Hello(process_nonce=life)) if life != before.process_nonce:
             return
         case Heard(_, Goodbye()):
-            yield from learner.left(rules.DRAINING_LEAVES, codes, after)
+            yield from learner.left(rules.DRAINING_LEAVES, after, codes)
         case _:
             got = "Hello" if found is not None else f"a client that still runs {within_s:g} s later"
             raise Broken(rules.DRAINING_LEAVES, f"the client's end after {after}", got)

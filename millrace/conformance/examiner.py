@@ -12,7 +12,7 @@ from typing import Literal
 from millrace.conformance import rules
 from millrace.conformance.learner import Learner, Settings
 from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, Effect, Event, Script, Skipped, Wait
+from millrace.conformance.script import Broken, Effect, EndClient, Event, Script, Skipped, Wait
 
 CHECK_S = 40.0  # longest time that one check may take
 
@@ -115,7 +115,7 @@ class Examiner:
     def _failed(self, broken: Broken) -> None:
         self._record("failed", rule=broken.rule, expected=broken.expected, got=broken.got)
         if self.learner.runs:
-            self.learner.end()
+            self.learner.do(EndClient())
         while self.learner.is_mute and not self.done:
             self._began_s = self.learner.now
             self._record("skipped", note="the client never said Hello")
@@ -133,7 +133,7 @@ class Examiner:
         self.results.append(Result(name, outcome, self.learner.now - self._began_s, rule, expected, got, note))
         self._script, self._due_s = None, self.learner.now
         if self.done and self.learner.runs:
-            self.learner.end()
+            self.learner.do(EndClient())
 
     def _out_of_time(self) -> None:
         while not self.done:

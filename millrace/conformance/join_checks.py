@@ -11,7 +11,8 @@ import numpy as np
 
 from millrace.conformance import rules
 from millrace.conformance.learner import Learner
-from millrace.conformance.script import Broken, Heard, Script, Wait, brief
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import AskToStop, Broken, CutConnection, Listen, Script, Skipped, Wait, brief
 from protocol.bounds import MAX_LINE
 from protocol.envs.description import DescribedEnv, read_description
 from protocol.errors import BadMessage, UsageError
@@ -22,14 +23,18 @@ from protocol.messages import (
     Heartbeat,
     HeartbeatReply,
     Hello,
+    Message,
     Refuse,
     Rejoin,
     Release,
+    Rollout,
     Weights,
     Welcome,
 )
 from protocol.specs import DescribeSpec
 
+MOST_LIMIT_STEPS = 2000  # of a time limit that a check walks to
+POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # balance the pole of a cart, so that its episodes reach the time limit
 SILENCE_S = 1.5  # learner_timeout_s of the check of silence
 
 
@@ -41,24 +46,42 @@ def describe_spec(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s:
 
 def described(learner: Learner) -> Script[DescribedEnv]:
     """The client's environment. If it is not known yet, the client joins and describes it."""
-    if learner.description is None:
+    if learner.env is None:
         yield from learner.joining()
         learner.welcome(describe_spec(learner))
         within_s = learner.settings.start_s
-        found = yield Wait(
-            within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, Described | Goodbye)
-        )
-        if found is None:
-            raise Broken(rules.DESCRIBE, f"Described after a Welcome with a DescribeSpec, within {within_s:g} s", "none")
-        assert isinstance(found, Heard)
-        if not isinstance(found.message, Described):
-            got = f"Goodbye: {found.message.reason}" if isinstance(found.message, Goodbye) else brief(found.message)
-            raise Broken(rules.DECLINED, f"a description of the environment {learner.settings.env.id}", got)
-        learner.description = found.message
-    try:
-        return read_description(learner.description.description)
-    except (BadMessage, UsageError) as error:
-        raise Broken(rules.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
+        text = f"Described of the environment {learner.settings.env.id} after a Welcome with a DescribeSpec"
+        found = yield from learner.expect((Described, Goodbye), rules.DESCRIBE, text, within_s=within_s)
+        if not isinstance(found, Described):
+            raise Broken(rules.DECLINED, text, brief(found))
+        try:
+            learner.env = read_description(found.description)
+        except (BadMessage, UsageError) as error:
+            raise Broken(rules.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
+    return learner.env
+
+
+def time_limit(learner: Learner) -> Script[int]:
+    """Steps of the longest episode, as described. Skips the check if there is no limit that it can walk to."""
+    env = yield from described(learner)
+    longest = env.max_episode_steps
+    if longest is None or longest > MOST_LIMIT_STEPS:
+        raise Skipped("the environment has no time limit" if longest is None else f"its time limit is {longest} steps")
+    return longest
+
+
+def heartbeats(learner: Learner, number: int, rule: Rule = rules.HEARTBEAT) -> Script[Heartbeat]:
+    """The last of so many Heartbeats that follow."""
+    for _ in range(number):
+        beat = yield from learner.expect(Heartbeat, rule, "a Heartbeat")
+    return beat
+
+
+def over_a_new_connection(learner: Learner, *others: type[Message | Rollout]) -> Script[None]:
+    """Every connection is reset. A Heartbeat of the same session comes, or one of these messages."""
+    learner.do(CutConnection(), Listen())
+    text = "a message of the same session over a new connection"
+    yield from learner.expect((Heartbeat, *others), rules.CONNECTION, text, within_s=10)
 
 
 # -------------------------------------------------------------------------------------------------------------- joining
@@ -105,29 +128,19 @@ def accepts_only_its_welcome(learner: Learner) -> Script[None]:
     hello = yield from learner.joining()
     learner.send(Welcome(77, hello.attempt - 1, describe_spec(learner)))
     learner.send(Welcome(78, hello.attempt + 1, describe_spec(learner)))
-    found = yield Wait(
-        6.0,
-        lambda event: isinstance(event, Heard) and (getattr(event.message, "session", 0) in (77, 78) or _is_hello(event)),
-    )
-    if found is None or not _is_hello(found):
-        got = "no Hello any more" if found is None else brief(found.message) if isinstance(found, Heard) else ""
-        raise Broken(rules.WELCOME_ATTEMPT, f"Hello until a Welcome for attempt {hello.attempt} comes", got)
-
-
-def _is_hello(event: object) -> bool:
-    return isinstance(event, Heard) and isinstance(event.message, Hello)
+    text = f"Hello until a Welcome for attempt {hello.attempt} comes"
+    found = yield from learner.expect((Hello, Heartbeat, Described), rules.WELCOME_ATTEMPT, text, within_s=6.0)
+    if not isinstance(found, Hello):
+        raise Broken(rules.WELCOME_ATTEMPT, text, brief(found))
 
 
 def describes(learner: Learner) -> Script[None]:
     """The spaces of the environment, with every Heartbeat."""
-    learner.description = None
+    learner.env = None
     yield from described(learner)
-    first = learner.described_as()
     for _ in range(2):
-        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
-        again = yield from learner.expect(Described, rules.DESCRIBE_AGAIN, "Described after each Heartbeat")
-        if repr(again.description) != repr(first.description):
-            raise Broken(rules.DESCRIBE_AGAIN, "the same description again", "another")
+        yield from heartbeats(learner, 1)
+        yield from learner.expect(Described, rules.DESCRIBE_AGAIN, "Described after each Heartbeat")
 
 
 # ------------------------------------------------------------------------------------------- a session of any kind
@@ -143,19 +156,19 @@ def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
     yield from _replies(learner, 1)
     learner.answers_heartbeats = False
     yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat although the last one was not answered")
-    learner.send(HeartbeatReply(learner.session, 9, learner.of_lanes()))
+    learner.send(learner.watch.reply(9))
     yield from _replies(learner, 9)
-    learner.send(HeartbeatReply(learner.session, 9, learner.of_lanes()))
-    learner.send(HeartbeatReply(learner.session, 4, learner.of_lanes()))
+    learner.send(learner.watch.reply(9))
+    learner.send(learner.watch.reply(4))
     for _ in range(2):
-        late = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+        late = yield from heartbeats(learner, 1)
         if late.replies != 9:
             raise Broken(rules.HEARTBEAT_REPLIES, "replies 9 after a late copy of reply 4", f"{late.replies}")
 
 
 def _replies(learner: Learner, number: int) -> Script[None]:
     for _ in range(4):  # one may have been on its way
-        found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+        found = yield from heartbeats(learner, 1)
         if found.replies >= number:
             return
     raise Broken(rules.HEARTBEAT_REPLIES, f"replies {number} after HeartbeatReply {number}", f"{found.replies}")
@@ -171,10 +184,9 @@ def in_any_session(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s
 def keeps_the_rhythm(learner: Learner) -> Script[None]:
     """Heartbeats come as often as the session asks for."""
     yield from in_any_session(learner, heartbeat_s=0.5)
-    yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from heartbeats(learner, 1)
     began_s = learner.now
-    for _ in range(4):
-        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from heartbeats(learner, 4)
     took_s = learner.now - began_s
     if not 1.0 <= took_s <= 4.0:
         raise Broken(rules.HEARTBEAT, "four of them in 2 s, as heartbeat_s is 0.5", f"{took_s:.1f} s")
@@ -184,20 +196,19 @@ def joins_again(learner: Learner) -> Script[None]:
     """A Rejoin of this session, and one of another."""
     yield from in_any_session(learner)
     learner.send(Rejoin(learner.session + 1000))
-    yield from learner.quiet(Hello, 1.0, rules.OTHER_SESSION, "no Hello after a Rejoin of another session")
+    yield from learner.quiet(Hello, rules.OTHER_SESSION, "no Hello after a Rejoin of another session", for_s=1.0)
     yield from learner.rejoin()
     learner.welcome(describe_spec(learner))
-    yield from learner.expect(Heartbeat, rules.SESSION, "a Heartbeat of the new session")
+    yield from heartbeats(learner, 1, rules.SESSION)
 
 
 def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
     """The learner answers a repeated Hello by the same Welcome."""
     yield from in_any_session(learner)
     yield from _replies(learner, 1)
-    assert learner.hello is not None
-    learner.send(Welcome(learner.session, learner.hello.attempt, describe_spec(learner)))
+    learner.send(learner.watch.welcome)
     for _ in range(2):
-        found = yield from learner.expect(Heartbeat, rules.REPEATED_WELCOME, "a Heartbeat of the same session")
+        found = yield from heartbeats(learner, 1, rules.REPEATED_WELCOME)
         if not found.replies:
             raise Broken(rules.REPEATED_WELCOME, "a session that goes on (replies above 0)", "one that began again")
 
@@ -205,23 +216,13 @@ def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
 def notices_silence(learner: Learner) -> Script[None]:
     """The learner says nothing more."""
     yield from in_any_session(learner, learner_timeout_s=SILENCE_S)
-    before = learner.hello
-    assert before is not None
-    for _ in range(12):  # as long as it is heard, the client stays: any message counts
-        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from heartbeats(learner, 12)  # as long as it hears the learner, the client stays: any message counts
     learner.answers_heartbeats = False
-    learner.allows_hello = True
     silent_from_s = learner.now
-    hello = yield from learner.expect(
-        Hello,
-        rules.SILENT,
-        f"Hello {SILENCE_S} s (learner_timeout_s) after the learner's last message",
-        within_s=SILENCE_S + 4,
-    )
+    text = f"Hello {SILENCE_S} s (learner_timeout_s) after the learner's last message"
+    yield from learner.later_hello(rules.SILENT, text, within_s=SILENCE_S + 4)
     if learner.now - silent_from_s < SILENCE_S - 2 * learner.settings.heartbeat_s - 0.1:
         raise Broken(rules.SILENT, f"Hello after {SILENCE_S} s of silence", f"after {learner.now - silent_from_s:.1f} s")
-    if hello.attempt <= before.attempt:
-        raise Broken(rules.SILENT, f"an attempt later than {before.attempt}", f"attempt {hello.attempt}")
 
 
 # ---------------------------------------------------------------------------------------------------- faults of networks
@@ -231,22 +232,16 @@ def outlives_its_connection(learner: Learner) -> Script[None]:
     """Every connection is reset; the learner keeps the session."""
     yield from in_any_session(learner)
     for _ in range(2):
-        learner.cut()
-        yield from learner.expect(Heartbeat, rules.CONNECTION, "a Heartbeat over a new connection", within_s=10)
+        yield from over_a_new_connection(learner)
 
 
 def outlives_a_restart(learner: Learner) -> Script[None]:
     """The learner is away for a second, and then knows no session."""
     yield from in_any_session(learner)
-    before = learner.hello
-    assert before is not None
-    learner.cut(listen=False)
-    yield from learner.let_pass(1.0)
-    learner.listen()
-    yield from learner.expect(Heartbeat, rules.CONNECTION, "a Heartbeat over a new connection", within_s=10)
-    hello = yield from learner.rejoin()
-    if hello.process_nonce != before.process_nonce:
-        raise Broken(rules.HELLO, f"life {before.process_nonce}, for the process is the same", f"life {hello.process_nonce}")
+    learner.do(CutConnection())
+    yield Wait(1.0)
+    yield from over_a_new_connection(learner)
+    yield from learner.rejoin()
     learner.welcome(describe_spec(learner))
     yield from learner.expect(Described, rules.DESCRIBE, "Described in the new session")
 
@@ -258,23 +253,22 @@ def leaves_when_refused(learner: Learner) -> Script[None]:
     """Refuse while joining."""
     yield from learner.newly_started()
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
-    yield from learner.left(rules.REFUSE, 2, "Refuse while joining")
+    yield from learner.left(rules.REFUSE, "Refuse while joining", (2,))
 
 
 def leaves_when_refused_later(learner: Learner) -> Script[None]:
     """Refuse while ready."""
     yield from in_any_session(learner)
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
-    assert learner.watch is not None
-    learner.watch.heard_heartbeat_s = learner.now + learner.settings.patience_s  # no Heartbeat is due any more
-    yield from learner.left(rules.REFUSE, 2, "Refuse while ready")
+    learner.may_leave = True
+    yield from learner.left(rules.REFUSE, "Refuse while ready", (2,))
 
 
 def drains_while_joining(learner: Learner) -> Script[None]:
     """Drain is the answer to Hello. Its reason is as long as a reason may be."""
     yield from learner.newly_started()
     learner.send(Drain("…" * MAX_LINE))
-    yield from learner.left(rules.DRAIN_JOINING, 0, "Drain while joining")
+    yield from learner.left(rules.DRAIN_JOINING, "Drain while joining")
 
 
 def drains_while_idle(learner: Learner) -> Script[None]:
@@ -284,22 +278,22 @@ def drains_while_idle(learner: Learner) -> Script[None]:
     goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain")
     if goodbye.tickets:
         raise Broken(rules.DRAIN, "Goodbye without tickets", f"tickets {list(goodbye.tickets)}")
-    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")
+    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
 
 
 def stops_on_request(learner: Learner) -> Script[None]:
     """SIGTERM while ready."""
     yield from in_any_session(learner)
-    learner.stop()
+    learner.do(AskToStop())
     yield from learner.expect(Goodbye, rules.STOP, "Goodbye after SIGTERM")
-    yield from learner.left(rules.STOP, 0, "SIGTERM and Goodbye")
+    yield from learner.left(rules.STOP, "SIGTERM and Goodbye")
 
 
 def stops_while_joining(learner: Learner) -> Script[None]:
     """SIGTERM while no learner answers."""
     yield from learner.newly_started()
-    learner.stop()
-    yield from learner.left(rules.STOP, 0, "SIGTERM while joining")
+    learner.do(AskToStop())
+    yield from learner.left(rules.STOP, "SIGTERM while joining")
 
 
 def draws_its_life(learner: Learner) -> Script[None]:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, TypeVar
 
 from millrace.conformance import rules
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import (
-    AskToStop,
     Broken,
     CutConnection,
     Effect,
@@ -21,7 +21,6 @@ from millrace.conformance.script import (
     Ended,
     Event,
     Heard,
-    Listen,
     Script,
     Send,
     StartClient,
@@ -30,23 +29,17 @@ from millrace.conformance.script import (
 )
 from millrace.conformance.watch import Watch
 from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
 from protocol.errors import BadMessage
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
-    Call,
-    Collect,
-    Described,
     Failure,
     Goodbye,
     Heartbeat,
-    HeartbeatReply,
     Hello,
     Inquire,
-    Received,
     Rejoin,
-    Reset,
-    Step,
     ToLearner,
     ToWorker,
     Welcome,
@@ -55,6 +48,7 @@ from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from protocol.wire.codec import Buffer, encode
 
 M = TypeVar("M")
+QUIET_S = 0.7
 
 
 @dataclass(frozen=True)
@@ -86,254 +80,182 @@ class Learner:
         self.peer = b""
         self.hello: Hello | None = None
         """the newest, of the process that runs; what comes before it was said by the process before"""
-        self.watch: Watch | None = None
-        """of the current session; None while there is none"""
-        self.hears = True
-        """False: what the client says is lost"""
         self.answers_heartbeats = True
-        self.allows_hello = False
-        """whether the client may start to join by itself"""
-        self.allows_another_process = False
-        """whether the client's process may have left, and another have started under its name, by its supervisor"""
-        self.description: Described | None = None
+        self.may_leave = False
+        """whether the client may leave its session by itself, also by another process; no Heartbeat is due"""
+        self.tickets = count(101)
+        self.env: DescribedEnv | None = None
         """what the client has described, in this whole run of the test"""
-        self.long_steps = 0
-        """T of a rollout that takes so long that the test can act before its end; 0: it was not measured yet"""
-        self.long_s = 0.0
-        """how long the client takes for that rollout"""
-        self.received: dict[int, Received] | None = None
-        """by lane: what HeartbeatReply and Collect say has arrived; None: all that has"""
-        self.unlisted: set[int] = set()
-        """lanes that they do not list"""
-        self._lanes: dict[int, int] = {}  # lane -> incarnation, in this session
-        self._numbers = 0x5EED_0000
-        self._tickets = 100
+        self.step_s = 0.0
+        """how long a step takes that is long enough to act meanwhile; 0: it was not measured yet"""
+        self._sessions = count(0x5EED_0001)
         self._steps = 0  # env steps that the process has reported
-        self._welcome: Welcome | None = None
+        self._watch: Watch | None = None  # of the current session
+
+    @property
+    def watch(self) -> Watch:
+        """The watch over the current session."""
+        assert self._watch is not None, "the check has welcomed the client"
+        return self._watch
+
+    @property
+    def session(self) -> int:
+        """The current session."""
+        return self.watch.session
 
     # --------------------------------------------------------------------------------------------------------- sending
 
     def send(self, message: ToWorker) -> None:
         """Send a message to the client."""
-        if self.watch is not None:
-            self.watch.sent(message)
-            match message:
-                case Collect() if message.session == self.session:
-                    for permit in message.permits:
-                        self._lanes[permit.lane] = max(permit.incarnation, self._lanes.get(permit.lane, 0))
-                case Reset() | Step() | Call() if message.session == self.session:
-                    self._lanes[message.lane] = max(message.incarnation, self._lanes.get(message.lane, 0))
-        self.send_frames(encode(message))
-
-    def send_frames(self, frames: list[Buffer]) -> None:
-        """Send these frames, whatever they are."""
-        self.effects.append(Send(self.peer, frames))
+        if self._watch is not None:
+            self._watch.sent(message)
+        self.effects.append(Send(self.peer, encode(message)))
 
     def send_unreadable(self, ticket: int, *messages: list[Buffer]) -> None:
         """Send frames that cannot be read, some of them with this ticket, which the client must not answer."""
-        assert self.watch is not None
         self.watch.unreadable(ticket)
-        for frames in messages:
-            self.send_frames(frames)
+        self.effects += [Send(self.peer, frames) for frames in messages]
 
-    def reply(self) -> None:
-        """Send the next HeartbeatReply."""
-        assert self.watch is not None
-        self.send(HeartbeatReply(self.session, self.watch.replies + 1, self.of_lanes()))
+    def welcome(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
+        """Answer the newest Hello: a new session begins."""
+        assert self.hello is not None
+        self.answers_heartbeats = True
+        self._watch = Watch(Welcome(next(self._sessions), self.hello.attempt, run), self.now, self._steps)
+        self.send(self._watch.welcome)
 
-    def of_lanes(self) -> tuple[Received, ...]:
-        """One entry for each lane of the client."""
-        assert self.watch is not None
-        entries = []
-        for lane, incarnation in sorted(self._lanes.items()):
-            if lane in self.unlisted:
-                continue
-            if self.received is not None:
-                entries.append(self.received.get(lane, Received(lane, incarnation, 0)))
-                continue
-            arrived = [
-                rollout.sequence
-                for ticket, rollout in self.watch.rollouts.items()
-                if (self.watch.permits[ticket].permit.lane, self.watch.permits[ticket].permit.incarnation)
-                == (lane, incarnation)
-            ]
-            entries.append(Received(lane, incarnation, max(arrived, default=-1) + 1))
-        return tuple(entries)
-
-    def ticket(self) -> int:
-        """The next ticket."""
-        self._tickets += 1
-        return self._tickets
-
-    @property
-    def session(self) -> int:
-        """The current session."""
-        assert self.watch is not None, "the check has welcomed the client"
-        return self.watch.session
-
-    def described_as(self) -> Described:
-        """What the client has described."""
-        assert self.description is not None
-        return self.description
-
-    def release(self, lane: int) -> None:
-        """The lane is not the client's any more, as far as the learner's books say."""
-        self._lanes.pop(lane, None)
+    def do(self, *effects: Effect) -> None:
+        """Have these effects on the client's process and its connections."""
+        self.effects += effects
+        for effect in effects:
+            match effect:
+                case StartClient():
+                    self.runs, self.is_mute = True, not self.peer
+                case EndClient():
+                    self._forget_process()
+                case CutConnection() if self._watch is not None:
+                    self._watch.heard_heartbeat_s = self.now + self.settings.patience_s
 
     # --------------------------------------------------------------------------------------------------------- hearing
 
     def take(self, event: Event, wanted: Callable[[Event], bool]) -> bool:
         """Do the books for an event; whether the check waits for it. Raises `Broken`."""
         match event:
-            case Ended(code, line):
-                self.runs, self.watch, self.hello = False, None, None
+            case Ended():
+                self._forget_process()
                 if not wanted(event):
-                    said = f"; it printed: {line}" if line else ""
-                    raise Broken(rules.STAYS, "the client to go on", f"its end with exit code {code}{said}")
+                    raise Broken(rules.STAYS, "the client to go on", str(event))
                 return True
-            case Heard(_, Alive() | Inquire()):
-                return False
-            case Heard(_, BadMessage() as error):
-                if self.runs and self.hears:
-                    raise Broken(_rule_of_unreadable(str(error)), "a message that can be read", str(error))
-                return False
-            case Heard(peer, Hello() as hello):
-                return self._take_hello(peer, hello, event, wanted)
-            case Heard(peer, message) if peer == self.peer and self.hello is not None and self.hears:
+            case Heard(_, BadMessage() as error) if self.runs:
+                raise Broken(_rule_of_unreadable(str(error)), "a message that can be read", str(error))
+            case Heard(peer, Hello() as hello) if self.runs and (self.hello is None or peer == self.peer):
+                self._take_hello(hello, is_wanted=wanted(event))
+                self.peer, self.hello, self.is_mute = peer, hello, False
+                return wanted(event)
+            case Heard(_, Hello() | Alive() | Inquire() | BadMessage()):
+                return False  # of a supervisor, of a process that was ended, or of a second worker of the same command
+            case Heard(peer, message) if peer == self.peer and self.hello is not None:
                 return self._take_message(message, event, wanted)
         return False
 
-    def _take_hello(self, peer: bytes, hello: Hello, event: Event, wanted: Callable[[Event], bool]) -> bool:
-        if not self.runs:
-            return False  # of a client that was ended
-        before = self.hello
-        if before is not None and peer != self.peer:
-            return False  # of a second worker of the same command
-        is_another = before is not None and hello.process_nonce != before.process_nonce
-        if is_another and not self.allows_another_process:
+    def _forget_process(self) -> None:
+        self.runs, self.hello, self._watch = False, None, None
+        self.may_leave, self._steps = False, 0
+
+    def _take_hello(self, hello: Hello, is_wanted: bool) -> None:
+        if self.hello is not None and hello.process_nonce != self.hello.process_nonce and not self.may_leave:
             raise Broken(rules.STAYS, "the same process, or the client's end", "the Hello of a new process under its name")
-        self.peer, self.hello, self.is_mute = peer, hello, False
-        if not self.hears:
-            return False
-        is_later = before is None or hello.attempt != before.attempt
-        if self.watch is not None and is_later and not (self.allows_hello or wanted(event)):
+        if self._watch is None:
+            return
+        if self.hello is not None and hello.attempt == self.hello.attempt:
+            self.send(self._watch.welcome)
+        elif self.may_leave or is_wanted:
+            self._watch, self.may_leave = None, False
+        else:
             raise Broken(rules.SILENT, "the client to stay in its session while the learner answers", brief(hello))
-        if self.watch is not None and is_later:
-            self.watch = None
-        if not is_later and self.watch is not None and self._welcome is not None:
-            self.send(self._welcome)
-        return wanted(event)
 
     def _take_message(
         self, message: ToLearner | Inquire | BadMessage, event: Event, wanted: Callable[[Event], bool]
     ) -> bool:
-        of_session = getattr(message, "session", None)
-        if self.watch is None and wanted(event):
+        watch = self._watch
+        if watch is None and wanted(event):
             return True
-        if self.watch is None or of_session != self.watch.session:
-            current = "none: the client is joining" if self.watch is None else str(self.watch.session)
+        if watch is None or getattr(message, "session", None) != watch.session:
+            current = "none: the client is joining" if watch is None else str(watch.session)
             raise Broken(rules.SESSION, f"session {current}", brief(message))
         assert not isinstance(message, Inquire | BadMessage), "they have no session"
-        self.watch.see(message, self.now)
-        self._steps = self.watch.steps
-        is_wanted = wanted(event)
+        watch.see(message, self.now)
+        self._steps = watch.steps
+        if isinstance(message, Heartbeat) and self.answers_heartbeats:
+            self.send(watch.reply(watch.replies + 1))
+        if wanted(event):
+            return True
         match message:
-            case Heartbeat() if self.answers_heartbeats:
-                self.reply()
             case Failure(_, error):
-                if not is_wanted:
-                    raise Broken(rules.STAYS, "the client to go on", f"Failure: {error}")
+                raise Broken(rules.STAYS, "the client to go on", f"Failure: {error}")
+            case Goodbye(_, reason) if watch.answers:
+                raise Broken(rules.STAYS, "the client to go on", f"Goodbye: {reason}")
             case Goodbye(_, reason):
-                if not is_wanted and not (self.watch.answers or self.watch.rollouts):
-                    part = f"a client that takes part in a session with a {type(self.watch.run).__name__}"
-                    raise Broken(rules.DECLINED, part, f"Goodbye: {reason}")
-                if not is_wanted:
-                    raise Broken(rules.STAYS, "the client to go on", f"Goodbye: {reason}")
-            case _:
-                pass
-        return is_wanted
+                part = f"a client that takes part in a session with a {type(watch.run).__name__}"
+                raise Broken(rules.DECLINED, part, f"Goodbye: {reason}")
+        return False
 
     def check_heartbeats(self) -> None:
         """Raise `Broken` if a Heartbeat is overdue. None is due from a client that may leave the session by itself."""
-        if self.watch is not None and self.runs and self.hears and not (self.allows_hello or self.watch.said_goodbye):
-            self.watch.late(self.now)
+        if self._watch is not None and not (self.may_leave or self._watch.said_goodbye):
+            self._watch.late(self.now)
 
     # ----------------------------------------------------------------------------------------------- parts of any check
 
-    def start(self) -> None:
-        """Start the client's process."""
-        self.effects.append(StartClient())
-        self._steps = 0
-        self.is_mute |= not self.peer
-        self.runs, self.hello, self.watch = True, None, None
-
-    def end(self) -> None:
-        """End the client's process, whatever it does."""
-        self.effects.append(EndClient())
-        self.runs, self.hello, self.watch = False, None, None
-
-    def stop(self) -> None:
-        """Send SIGTERM to the client."""
-        self.effects.append(AskToStop())
-
-    def cut(self, *, listen: bool = True) -> None:
-        """Close every connection; `listen`: and take new ones at once."""
-        self.effects.append(CutConnection())
-        if listen:
-            self.effects.append(Listen())
-        if self.watch is not None:
-            self.watch.heard_heartbeat_s = self.now + self.settings.patience_s
-
-    def listen(self) -> None:
-        """Take connections again."""
-        self.effects.append(Listen())
-
-    def expect(self, kind: type[M], rule: Rule, expected: str, *, within_s: float = 0.0, **fields: Any) -> Script[M]:
-        """The next message of this kind whose fields have these values, within `within_s` (or the patience). Or `Broken`."""
+    def expect(
+        self, kinds: type[M] | tuple[type[M], ...], rule: Rule, expected: str, *, within_s: float = 0.0, **fields: Any
+    ) -> Script[M]:
+        """The next message of these kinds whose fields have these values, within `within_s` or the patience. Or `Broken`."""
+        may_end = Goodbye in (kinds if isinstance(kinds, tuple) else (kinds,))
 
         def is_it(event: Event) -> bool:
-            if kind is Goodbye and isinstance(event, Ended):
-                return True
-            if not (isinstance(event, Heard) and isinstance(event.message, kind)):
-                return False
-            return all(getattr(event.message, name) == value for name, value in fields.items())
+            if isinstance(event, Ended):
+                return may_end
+            message = event.message
+            return isinstance(message, kinds) and all(getattr(message, name) == value for name, value in fields.items())
 
         within_s = within_s or self.settings.patience_s
         found = yield Wait(within_s, is_it)
-        if found is None:
-            raise Broken(rule, expected, f"none within {within_s:g} s")
-        if isinstance(found, Ended):
-            raise Broken(rule, expected, f"the client's end with exit code {found.code}, without Goodbye")
+        if not isinstance(found, Heard):
+            raise Broken(rule, expected, f"none within {within_s:g} s" if found is None else f"{found}, without Goodbye")
         message: M = found.message  # type: ignore[assignment]
         return message
 
-    def quiet(self, kinds: type | tuple[type, ...], for_s: float, rule: Rule, expected: str) -> Script[None]:
-        """Nothing of these kinds arrives for so long. Or `Broken`."""
-        found = yield Wait(for_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kinds))
-        if found is not None:
-            assert isinstance(found, Heard)
+    def quiet(self, kind: type, rule: Rule, expected: str, *, for_s: float = QUIET_S) -> Script[None]:
+        """Nothing of this kind arrives for so long. Or `Broken`."""
+        found = yield Wait(for_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kind))
+        if isinstance(found, Heard):
             raise Broken(rule, expected, brief(found.message))
 
-    def let_pass(self, for_s: float) -> Script[None]:
-        """Let time pass."""
-        yield Wait(for_s)
+    def left(self, rule: Rule, after: str, codes: tuple[int, ...] = (0,)) -> Script[None]:
+        """The client's process ends with one of these exit codes. Or `Broken`."""
+        within_s = self.settings.patience_s
+        found = yield Wait(within_s, lambda event: isinstance(event, Ended))
+        if not isinstance(found, Ended):
+            raise Broken(rule, f"the client's end after {after}", f"a client that still runs {within_s:g} s later")
+        if found.code not in codes:
+            raise Broken(rule, f"exit code {' or '.join(map(str, codes))} after {after}", f"exit code {found.code}")
 
     def joining(self) -> Script[Hello]:
         """A client that has said Hello and is not welcomed. It is started, or told to join again."""
-        if self.runs and self.watch is not None:
+        if self._watch is not None:
             return (yield from self.rejoin())
-        if self.runs and self.hello is not None:
+        if self.hello is not None:
             return self.hello
         return (yield from self.newly_started())
 
     def newly_started(self) -> Script[Hello]:
         """A client that has just been started, and has said its first Hello."""
         if self.runs:
-            self.end()
-        self.start()
-        started = self.settings.start_s
+            self.do(EndClient())
+        self.do(StartClient())
+        within_s = self.settings.start_s
         hello = yield from self.expect(
-            Hello, rules.HELLO, f"Hello after the start (--start-s {started:g})", within_s=started
+            Hello, rules.HELLO, f"Hello after the start (--start-s {within_s:g})", within_s=within_s
         )
         if hello.protocol != PROTOCOL_VERSION:
             raise Broken(rules.PROTOCOL, f"protocol {PROTOCOL_VERSION}", f"protocol {hello.protocol}")
@@ -341,35 +263,19 @@ class Learner:
 
     def rejoin(self) -> Script[Hello]:
         """The client is told to join again, and does so."""
+        self.send(Rejoin(self.session))
+        return (yield from self.later_hello(rules.REJOIN, "Hello with a later attempt after Rejoin"))
+
+    def later_hello(self, rule: Rule, expected: str, *, within_s: float = 0.0) -> Script[Hello]:
+        """The process stays, and leaves its session to join again."""
         before = self.hello
         assert before is not None
-        self.send(Rejoin(self.session))
-        self.allows_hello = True  # so that no Heartbeat is due
-        hello = yield from self.expect(Hello, rules.REJOIN, "Hello with a later attempt after Rejoin")
-        if hello.attempt <= before.attempt:
-            raise Broken(rules.REJOIN, f"an attempt later than {before.attempt}", f"attempt {hello.attempt}")
+        self.may_leave = True
+        hello = yield from self.expect(Hello, rule, expected, within_s=within_s)
+        if hello.process_nonce != before.process_nonce or hello.attempt <= before.attempt:
+            expected = f"an attempt later than {before.attempt}, in life {before.process_nonce}"
+            raise Broken(rule, expected, f"attempt {hello.attempt}, in life {hello.process_nonce}")
         return hello
-
-    def welcome(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
-        """Answer the newest Hello: a new session begins."""
-        assert self.hello is not None
-        self._numbers += 1
-        self._lanes, self.received, self.unlisted = {}, None, set()
-        self.answers_heartbeats, self.hears, self.allows_hello, self.allows_another_process = True, True, False, False
-        self.watch = Watch(self._numbers, run, self.now, self._steps)
-        self._welcome = Welcome(self._numbers, self.hello.attempt, run)
-        self.send(self._welcome)
-
-    def left(self, rule: Rule, codes: int | tuple[int, ...], after: str) -> Script[None]:
-        """The client's process ends with this exit code, or one of these. Or `Broken`."""
-        within_s = self.settings.patience_s
-        allowed = (codes,) if isinstance(codes, int) else codes
-        found = yield Wait(within_s, lambda event: isinstance(event, Ended))
-        if found is None:
-            raise Broken(rule, f"the client's end after {after}", f"a client that still runs {within_s:g} s later")
-        assert isinstance(found, Ended)
-        if found.code not in allowed:
-            raise Broken(rule, f"exit code {' or '.join(map(str, allowed))} after {after}", f"exit code {found.code}")
 
 
 def _rule_of_unreadable(error: str) -> Rule:

@@ -88,6 +88,9 @@ class Ended:
     last_line: str
     """the last line that it printed"""
 
+    def __str__(self) -> str:
+        return f"its end with exit code {self.code}" + (f"; it printed: {self.last_line}" if self.last_line else "")
+
 
 Event = Heard | Ended
 

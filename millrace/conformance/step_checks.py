@@ -13,9 +13,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from millrace.conformance import rules
-from millrace.conformance.join_checks import described
+from millrace.conformance.join_checks import POLE_GAINS, described, heartbeats, over_a_new_connection, time_limit
 from millrace.conformance.learner import Learner
-from millrace.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
+from millrace.conformance.script import Broken, Script, Skipped, Wait, brief
 from millrace.conformance.watch import resets_too_early
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE
@@ -24,7 +24,6 @@ from protocol.messages import (
     Call,
     Drain,
     Goodbye,
-    Heartbeat,
     LaneIncarnation,
     Release,
     Reset,
@@ -32,14 +31,12 @@ from protocol.messages import (
     Step,
     Stepped,
     Weights,
-    Welcome,
 )
 from protocol.specs import StepSpec
 from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack, unpack
 
 WALK_STEPS = 300  # steps of the walk that looks for ends of episodes
-LIMIT_STEPS = 2000  # most steps of the walk to a time limit
 APART_STEPS = 8  # in which actions that copies do not share make a difference
 LANES = 2
 
@@ -73,12 +70,12 @@ class Stepping:
         copies = range(self.spec.lanes[lane]) if copies is None else copies
         seeds = tuple(None if seed is None else seed + copy for copy in copies)
         options = np.frombuffer(pack(None), np.uint8)
-        return Reset(self.learner.session, self.learner.ticket(), lane, incarnation, tuple(copies), seeds, options)
+        return Reset(self.learner.session, next(self.learner.tickets), lane, incarnation, tuple(copies), seeds, options)
 
     def step(self, lane: int = 0, incarnation: int = 0, actions: tuple[Array, ...] | None = None) -> Step:
         """A Step with these actions, or random ones."""
         chosen = self.random_actions(self.spec.lanes[lane]) if actions is None else actions
-        return Step(self.learner.session, self.learner.ticket(), lane, incarnation, chosen)
+        return Step(self.learner.session, next(self.learner.tickets), lane, incarnation, chosen)
 
     def random_actions(self, N: int) -> tuple[Array, ...]:
         """Random actions of N copies."""
@@ -107,13 +104,16 @@ class Stepping:
         return (yield from self.learner.expect(Stepped, rules.ORDER_ANSWERED, text, ticket=order.ticket))
 
 
-def stepping(learner: Learner) -> Script[Stepping]:
-    """A new session of the environment profile."""
+def stepping(learner: Learner, *lanes: int) -> Script[Stepping]:
+    """A new session of the environment profile, in which these lanes were reset."""
     spec = yield from step_spec(learner)
     env = yield from described(learner)
     yield from learner.joining()
     learner.welcome(spec)
-    return Stepping(learner, spec, env)
+    steps = Stepping(learner, spec, env)
+    for lane in lanes:
+        yield from steps.do(steps.reset(lane))
+    return steps
 
 
 def answers_reset_and_step(learner: Learner) -> Script[None]:
@@ -129,7 +129,7 @@ def answers_reset_and_step(learner: Learner) -> Script[None]:
 def says_nothing_without_an_order(learner: Learner) -> Script[None]:
     """No Stepped before the first Reset."""
     yield from stepping(learner)
-    yield from learner.quiet(Stepped, 1.0, rules.ORDER_ONLY, "nothing before the first order of the session")
+    yield from learner.quiet(Stepped, rules.ORDER_ONLY, "nothing before the first order of the session", for_s=1.0)
 
 
 def ends_episodes(learner: Learner) -> Script[None]:
@@ -188,10 +188,8 @@ def _within(longest: int | None, length: Array, row: Stepped) -> None:
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
     """A walk to the time limit."""
+    longest = yield from time_limit(learner)
     steps = yield from stepping(learner)
-    longest = steps.env.max_episode_steps
-    if longest is None or longest > LIMIT_STEPS:
-        raise Skipped("the environment has no time limit" if longest is None else f"its time limit is {longest} steps")
     act = controller(steps)
     row = yield from steps.do(steps.reset())
     length = np.zeros(steps.spec.lanes[0], int)
@@ -215,8 +213,9 @@ def controller(steps: Stepping) -> Callable[[Stepped], tuple[Array, ...]]:
     is_pole = not more and not others and observation.shape == (4,) and action.kind == "discrete" and action.sizes == (2,)
     if not is_pole:
         return lambda row: steps.random_actions(len(row.reward))
-    gains = np.array([0.1, 0.2, 1.0, 0.6])
-    return lambda row: ((row.obs[0] @ gains > 0).astype(action.dtype) + np.asarray(action.start or 0, action.dtype),)
+    return lambda row: (
+        (row.obs[0] @ np.array(POLE_GAINS) > 0).astype(action.dtype) + np.asarray(action.start or 0, action.dtype),
+    )
 
 
 def begins_the_same_episode_for_a_seed(learner: Learner) -> Script[None]:
@@ -297,28 +296,26 @@ def ignores_an_old_order(learner: Learner) -> Script[None]:
     yield from steps.do(first)
     yield from steps.do(steps.step())
     learner.send(first)
-    yield from learner.quiet(Stepped, 0.7, rules.ORDER_OLD, f"no answer to ticket {first.ticket} after a newer one")
+    yield from learner.quiet(Stepped, rules.ORDER_OLD, f"no answer to ticket {first.ticket} after a newer one")
     yield from steps.do(steps.step())
 
 
 def ignores_another_session(learner: Learner) -> Script[None]:
     """Orders of the session before. Its steps still count."""
-    old = yield from stepping(learner)
+    old = yield from stepping(learner, 0)
     before = learner.session
-    yield from old.do(old.reset())
     yield from old.do(old.step())
     for _ in range(4):  # some may have been on their way
-        heartbeat = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+        heartbeat = yield from heartbeats(learner, 1)
         if heartbeat.steps:
             break
     else:
         raise Broken(rules.HEARTBEAT_STEPS, "steps above 0 after a Step", "0")
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     learner.send(replace(steps.step(), session=before))
-    yield from learner.quiet(Stepped, 0.7, rules.OTHER_SESSION, "no answer to an order of the session before")
+    yield from learner.quiet(Stepped, rules.OTHER_SESSION, "no answer to an order of the session before")
     yield from steps.do(steps.step())
-    yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from heartbeats(learner, 1)
 
 
 def serves_two_lanes(learner: Learner) -> Script[None]:
@@ -339,13 +336,12 @@ def serves_two_lanes(learner: Learner) -> Script[None]:
 
 def starts_a_lane_again(learner: Learner) -> Script[None]:
     """A higher incarnation, then an order of the lower one."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     yield from steps.do(steps.step())
     yield from steps.do(steps.reset(incarnation=2))
     yield from steps.do(steps.step(incarnation=2))
     learner.send(steps.step(incarnation=1))
-    yield from learner.quiet(Stepped, 0.7, rules.INCARNATION, "no answer to an order of incarnation 1 after one of 2")
+    yield from learner.quiet(Stepped, rules.INCARNATION, "no answer to an order of incarnation 1 after one of 2")
     yield from steps.do(steps.step(incarnation=2))
 
 
@@ -366,11 +362,10 @@ def resets_some_copies(learner: Learner) -> Script[None]:
 
 def answers_calls(learner: Learner) -> Script[None]:
     """A Call of an attribute that every gymnasium environment has, and of two that none has."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     for name in ("render_mode", "no_such_attribute_anywhere", "…" * MAX_LINE):
         given = np.frombuffer(pack(((), {})), np.uint8)
-        call = Call(learner.session, learner.ticket(), 0, 0, (0,), name, False, given)
+        call = Call(learner.session, next(learner.tickets), 0, 0, (0,), name, False, given)
         learner.send(call)
         found = yield from learner.expect(Returned, rules.RETURNED, f"Returned for ticket {call.ticket}", ticket=call.ticket)
         if found.error:
@@ -383,8 +378,7 @@ def answers_calls(learner: Learner) -> Script[None]:
 
 def beats_while_it_steps(learner: Learner) -> Script[None]:
     """Orders follow each other without a pause; the watch counts heartbeats meanwhile."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     until_s = learner.now + 2 * 1.5 + 8 * learner.settings.heartbeat_s
     while learner.now < until_s:
         yield from steps.do(steps.step())
@@ -392,25 +386,19 @@ def beats_while_it_steps(learner: Learner) -> Script[None]:
 
 def lists_its_tickets(learner: Learner) -> Script[None]:
     """Heartbeats after answers: nothing is held any more."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
-    for _ in range(3):
-        found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from stepping(learner, 0)
+    found = yield from heartbeats(learner, 3)
     if found.tickets:
         raise Broken(rules.HEARTBEAT_TICKETS, "no tickets while no order is open", f"{list(found.tickets)}")
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
     """A lane goes to another worker, and comes back later."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset(0))
-    yield from steps.do(steps.reset(1))
+    steps = yield from stepping(learner, 0, 1)
     learner.send(steps.step(0))  # it may be answered or not
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
-    learner.release(0)
-    yield from learner.let_pass(0.3)
-    for _ in range(3):
-        found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield Wait(0.3)
+    found = yield from heartbeats(learner, 3)
     if found.tickets:
         raise Broken(rules.RELEASE, "no tickets of the released lane", f"{list(found.tickets)}")
     yield from steps.do(steps.step(1))
@@ -420,28 +408,20 @@ def releases_a_lane(learner: Learner) -> Script[None]:
 
 def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
     """A Release was lost; the next HeartbeatReply does not list the lane."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset(0))
-    yield from steps.do(steps.reset(1))
-    learner.unlisted.add(0)
-    for _ in range(3):
-        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
-    learner.unlisted.clear()
+    steps = yield from stepping(learner, 0, 1)
+    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
+    yield from heartbeats(learner, 3)
     yield from steps.do(steps.step(1))
     yield from steps.do(steps.reset(0, incarnation=1))
 
 
 def answers_after_a_reset_connection(learner: Learner) -> Script[None]:
     """The connection is cut while an order is open."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     order = steps.step()
     learner.send(order)
-    learner.cut()
-    heard = yield Wait(10, lambda event: isinstance(event, Heard) and isinstance(event.message, Heartbeat | Stepped))
-    if heard is None:
-        raise Broken(rules.CONNECTION, "the client over a new connection, in the same session", "nothing within 10 s")
-    if not (isinstance(heard, Heard) and isinstance(heard.message, Stepped)):
+    yield from over_a_new_connection(learner, Stepped)
+    if order.ticket not in learner.watch.answers:
         learner.send(order)
         yield from steps.answer(order)
     yield from steps.do(steps.step())
@@ -449,8 +429,7 @@ def answers_after_a_reset_connection(learner: Learner) -> Script[None]:
 
 def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
     """An unknown type, an extra field, a missing frame, bytes that are no msgpack."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     order = steps.step()
     head = msgpack.unpackb(bytes(encode(order)[0]))
     arrays = list(encode(order)[1:])
@@ -466,14 +445,13 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
         [b"\xc1"],
         [b""],
     )
-    yield from learner.quiet(Stepped, 0.7, rules.IGNORE_UNREADABLE, "no answer to what cannot be read")
+    yield from learner.quiet(Stepped, rules.IGNORE_UNREADABLE, "no answer to what cannot be read")
     yield from steps.do(steps.step())
 
 
 def reads_long_messages(learner: Learner) -> Script[None]:
     """A Release with as many lanes as a head holds, and a frame of 8 MiB."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     learner.send(Release(learner.session, tuple(LaneIncarnation(1000 + lane, 0) for lane in range(60_000))))
     learner.send(Weights(1, np.zeros(1 << 21, np.float32), np.zeros(0, np.float32)))
     yield from steps.do(steps.step())
@@ -487,8 +465,7 @@ def takes_a_late_welcome(learner: Learner) -> Script[None]:
     rows = yield from steps.walk(expected)
     yield from steps.do(steps.reset(seed=9))
     yield from steps.do(steps.step(actions=expected[0]))
-    assert learner.hello is not None
-    learner.send(Welcome(learner.session, learner.hello.attempt, steps.spec))
+    learner.send(learner.watch.welcome)
     found = yield from steps.do(steps.step(actions=expected[1]))
     if not _same(found, rows[1]):
         raise Broken(rules.REPEATED_WELCOME, "the episode to go on after a repeated Welcome", "another observation")
@@ -496,28 +473,16 @@ def takes_a_late_welcome(learner: Learner) -> Script[None]:
 
 def drains_while_it_steps(learner: Learner) -> Script[None]:
     """Drain follows an order at once."""
-    steps = yield from stepping(learner)
-    yield from steps.do(steps.reset())
+    steps = yield from stepping(learner, 0)
     order = steps.step()
     learner.send(order)
     learner.send(Drain("the run is over"))
-    answered = False
-    while True:
-        found = yield Wait(
-            learner.settings.patience_s,
-            lambda event: isinstance(event, Heard) and isinstance(event.message, Stepped | Goodbye),
-        )
-        if found is None:
-            raise Broken(rules.DRAIN, "Goodbye after Drain", f"none within {learner.settings.patience_s:g} s")
-        assert isinstance(found, Heard)
-        if isinstance(found.message, Goodbye):
-            break
-        answered = True
-    listed = order.ticket in found.message.tickets
-    if listed == answered:
+    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain")
+    listed = order.ticket in goodbye.tickets
+    if listed == (order.ticket in learner.watch.answers):
         raise Broken(
             rules.DRAIN,
             f"ticket {order.ticket} either answered before Goodbye or listed in it",
             "both" if listed else "neither",
         )
-    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")
+    yield from learner.left(rules.DRAIN, "Drain and Goodbye")

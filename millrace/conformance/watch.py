@@ -17,6 +17,7 @@ from millrace.conformance.rules import Rule
 from millrace.conformance.script import Broken, brief
 from protocol.errors import BadRollout
 from protocol.messages import (
+    Answer,
     Call,
     Collect,
     Described,
@@ -26,7 +27,10 @@ from protocol.messages import (
     Goodbye,
     Heartbeat,
     HeartbeatReply,
+    Order,
     Permit,
+    Received,
+    Release,
     Reset,
     Returned,
     Rollout,
@@ -35,6 +39,7 @@ from protocol.messages import (
     ToLearner,
     ToWorker,
     Weights,
+    Welcome,
 )
 from protocol.rollout import validate
 from protocol.rows.stepped import wrong_rows
@@ -56,62 +61,80 @@ class Dealt(NamedTuple):
 class Watch:
     """One session, as the learner sees it."""
 
-    def __init__(self, session: int, run: DescribeSpec | RunSpec | StepSpec, now: float, steps: int = 0) -> None:
+    def __init__(self, welcome: Welcome, now: float, steps: int = 0) -> None:
         """`steps`: env steps that the process has reported in earlier sessions."""
-        self.session, self.run = session, run
+        self.welcome = welcome
+        self.session, self.run = welcome.session, welcome.run
         self.heard_heartbeat_s = now
         self.heartbeat: Heartbeat | None = None
         """the newest"""
         self.replies = 0
         """number of the last HeartbeatReply sent"""
+        self.confirms = True
+        """False: the learner says of no rollout that it has arrived"""
         self.versions: dict[int, Weights] = {}
         """the weights sent, by version"""
-        self.orders: dict[int, Reset | Step | Call | Evaluate] = {}
+        self.orders: dict[int, Order | Evaluate] = {}
         """by ticket"""
         self.permits: dict[int, Dealt] = {}
         """by ticket"""
-        self.answers: dict[int, Stepped | Returned] = {}
-        """the first answer to each order, by ticket"""
-        self.rollouts: dict[int, Rollout] = {}
-        """the first rollout of each ticket"""
+        self.answers: dict[int, Answer | Rollout] = {}
+        """the first answer to each order, and the first rollout of each permit, by ticket"""
         self.said_goodbye = False
+        self._description: Described | None = None
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
-        self._incarnations: dict[int, int] = {}  # the highest dealt, by lane
-        self._outdated = set[int]()  # tickets that were dealt for a lower one
+        self._lanes: dict[int, int] = {}  # the client's lanes, each in its highest incarnation
         self._asked, self._answered = Counter[int](), Counter[int]()
         self._next_sequence: dict[tuple[int, int], int] = {}
         self._rows: dict[tuple[int, int], LaneRows] = {}
         self.steps = steps
         """the most that a Heartbeat has reported"""
 
-    # ------------------------------------------------------------------------------------------ what the learner said
+    # ------------------------------------------------------------------------------------------ what the learner says
 
     def sent(self, message: ToWorker) -> None:
-        """The learner has sent this message."""
+        """The learner has sent this message, which may be lost."""
         match message:
             case Weights(version):
                 self.versions[version] = message
             case Reset() | Step() | Call() | Evaluate() if message.session != self.session:
                 self._ignored[message.ticket] = OTHER_SESSION
-            case Reset() | Step() | Call() | Evaluate():
+            case Evaluate():
                 self.orders[message.ticket] = message
-                self._asked[message.ticket] += 1
+            case Reset() | Step() | Call():
+                self.orders[message.ticket] = message
+                self._asks(message)
             case Collect(session, _, permits) if session != self.session:
                 self._ignored |= {permit.ticket: OTHER_SESSION for permit in permits}
             case Collect(_, version, permits):
                 for permit in permits:
-                    newest = max(permit.incarnation, self._incarnations.get(permit.lane, 0))
-                    self._incarnations[permit.lane] = newest
-                    if permit.incarnation < newest:
-                        self._outdated.add(permit.ticket)
                     self.permits[permit.ticket] = Dealt(permit, version)
-                    self._asked[permit.ticket] += 1
+                    self._asks(permit)
+            case Release(session, lanes) if session == self.session:
+                for lane in lanes:
+                    self._lanes.pop(lane.lane, None)
             case HeartbeatReply(session, number) if session == self.session:
                 self.replies = max(self.replies, number)
+
+    def _asks(self, order: Order | Permit) -> None:
+        self._asked[order.ticket] += 1
+        newest = self._lanes[order.lane] = max(order.incarnation, self._lanes.get(order.lane, 0))
+        if order.incarnation < newest:
+            why = f"it is of incarnation {order.incarnation}, its lane is in {newest}"
+            self._ignored[order.ticket] = rules.INCARNATION, why
 
     def unreadable(self, ticket: int) -> None:
         """The learner sends this ticket in messages that cannot be read."""
         self._ignored[ticket] = UNREADABLE
+
+    def received(self) -> tuple[Received, ...]:
+        """What the learner says of each lane of the client: the rollouts that have arrived."""
+        arrived = self._next_sequence if self.confirms else {}
+        return tuple(Received(*place, arrived.get(place, 0)) for place in sorted(self._lanes.items()))
+
+    def reply(self, number: int) -> HeartbeatReply:
+        """The HeartbeatReply with this number."""
+        return HeartbeatReply(self.session, number, self.received())
 
     # --------------------------------------------------------------------------------------------- what the client says
 
@@ -136,10 +159,18 @@ class Watch:
                 raise Broken(
                     rules.DESCRIBE, f"Described only with a DescribeSpec, not a {type(self.run).__name__}", brief(message)
                 )
-            case Stepped() | Returned():
-                self._see_answer(message)
-            case Rollout():
-                self._see_rollout(message)
+            case Described():
+                first = self._description = self._description or message
+                if repr(message.description) != repr(first.description):
+                    raise Broken(rules.DESCRIBE_AGAIN, "the same description again", "another")
+            case Stepped() | Returned() | Rollout():
+                if message.ticket in self._ignored:
+                    rule, why = self._ignored[message.ticket]
+                    raise Broken(rule, f"ticket {message.ticket} to be ignored: {why}", brief(message))
+                if isinstance(message, Rollout):
+                    self._see_rollout(message)
+                else:
+                    self._see_answer(message)
             case Evaluated() | EpisodeRows():
                 if not isinstance(self.orders.get(message.ticket), Evaluate):
                     raise Broken(rules.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
@@ -177,75 +208,53 @@ class Watch:
                 f"tickets of this session{f', among {sorted(known)[-5:]}' if known else ', which has none yet'}",
                 f"ticket {strange[0]}",
             )
-        if finished := [ticket for ticket in tickets if ticket in self.answers or ticket in self.rollouts]:
+        if finished := [ticket for ticket in tickets if ticket in self.answers]:
             raise Broken(
                 rules.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
             )
 
-    def _see_ignored(self, message: Stepped | Returned | Rollout) -> None:
-        if message.ticket in self._ignored:
-            rule, why = self._ignored[message.ticket]
-            raise Broken(rule, f"ticket {message.ticket} to be ignored: {why}", brief(message))
-
-    def _see_answer(self, message: Stepped | Returned) -> None:
-        self._see_ignored(message)
+    def _see_answer(self, message: Answer) -> None:
         order = self.orders.get(message.ticket)
         if order is None or isinstance(order, Evaluate):
             last = f"ticket {max(self.orders)} was the last order" if self.orders else "no order was sent in this session"
             raise Broken(rules.ORDER_ONLY, f"no answer without an order ({last})", brief(message))
         if isinstance(order, Call) != isinstance(message, Returned):
             raise Broken(rules.ORDER_ANSWERED, f"the answer to a {type(order).__name__}", brief(message))
-        if message.lane != order.lane:
-            raise Broken(
-                rules.LANES, f"lane {order.lane}, as in the order with ticket {order.ticket}", f"lane {message.lane}"
-            )
+        self._see_lane(message, order)
         if message.incarnation != order.incarnation:
             raise Broken(
                 rules.INCARNATION, f"incarnation {order.incarnation}, as in the order", f"incarnation {message.incarnation}"
             )
-        self._answered[message.ticket] += 1
-        if self._answered[message.ticket] > self._asked[message.ticket]:
-            raise Broken(
-                rules.ORDER_ONLY,
-                f"{self._asked[message.ticket]} answer to ticket {message.ticket}, which was sent as often",
-                f"{self._answered[message.ticket]} answers",
-            )
         if isinstance(message, Stepped):
             assert isinstance(self.run, StepSpec)
             check_stepped(message, self.run)
-        first = self.answers.setdefault(message.ticket, message)
-        if first is not message and isinstance(first, Stepped) and isinstance(message, Stepped):
-            for name in ("reward", "terminated", "truncated"):
-                if getattr(first, name).tobytes() != getattr(message, name).tobytes():
-                    raise Broken(
-                        rules.ORDER_ONCE,
-                        f"the {name} of the first answer to ticket {message.ticket}, {getattr(first, name).tolist()}",
-                        f"{getattr(message, name).tolist()}",
-                    )
-            if any(one.tobytes() != other.tobytes() for one, other in zip(first.obs, message.obs, strict=True)):
-                raise Broken(
-                    rules.ORDER_ONCE, f"the same observations as in the first answer to ticket {message.ticket}", "others"
-                )
+        self._is_first(message, rules.ORDER_ONLY, rules.ORDER_ONCE)
+
+    def _see_lane(self, message: Answer | Rollout, order: Order | Permit) -> None:
+        if message.lane != order.lane:
+            expected = f"lane {order.lane}, as in the {type(order).__name__} with ticket {order.ticket}"
+            raise Broken(rules.LANES, expected, f"lane {message.lane}")
+
+    def _is_first(self, message: Answer | Rollout, too_often: Rule, differs: Rule) -> bool:
+        """Whether its ticket was not answered before. The rules: for too many answers, and for one that differs."""
+        ticket = message.ticket
+        self._answered[ticket] += 1
+        asked, answered = self._asked[ticket], self._answered[ticket]
+        if answered > asked:
+            raise Broken(too_often, f"answers to ticket {ticket} as often as it was sent: {asked}", f"{answered} answers")
+        first = self.answers.setdefault(ticket, message)
+        if first is not message and (wrong := fields_that_differ(first, message)):
+            raise Broken(differs, f"the same answer to ticket {ticket} again", f"another {', '.join(wrong)}")
+        return first is message
 
     def _see_rollout(self, message: Rollout) -> None:
-        self._see_ignored(message)
         if not isinstance(self.run, RunSpec):
             raise Broken(rules.TICKETS, "no rollout in a session whose copies are stepped on order", brief(message))
         dealt = self.permits.get(message.ticket)
         if dealt is None:
             raise Broken(rules.TICKETS, f"a ticket that was dealt: {sorted(self.permits) or 'none yet'}", brief(message))
         permit, version = dealt
-        if message.lane != permit.lane:
-            raise Broken(
-                rules.LANES, f"lane {permit.lane}, as in the permit with ticket {permit.ticket}", f"lane {message.lane}"
-            )
-        if message.ticket in self._outdated:
-            newest = self._incarnations[message.lane]
-            raise Broken(
-                rules.INCARNATION,
-                f"ticket {message.ticket} to be ignored: it is of incarnation {permit.incarnation}, its lane is in {newest}",
-                brief(message),
-            )
+        self._see_lane(message, permit)
         if message.version != version:
             raise Broken(
                 rules.VERSION,
@@ -254,17 +263,7 @@ class Watch:
             )
         if version not in self.versions:
             raise Broken(rules.VERSION, f"no rollout before the Weights of version {version}", brief(message))
-        self._answered[message.ticket] += 1
-        first = self.rollouts.setdefault(message.ticket, message)
-        if first is not message:
-            if self._answered[message.ticket] > self._asked[message.ticket]:
-                raise Broken(
-                    rules.ROLLOUT_ONCE,
-                    f"{self._asked[message.ticket]} rollout of ticket {message.ticket}, which was dealt as often",
-                    f"{self._answered[message.ticket]} rollouts",
-                )
-            if first.sequence != message.sequence or not same_arrays(first, message):
-                raise Broken(rules.ROLLOUT_ONCE, f"the same rollout of ticket {message.ticket} again", "another")
+        if not self._is_first(message, rules.ROLLOUT_ONCE, rules.ROLLOUT_ONCE):
             return
         if message.sequence != permit.sequence:
             raise Broken(
@@ -289,10 +288,18 @@ class Watch:
         rows.see(message, self.versions[message.version])
 
 
-def same_arrays(one: Rollout, other: Rollout) -> bool:
-    """Whether two rollouts have the same bits."""
-    arrays = [(*each.obs, each.action, each.log_prob, each.reward, each.terminated, each.truncated) for each in (one, other)]
-    return all(a.tobytes() == b.tobytes() for a, b in zip(*arrays, strict=True)) and one.episodes == other.episodes
+def fields_that_differ(one: Answer | Rollout, other: Answer | Rollout) -> list[str]:
+    """Names of the fields of two messages that have not the same bits."""
+    return [name for name in one.__struct_fields__ if _bits(getattr(one, name)) != _bits(getattr(other, name))]
+
+
+def _bits(value: object) -> object:
+    match value:
+        case np.ndarray():
+            return value.dtype, value.shape, value.tobytes()
+        case tuple():
+            return [_bits(each) for each in value]
+    return value
 
 
 def check_stepped(message: Stepped, spec: StepSpec) -> None:

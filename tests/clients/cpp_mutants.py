@@ -259,7 +259,7 @@ MUTANTS = [
         "    held.kept",
         "    send_rollout(*rollout), send_rollout(*rollout);\n"
         "    held.kept",
-        "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 rollouts",
+        "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 answers",
     ),
     Mutant(
         "ignores a repeated ticket", "rollouts.hpp",

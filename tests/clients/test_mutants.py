@@ -41,7 +41,7 @@ MUTANTS = [
     Mutant("lane not owned", "collector", "collects rollouts", rules.LANES, "lane 1"),
     Mutant("missing truncated", "environment", "truncates an episode", rules.TRUNCATED, "no end after 500 steps"),
     Mutant("missing truncated in rollouts", "collector", "truncates an episode", rules.ROWS, "valid: expected"),
-    Mutant("repeated rollout", "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 rollouts"),
+    Mutant("repeated rollout", "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 answers"),
     Mutant("wrong episode return", "collector", "keeps the row format", rules.EPISODES, ""),
     Mutant("wrong log-probabilities", "collector", "collects rollouts", rules.LOG_PROB, "-0."),
     Mutant("every row valid", "collector", "keeps the row format", rules.ROWS, "valid: expected False"),

@@ -80,7 +80,7 @@ def waits_for_ever(learner: Learner) -> Script[None]:
 def in_a_session(learner: Learner) -> Script[None]:
     yield from learner.newly_started()
     learner.welcome(describe_spec(learner))
-    yield from learner.let_pass(30.0)
+    yield Wait(30.0)
 
 
 def run(test: Examiner, until_s: float, step_s: float = 0.1) -> list[Effect]:
@@ -126,7 +126,7 @@ def sends_what_cannot_be_read(learner: Learner) -> Script[None]:
     yield from learner.newly_started()
     learner.welcome(describe_spec(learner))
     learner.send_unreadable(7, [b"\xc1"])
-    yield from learner.let_pass(30.0)
+    yield Wait(30.0)
 
 
 def welcomed(script: Callable[[Learner], Script[None]] = in_a_session) -> tuple[Examiner, int]:
@@ -209,7 +209,7 @@ def test_a_client_may_end_at_once_when_it_is_refused() -> None:
 
 def watch_of(*versions: int) -> Watch:
     """The watch over a session in which these weights were sent."""
-    watch = Watch(1, run_spec(), 0.0)
+    watch = Watch(Welcome(1, 71, run_spec()), 0.0)
     for version in versions:
         watch.sent(Weights(version, np.zeros(1, np.float32), np.zeros(0, np.float32)))
     return watch
@@ -259,7 +259,7 @@ def test_last_words_of_a_process_that_was_ended_do_not_count_for_the_next() -> N
     def starts_again(learner: Learner) -> Script[None]:
         yield from learner.newly_started()
         learner.welcome(run_spec())
-        yield from learner.let_pass(0.5)
+        yield Wait(0.5)
         yield from learner.newly_started()
 
     test, session = welcomed(starts_again)
