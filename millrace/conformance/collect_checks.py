@@ -98,7 +98,9 @@ class Collecting:
         yield Wait(self.rollout_s / 5)
 
     def rollout(self, permit: Permit, rule: Rule = rules.TICKETS) -> Script[Rollout]:
-        """The rollout of a permit that was dealt. If none comes, this rule is broken."""
+        """The rollout of a permit that was dealt, or has come already. If none comes, this rule is broken."""
+        if isinstance(found := self.learner.watch.answers.get(permit.ticket), Rollout):
+            return found
         text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
         within_s = 2 * self.learner.settings.patience_s
         return (yield from self.learner.expect(Rollout, rule, text, within_s=within_s, ticket=permit.ticket))
@@ -137,11 +139,7 @@ def run_spec(learner: Learner, steps: int = STEPS, net: tuple[int, ...] = NET) -
     )
 
 
-def collecting(
-    learner: Learner,
-    steps: int = STEPS,
-    net: tuple[int, ...] = NET,
-) -> Script[Collecting]:
+def collecting(learner: Learner, steps: int = STEPS, net: tuple[int, ...] = NET) -> Script[Collecting]:
     """A new session of the collector profile."""
     run = yield from run_spec(learner, steps, net)
     yield from learner.joining()
@@ -320,8 +318,7 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
     for version in range(2, 20):  # their orders were lost
         session.give(session.weights(version))
         yield Wait(session.rollout_s / 10)
-    if permit.ticket not in learner.watch.answers:
-        yield from session.rollout(permit)
+    yield from session.rollout(permit)
     yield from session.collect(version=version)
 
 
@@ -375,14 +372,11 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     permits = [session.permit(0), session.permit(1), session.permit(0)]
     session.deal(*permits)
-    waiting = {permit.ticket for permit in permits}
-    first: dict[int, Rollout] = {}  # of each lane
-    while waiting:
-        text = f"rollouts of tickets {sorted(waiting)}"
-        found = yield from learner.expect(Rollout, rules.TICKETS, text, within_s=2 * learner.settings.patience_s)
-        waiting.discard(found.ticket)
-        first.setdefault(found.lane, found)
-    if _repeats(first[0], first[1]):
+    rollouts: list[Rollout] = []
+    for permit in permits:
+        rollout = yield from session.rollout(permit)
+        rollouts.append(rollout)
+    if _repeats(*rollouts[:2]):
         got = f"the same observations and actions in lane 1 as in lane 0, for {STEPS} steps"
         raise Broken(rules.INDEPENDENT, "lanes that differ", got)
 
@@ -590,13 +584,10 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     learner.send(Drain("the run is over"))
     early = set(learner.watch.answers)
     within_s = 2 * learner.settings.patience_s
-    while True:
-        found = yield from learner.expect((Rollout, Goodbye), rules.DRAIN, "Goodbye after Drain", within_s=within_s)
-        if isinstance(found, Goodbye):
-            break
+    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain", within_s=within_s)
     arrived = learner.watch.answers.keys()
     unfinished = {permit.ticket for permit in (*permits, waits)} - arrived
-    if (listed := set(found.tickets)) != unfinished:
+    if (listed := set(goodbye.tickets)) != unfinished:
         raise Broken(rules.DRAIN, f"Goodbye with the unfinished tickets {sorted(unfinished)}", f"{sorted(listed)}")
     if (late := len(arrived - early)) > 1:
         raise Broken(rules.DRAIN, "no new rollout after Drain: at most the one in progress", f"{late} rollouts")

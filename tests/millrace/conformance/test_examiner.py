@@ -39,18 +39,26 @@ from protocol.messages import (
     Goodbye,
     Heartbeat,
     Hello,
+    LaneIncarnation,
     Permit,
+    Received,
+    Release,
     Rollout,
+    Step,
     Stepped,
     Weights,
     Welcome,
 )
-from protocol.specs import Leaf, StepSpec
+from protocol.specs import DescribeSpec, Leaf, StepSpec
 from protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
 from tests.support.fake_ends import fake_rollout, run_spec
 
 SETTINGS = Settings(EnvSpec("CartPole-v1"))
+STEPPED = StepSpec((EnvSpec("own"),), (0, 0), (2,), (Leaf("", "multibinary", (), "int8"),), ())
+STEPPED_ANSWER = Stepped(
+    1, 7, 0, 0, (np.ones(2, np.int8),), np.zeros(2), np.zeros(2, bool), np.zeros(2, bool), np.zeros(0, np.uint8)
+)
 HELLO = Hello(PROTOCOL_VERSION, "w", "host", 1, 70, "test", 71)
 
 
@@ -255,6 +263,50 @@ def test_a_rollout_does_not_come_before_an_earlier_one_of_its_lane() -> None:
     assert (broken.value.rule, broken.value.got) == (rules.IN_ORDER, "sequence 1")
 
 
+def test_a_permit_of_a_lower_incarnation_is_not_answered() -> None:
+    watch = watch_of(3)
+    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 0, 1, 0)), ()))
+    with pytest.raises(Broken) as broken:
+        watch.see(fake_rollout(1, 0, 8, 3, 0), 0.1)
+    assert broken.value.rule is rules.INCARNATION
+
+
+def test_a_lane_is_listed_with_what_has_arrived_until_it_is_released() -> None:
+    watch = watch_of(3)
+    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 1, 0, 0)), ()))
+    watch._next_sequence[0, 2] = 1
+    assert watch.received() == (Received(0, 2, 1), Received(1, 0, 0))
+    watch.confirms = False
+    assert watch.received() == (Received(0, 2, 0), Received(1, 0, 0))
+    watch.sent(Release(5, (LaneIncarnation(0, 2),)))  # of another session
+    assert len(watch.received()) == 2
+    watch.sent(Release(1, (LaneIncarnation(0, 2),)))
+    assert watch.received() == (Received(1, 0, 0),)
+
+
+def test_an_answer_that_is_sent_again_is_the_same() -> None:
+    watch = Watch(Welcome(1, 71, STEPPED), 0.0)
+    order = Step(1, 7, 0, 0, ())
+    for _ in range(3):
+        watch.sent(order)
+    watch.see(STEPPED_ANSWER, 0.1)
+    watch.see(msgspec.structs.replace(STEPPED_ANSWER, reward=np.zeros(2)), 0.2)
+    with pytest.raises(Broken) as broken:
+        watch.see(msgspec.structs.replace(STEPPED_ANSWER, infos=np.ones(1, np.uint8)), 0.3)
+    assert (broken.value.rule, broken.value.got) == (rules.ORDER_ONCE, "another infos")
+
+
+def test_a_description_that_is_sent_again_is_the_same() -> None:
+    watch = Watch(Welcome(1, 71, DescribeSpec(EnvSpec("own"))), 0.0)
+    description: Any
+    for description in ("one", "one"):
+        watch.see(Described(1, description), 0.1)
+    description = "other"
+    with pytest.raises(Broken) as broken:
+        watch.see(Described(1, description), 0.2)
+    assert broken.value.rule is rules.DESCRIBE_AGAIN
+
+
 def test_last_words_of_a_process_that_was_ended_do_not_count_for_the_next() -> None:
     def starts_again(learner: Learner) -> Script[None]:
         yield from learner.newly_started()
@@ -334,11 +386,8 @@ def test_no_two_checks_of_a_profile_have_one_name() -> None:
 def test_results_of_a_step_have_the_arrays_of_their_lane_and_values_of_their_spaces(
     changed: dict[str, Any], rule: Rule, got: str
 ) -> None:
-    spec = StepSpec((EnvSpec("own"),), (0, 0), (2,), (Leaf("", "multibinary", (), "int8"),), ())
-    flags, infos = np.zeros(2, bool), np.zeros(0, np.uint8)
-    right = Stepped(1, 1, 0, 0, (np.ones(2, np.int8),), np.zeros(2), flags, flags, infos)
-    check_stepped(right, spec)
+    check_stepped(STEPPED_ANSWER, STEPPED)
     with pytest.raises(Broken) as broken:
-        check_stepped(msgspec.structs.replace(right, **changed), spec)
+        check_stepped(msgspec.structs.replace(STEPPED_ANSWER, **changed), STEPPED)
     assert broken.value.rule is rule
     assert got in broken.value.got
