@@ -79,7 +79,7 @@ def play(max_lag: int, seconds: float) -> Played:
         coordinator.receive(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", n + 1, n, "simulated", n + 1), now)
     publish(0)
     while now < seconds:
-        if not busy[LANES] and (taken := coordinator.take()):
+        if not busy[LANES] and (taken := coordinator.rollouts.take()):
             lags += [coordinator.version - each.rollout.version for each in taken]
             begin(LANES, UPDATE_S, coordinator.version)
         for lane in range(LANES):
@@ -90,7 +90,7 @@ def play(max_lag: int, seconds: float) -> Played:
         if row == LANES:
             publish(coordinator.version + 1)
             continue
-        owner = coordinator.lanes[row].owner
+        owner = coordinator.rollouts.lanes[row].owner
         assert owner is not None
         ticket, version = tickets[row].pop(0)
         filled = msgspec.structs.replace(

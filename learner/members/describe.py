@@ -65,7 +65,7 @@ def described_by_workers(
     callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), lambda event: None)
     server_settings = ServerSettings(log_joins=False)
     server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)
-    began_s = member_s = logged_s = clock()
+    began_s = logged_s = clock()
     try:
         while coordinator.described is None:
             server.listen(POLL_S)
@@ -73,10 +73,7 @@ def described_by_workers(
             if coordinator.failure is not None:
                 raise coordinator.failure
             now = clock()
-            if members:
-                member_s = now
-            if now - member_s > settings.no_workers_timeout_s:
-                raise server.no_workers(1, settings.no_workers_timeout_s)
+            server.check_members(settings.no_workers_timeout_s)
             waiting_for = _waiting_for(link, server, sorted(member.hello.worker for member in members.values()))
             # In environment code, a worker is ended by the timeouts of the calls, which name themselves.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)

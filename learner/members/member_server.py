@@ -101,6 +101,7 @@ class MemberServer:
         self._log, self._keys = MemberLog(link, clock), KeyRevocation(link)
         self._remove_silent_from_s = self.listened_s
         self._ask_processes_s = self.listened_s
+        self._no_members_since_s = math.inf
         self._last_turned_away = ""  # what became of the last worker that did not stay
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
         self._joins = JoinLimiter()
@@ -163,6 +164,16 @@ class MemberServer:
             if self._clock() > deadline_s:
                 raise self.no_workers(workers, timeout_s)
             turn()
+
+    def check_members(self, timeout_s: float) -> None:
+        """Raise `NoWorkers` if every call for `timeout_s` has found no worker. Call it after each turn of a wait."""
+        now = self._clock()
+        if self._membership.members:
+            self._no_members_since_s = math.inf
+            return
+        self._no_members_since_s = min(self._no_members_since_s, now)
+        if now - self._no_members_since_s > timeout_s:
+            raise self.no_workers(1, timeout_s)
 
     def wait_until_all_left(self, deadline_s: float, poll_s: float) -> None:
         """Listen until no member is left, at most until the deadline. Silent workers are not removed."""

@@ -121,7 +121,10 @@ class Member:
         return activity.env_calls > (0 if before is None else before.env_calls)
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
-        """Keep the heartbeat. Returns the tickets that were lost on the way."""
+        """Keep the heartbeat. Returns the tickets that were lost on the way.
+
+        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
+        """
         if self.heartbeat is None and not self.hello.is_first_attempt:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
@@ -130,7 +133,8 @@ class Member:
         if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
             self.steps_per_s = max(0, heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
             self.measured = heartbeat.steps, self.heard_s
-        return self.lost_on_the_way(heartbeat, self.tickets)
+        held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
+        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and seen > sent_at]
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
         """The late actions since the last heartbeat. Those before this session belong to an earlier one.
@@ -143,14 +147,6 @@ class Member:
             before = 0 if self.hello.is_first_attempt else heartbeat.late_actions
         more = heartbeat.late_actions - before
         return more if 0 <= more <= MAX_LATE_ACTIONS else 0
-
-    def lost_on_the_way(self, heartbeat: Heartbeat, sent: Mapping[int, int]) -> list[int]:
-        """Those of the tickets in `sent` that were lost; for each, it has the value of `replies` when it was last sent.
-
-        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
-        """
-        held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
-        return [ticket for ticket, sent_at in sent.items() if ticket not in held and seen > sent_at]
 
     def stages(self) -> Stages:
         """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session."""

@@ -99,11 +99,11 @@ class RolloutService:
 
     def lag_histogram(self) -> dict[str, int]:
         """Number of rollouts that were used, by lag, since this learner started."""
-        return self._hub.lag_histogram()
+        return self._hub.weight_age.histogram()
 
     def first_use_s(self) -> dict[str, float]:
         """For each worker: median seconds from publishing weights to the arrival of its first rollout under them."""
-        return self._hub.first_use_s()
+        return self._hub.weight_age.first_use_s()
 
 
 def rollout_service(
@@ -131,7 +131,8 @@ def rollout_service(
         incarnations=incarnations,
     )
     limits = [most for most in (config.max_env_copies, processes.most_copies) if most]
-    coordinator.max_env_copies = min(limits, default=0)
+    if limits:
+        coordinator.evaluation.most_copies = min(limits) - run.lanes * run.copies
     settings = HubSettings(
         config.no_workers_timeout_s,
         config.stall_timeout_s,

@@ -11,7 +11,8 @@ an answer that could not be used, is dropped, and its ticket is played again fro
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -20,7 +21,7 @@ from learner.members.membership import Member, Outgoing
 from learner.rollouts.row_checks import reason_to_reject
 from learner.run_folder.results import Evaluation, fact_means
 from protocol.bounds import LARGEST
-from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
+from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.random_streams import Purpose, env_seed
 from protocol.rollout import LARGEST_REWARD, Episode, wrong_facts
 from protocol.specs import PolicySpec
@@ -99,6 +100,10 @@ class EvaluationTickets:
 
     def __init__(self, policy: PolicySpec, facts: int = 0) -> None:
         """`policy`: that of the run, which says what rows look like. `facts`: how many numbers each episode has."""
+        self.held: dict[int, Member] = {}
+        """the tickets that workers hold, by number"""
+        self.most_copies: int | None = None
+        """most env copies that play, on all workers together, unless one worker has more; None: no limit"""
         self._policy, self._facts = policy, facts
         self._plan: EvaluationPlan | None = None
         self._version = -1
@@ -106,7 +111,6 @@ class EvaluationTickets:
         self._first = FIRST_TICKET  # number of the first ticket of this evaluation
         self._seeds: list[tuple[int, ...]] = []  # of each ticket
         self._undealt: list[int] = []  # heap: indices of tickets that no worker has
-        self._held: dict[bytes, dict[int, int]] = {}  # by worker: index of the ticket -> `replies` when it was last sent
         self._played: dict[int, Evaluated] = {}  # by index of the ticket
         self._rows: dict[int, dict[int, list[EpisodeRows]]] = {}  # by index of a held ticket, and by episode
 
@@ -131,14 +135,9 @@ class EvaluationTickets:
         return self._plan
 
     @property
-    def held(self) -> Iterator[tuple[bytes, int]]:
-        """The tickets of the pending evaluation that workers hold: routing id and number."""
-        return ((peer, self._first + index) for peer, held in self._held.items() for index in held if self.pending)
-
-    @property
-    def holders(self) -> list[bytes]:
-        """The workers that hold tickets, by routing id."""
-        return sorted(peer for peer, held in self._held.items() if held)
+    def players(self) -> list[Member]:
+        """The workers that hold tickets."""
+        return list({member.peer: member for member in self.held.values()}.values())
 
     def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None) -> None:
         """Begin to evaluate this version. `deal` then gives out the tickets."""
@@ -147,56 +146,70 @@ class EvaluationTickets:
         self._plan, self._version, self._on_rows = plan, version, on_rows
         self._seeds = [plan.seeds[i : i + plan.copies] for i in range(0, len(plan.seeds), plan.copies)]
         self._undealt = list(range(len(self._seeds)))
-        self._held, self._played, self._rows = {}, {}, {}
+        self._played, self._rows = {}, {}
 
     def end(self) -> list[PlayedEpisode]:
         """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
-        self._plan = None
-        self._rows = {}
+        for number, member in self.held.items():
+            del member.tickets[number]
+        self._plan, self.held, self._rows = None, {}, {}
         answers = [answer for _, answer in sorted(self._played.items())]
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
-    def deal(self, members: Sequence[Member]) -> list[Outgoing]:
-        """Give tickets to these workers: one to each, then a second one while there are plenty."""
-        out: list[Outgoing] = []
+    def deal(self, active: Sequence[Member]) -> list[Outgoing]:
+        """Give tickets to these workers, in the order of joining: one to each, then a second while there are plenty.
+
+        With a limit of copies, the first to join play, because a worker keeps its copies.
+        """
+        plan, members, dealt = self._plan, active, list[tuple[Member, int]]()
+        assert plan is not None
+        if self.most_copies is not None:
+            members = active[: max(1, self.most_copies // min(plan.copies, len(plan.seeds)))]
+        holds = Counter(member.peer for member in self.held.values())
         for most in range(1, HELD_AT_ONCE + 1):
             for member in members:
                 plenty = most == 1 or len(self._undealt) > len(members)
-                if self._undealt and plenty and len(self._held.get(member.peer, ())) < most:
-                    out.append(self._send(member, heapq.heappop(self._undealt)))
-        return out
+                if self._undealt and plenty and holds[member.peer] < most:
+                    number = self._first + heapq.heappop(self._undealt)
+                    self.held[number] = member
+                    holds[member.peer] += 1
+                    dealt.append((member, number))
+        return [order for member, number in dealt for order in self.send(member, [number])]
 
-    def send_again(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
-        """Orders that were lost on the way to this worker, or whose answers were lost, as its heartbeat shows."""
-        held = {self._first + index: sent_at for index, sent_at in self._held.get(member.peer, {}).items()}
-        return [self._send(member, ticket - self._first) for ticket in member.lost_on_the_way(heartbeat, held)]
+    def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
+        """The orders for these tickets, those of an evaluation among them."""
+        return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
 
-    def take(self, member: Member, answer: Evaluated) -> str:
+    def versions(self, tickets: Iterable[int]) -> set[int]:
+        """The versions that these tickets name, those of an evaluation among them."""
+        return {self._version for number in tickets if number in self.held}
+
+    def take_in(self, member: Member, answer: Evaluated) -> str:
         """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""
-        index = answer.ticket - self._first
-        if not self.pending or index not in self._held.get(member.peer, ()):
+        if self.held.get(answer.ticket) is not member:
             return ""  # it came twice, or after the end
-        del self._held[member.peer][index]
+        index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
-            self._put_back(index)
+            self.lose(member, answer.ticket)
             return f"evaluation of ticket {answer.ticket}: {why}"
-        rows = self._rows.pop(index, {})
+        rows = self._rows.get(index, {})
         if self._on_rows is not None:
             if [_end(rows.get(n, ())) for n in range(len(answer.episodes))] != [one.length for one in answer.episodes]:
-                self._put_back(index)  # a message with rows was lost: the episodes are played again
+                self.lose(member, answer.ticket)  # a message with rows was lost: the episodes are played again
                 return ""
             assert self._plan is not None
             for episode, messages in sorted(rows.items()):
                 for message in messages:
                     self._on_rows(index * self._plan.copies + episode, message)
+        self._end(member, answer.ticket)
         self._played[index] = answer
         return ""
 
     def take_rows(self, member: Member, rows: EpisodeRows) -> str:
         """Keep rows until their answer comes. Returns what is wrong with them, or nothing. Those that came are ignored."""
-        index = rows.ticket - self._first
-        if not self.pending or index not in self._held.get(member.peer, ()) or self._on_rows is None:
+        if self.held.get(rows.ticket) is not member or self._on_rows is None:
             return ""
+        index = rows.ticket - self._first
         if rows.episode >= len(self._seeds[index]):
             return f"rows of ticket {rows.ticket}: expected an episode below {len(self._seeds[index])}, got {rows.episode}"
         assert self._plan is not None
@@ -208,32 +221,33 @@ class EvaluationTickets:
         come.append(rows)
         return ""
 
-    def removed(self, peer: bytes) -> None:
-        """The worker is gone: its tickets go to others."""
-        for index in self._held.pop(peer, {}):
-            self._put_back(index)
+    def lose(self, member: Member, number: int) -> None:
+        """The ticket, which this member holds, is lost: it is to be dealt again."""
+        heapq.heappush(self._undealt, self._end(member, number))
 
     # ---------------------------------------------------------------- inside
 
-    def _put_back(self, index: int) -> None:
+    def _end(self, member: Member, number: int) -> int:
+        """The ticket is with nobody, and its rows are dropped. Returns its index."""
+        del self.held[number], member.tickets[number]
+        index = number - self._first
         self._rows.pop(index, None)
-        heapq.heappush(self._undealt, index)
+        return index
 
-    def _send(self, member: Member, index: int) -> Outgoing:
+    def _order(self, member: Member, number: int) -> Evaluate:
         plan = self._plan
         assert plan is not None
-        self._held.setdefault(member.peer, {})[index] = member.replies
-        order = Evaluate(
+        member.tickets[number] = member.replies
+        return Evaluate(
             session=member.session,
-            ticket=self._first + index,
+            ticket=number,
             version=self._version,
-            seeds=self._seeds[index],
+            seeds=self._seeds[number - self._first],
             greedy=plan.greedy,
             most_steps=plan.most_steps,
             send_rows=plan.send_rows,
             send_frames=plan.send_frames,
         )
-        return member.peer, order
 
     def _wrong(self, answer: Evaluated, seeds: int) -> str:
         assert self._plan is not None

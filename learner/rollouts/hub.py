@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from learner.members.events import Event, Failed, PolicyRaised
 from learner.members.failure_count import FailureCount
@@ -19,12 +19,13 @@ from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import MemberState
+from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.stall_watch import StallWatch
+from learner.rollouts.stall_watch import StallWatch, Standstill
 from learner.rollouts.status import status
-from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.rollouts.waiting import LearnerTime
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
@@ -40,6 +41,7 @@ from protocol.wire.weight_dtypes import WeightsDtype, to_wire_dtype
 
 log = logging.getLogger("millrace.learner")
 
+T = TypeVar("T")
 POLL_S = 0.1
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
@@ -126,12 +128,11 @@ class Hub:
         self._processes = processes or ProcessCallbacks()
         self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
-        self._weight_age = WeightAge()
+        self.weight_age = WeightAge()
         self._progress = Progress()
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
         self._failure: EnvironmentFailed | PolicyFailed | None = None
-        self._no_members_since_s: float | None = None
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
         callbacks = ServerCallbacks(self._answer, self.status, self._on_event)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
@@ -153,7 +154,7 @@ class Hub:
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
         self._time.learned(self._clock())
-        self._weight_age.published(version, self._clock())
+        self.weight_age.published(version, self._clock())
         self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes)
         if deal:
             self._server.send(self.coordinator.begin_update())
@@ -163,36 +164,31 @@ class Hub:
 
         `watch` is called at least every `POLL_S` of a long wait.
         """
-        started_s = self._clock()
-        log_at_s = started_s + LOG_WAITING_AFTER_S
-        steps = self._worker_steps()
-        self._time.turn("gathering", started_s)
-        self._stall_watch.begin(started_s)
-        self._server.send(self.coordinator.begin_update())
-        self._turn(0.0)
-        while True:
-            taken = self.coordinator.take()
-            if taken is not None:
-                self._time.turn("learning", self._clock())
-                self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
-                self._weight_age.used(self._lags)
-                return taken
-            self._turn(POLL_S)
+        began_s = self._clock()
+        log_at_s, steps = began_s + LOG_WAITING_AFTER_S, self._worker_steps()
+
+        def watch_and_log() -> None:
+            nonlocal log_at_s, steps
             now = self._clock()
-            if not self._goes_on(now, self.coordinator.rollouts_waiting()):
-                stall_timeout_s = self.settings.stall_timeout_s
-                raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting(now)}")
-            if now - started_s >= LONG_S:
+            if now - began_s >= LONG_S:
                 watch()
             if now > log_at_s:  # ever less often
-                log_at_s, before, steps = now + (now - started_s), steps, self._worker_steps()
+                log_at_s, before, steps = now + (now - began_s), steps, self._worker_steps()
                 level = logging.INFO if steps != before else logging.WARNING
                 log.log(level, "%s", self.waiting(now), extra={"in_progress": True})
 
+        rollouts = self.coordinator.rollouts
+        self._time.turn("gathering", began_s)
+        self._server.send(self.coordinator.begin_update())
+        taken = self._wait(rollouts.take, rollouts.waiting, watch_and_log, "no rollout came")
+        self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
+        self.weight_age.used(self._lags)
+        return taken
+
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """The update of the rollouts that `gather` returned last failed: they are counted as lost."""
-        self.coordinator.not_used(taken)
-        self._weight_age.not_used(self._lags)
+        self.coordinator.rollouts.not_used(taken)
+        self.weight_age.not_used(self._lags)
 
     def evaluate(
         self, plan: EvaluationPlan, watch: Callable[[int, int], None], on_rows: OnRows | None = None
@@ -203,23 +199,23 @@ class Hub:
         does.
         """
         evaluation, steps_before = self.coordinator.evaluation, self._worker_steps()
-        began_s = self._clock()
-        self._time.turn("evaluating", began_s)
-        self._stall_watch.begin(began_s)
+
+        def env_steps() -> int:
+            return max(0, self._worker_steps() - steps_before)  # it falls if a worker is lost
+
+        self._time.turn("evaluating", self._clock())
         self._server.send(self.coordinator.begin_evaluation(plan, on_rows))
         try:
-            while not evaluation.done:
-                self._turn(POLL_S)
-                now = self._clock()
-                env_steps = self._worker_steps()
-                watch(evaluation.episodes_played, max(0, env_steps - steps_before))  # less, if a worker was lost
-                if not self._goes_on(now, env_steps + evaluation.episodes_played):
-                    stall_timeout_s = self.settings.stall_timeout_s
-                    raise Stalled(f"no env step of an evaluation was made for {stall_timeout_s:.0f} s; {self.waiting(now)}")
+            self._wait(
+                lambda: evaluation.done or None,
+                lambda: self._worker_steps() + evaluation.episodes_played,
+                lambda: watch(evaluation.episodes_played, env_steps()),
+                "no env step of an evaluation was made",
+            )
         finally:
-            played = self.coordinator.end_evaluation()
+            played = evaluation.end()
             self._time.turn("learning", self._clock())
-        self._weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
+        self.weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
         return played
 
     def pulse(self) -> None:
@@ -253,14 +249,6 @@ class Hub:
         count = self._processes.count
         return len(self.coordinator.members) if count is None else count()
 
-    def lag_histogram(self) -> dict[str, int]:
-        """Number of rollouts that were used, by lag, from the smallest; a JSON object has strings for keys."""
-        return self._weight_age.histogram()
-
-    def first_use_s(self) -> dict[str, float]:
-        """For each worker, the median number of seconds from publishing weights to its first rollout under them."""
-        return self._weight_age.first_use_s()
-
     def snapshot(self) -> HubSnapshot:
         """A snapshot of the current state."""
         link, coordinator, now = self.link, self.coordinator, self._clock()
@@ -269,9 +257,9 @@ class Hub:
             progress=self._progress,
             version=coordinator.version,
             ledger=coordinator.ledger.copy(),
-            incarnations=coordinator.incarnations(),
+            incarnations=coordinator.rollouts.incarnations(),
             lags=self._lags,
-            lag_counts=dict(self._weight_age.lags),
+            lag_counts=dict(self.weight_age.lags),
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],
             waiting=self.waiting(now),
@@ -285,14 +273,27 @@ class Hub:
 
     # ---------------------------------------------------------------- inside
 
-    def _goes_on(self, now: float, progress: int) -> bool:
-        """Refuse workers that only hold tickets. False if the run stands still."""
-        standstill = self._stall_watch.check(now, progress)
-        if standstill is None:
-            return True
-        for member in standstill.refuse:
-            self._server.send(self.coordinator.refuse(member, standstill.why))
-        return bool(standstill.refuse)
+    def _wait(
+        self, done: Callable[[], T | None], progress: Callable[[], int], watch: Callable[[], None], nothing_came: str
+    ) -> T:
+        """Listen until `done` returns something. Refuses workers that only hold tickets; raises `Stalled` if all do.
+
+        `progress` changes when what is awaited makes progress. `watch` is called after each turn. `nothing_came`: the error.
+        """
+        self._stall_watch.begin(self._clock())
+        self._turn(0.0)
+        while (result := done()) is None:
+            self._turn(POLL_S)
+            now = self._clock()
+            match self._stall_watch.check(now, progress()):
+                case Standstill(refuse=()):
+                    raise Stalled(f"{nothing_came} for {self.settings.stall_timeout_s:.0f} s; {self.waiting(now)}")
+                case Standstill(members, why):
+                    for member in members:
+                        self._server.send(self.coordinator.refuse(member, why))
+            watch()
+        self._time.turn("learning", self._clock())
+        return result
 
     def _worker_steps(self) -> int:
         """Env steps of all workers, as of their last heartbeats."""
@@ -307,7 +308,7 @@ class Hub:
             self._on_event(self._processes.failed.pop(0))
         if self._failure is not None:
             raise self._failure
-        self._check_members()
+        self._server.check_members(self.settings.no_workers_timeout_s)
 
     def _listen(self, timeout_s: float, short: bool = False) -> None:
         self._server.listen(timeout_s, short)
@@ -324,10 +325,10 @@ class Hub:
             why = f"worker {name_for_people(peer)}: rollout of ticket {message.ticket}: {error}"
             self._server.warn_limited(peer, why)
             return self.coordinator.reject_rollout(peer, message, why, now)
-        waiting = self.coordinator.rollouts_waiting()
+        waiting = self.coordinator.rollouts.waiting()
         out = self.coordinator.receive(peer, message, now)
-        if self.coordinator.rollouts_waiting() > waiting:  # of a ticket that this worker held
-            self._weight_age.arrived(name_for_people(peer), message.version, now)
+        if self.coordinator.rollouts.waiting() > waiting:  # of a ticket that this worker held
+            self.weight_age.arrived(name_for_people(peer), message.version, now)
             self._failures.collected(message.lane)
         return out
 
@@ -342,14 +343,3 @@ class Hub:
         if line := self._failures.line(event, self._clock()):
             kind = PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed
             self._failure = kind(line, event.traceback)
-
-    def _check_members(self) -> None:
-        """Raise `NoWorkers` when there was no member for too long."""
-        if self.coordinator.members:
-            self._no_members_since_s = None
-            return
-        now, timeout_s = self._clock(), self.settings.no_workers_timeout_s
-        if self._no_members_since_s is None:
-            self._no_members_since_s = now
-        if now - self._no_members_since_s > timeout_s:
-            raise self._server.no_workers(1, timeout_s)

@@ -13,7 +13,8 @@ import math
 from dataclasses import dataclass
 
 from learner.members.membership import Member
-from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
+from learner.rollouts.collecting_member import CollectingMember
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.alive import CallTimeouts
 
 ENDED_WITHIN_S = 5.0  # after its timeout, until the learner hears that a worker was ended
@@ -55,8 +56,7 @@ class StallWatch:
         if now - self._progress_s <= self._stall_timeout_s or any(self._in_call(member, now) for member in members):
             return None
         self._progress_s = now
-        evaluating = self._coordinator.evaluation.holders
-        idle = tuple(member for member in members if member.tickets or member.peer in evaluating)
+        idle = tuple(member for member in members if member.tickets)
         if len(idle) == len(members):
             idle = ()
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
@@ -71,11 +71,14 @@ class StallWatch:
     def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
         """The members whose oldest ticket is older than all their tickets may take together."""
         coordinator = self._coordinator
-        evaluation, run = coordinator.evaluation, coordinator.run
+        run, plan = coordinator.run, coordinator.evaluation.plan
         rollout_s = self._longest_s(run.copies, run.rollout_steps)
-        episodes_s = self._longest_s(plan.copies, plan.most_steps) if (plan := evaluation.plan) is not None else 0.0
-        held = {(ticket.peer, number): rollout_s for number, ticket in coordinator.tickets.items()}
-        held |= dict.fromkeys(evaluation.held, episodes_s)
+        episodes_s = 0.0 if plan is None else self._longest_s(plan.copies, plan.most_steps)
+        held = {
+            (peer, number): rollout_s if number in coordinator.rollouts.held else episodes_s
+            for peer, member in coordinator.members.items()
+            for number in member.tickets
+        }
         self._dealt_s = {both: self._dealt_s.get(both, now) for both in held}
         oldest_s: dict[bytes, float] = {}
         allowed_s: dict[bytes, float] = {}

@@ -12,7 +12,7 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiti
     return Status(
         coordinator.run.env.id,
         coordinator.membership.status(now),
-        len(coordinator.lanes),
+        len(coordinator.rollouts.lanes),
         version=coordinator.version,
         env_steps=progress.env_steps,
         total_steps=progress.total_steps,

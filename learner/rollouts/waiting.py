@@ -64,7 +64,7 @@ class LearnerTime:
             text = self._learning(now)
         elif not members:
             text = f"waiting {lasts_s:.0f} s for {self._no_worker()}"
-        elif self.phase == "gathering" and self._coordinator.awaited():
+        elif self.phase == "gathering" and self._coordinator.rollouts.awaited():
             text = f"waiting {lasts_s:.0f} s for {self._awaited(now)}"
         if text and (total_s := spent_s["gathering"] + spent_s["learning"]) >= SHARES_AFTER_S:
             gather, learn = spent_s["gathering"] / total_s, spent_s["learning"] / total_s
@@ -81,7 +81,7 @@ class LearnerTime:
     def _awaited(self, now: float) -> str:
         """The lanes of the worker that is held up longest, that worker, and how many other lanes are awaited."""
         lanes, members = dict[bytes, set[int]](), self._coordinator.members
-        for ticket in self._coordinator.awaited():
+        for ticket in self._coordinator.rollouts.awaited():
             lanes.setdefault(ticket.peer, set()).add(ticket.lane)
         peer = max(lanes, key=lambda peer: held_up(members[peer], now))
         mine, more = sorted(lanes.pop(peer)), sum(map(len, lanes.values()))
@@ -92,7 +92,7 @@ class LearnerTime:
     def _played(self, plan: EvaluationPlan, now: float) -> str:
         """How far an evaluation is, and who is held up longest of those that play it."""
         evaluation = self._coordinator.evaluation
-        who = self._held_up_longest([self._coordinator.members[peer] for peer in evaluation.holders], now)
+        who = self._held_up_longest(evaluation.players, now)
         done = f"{evaluation.episodes_played} of {len(plan.seeds)} episodes"
         return f"{done} (at most {plan.most_steps:,} env steps each); {who}"
 

@@ -51,7 +51,15 @@ def logged(which: str) -> tuple[set[str], set[str]]:
         def on_update(self, progress: millrace.Progress) -> None:
             progress.log("own_number", 1)
 
-    sizes = {"envs": 2, "lanes": 1, "rollout_steps": 8, "eval_episodes": 1, "eval_every": 16, "workers": 1}
+    sizes = {
+        "envs": 2,
+        "lanes": 1,
+        "rollout_steps": 8,
+        "eval_episodes": 1,
+        "eval_every": 16,
+        "workers": 1,
+        "heartbeat_s": 0.05,
+    }
     chosen: dict[str, Any] = {
         "env": "CartPole-v1",
         "steps": 200,

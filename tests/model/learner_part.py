@@ -10,10 +10,14 @@ from typing import Self, TypeVar
 
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership, Outgoing
+from learner.rollouts.collecting_member import CollectingMember
+from learner.rollouts.evaluation_tickets import FIRST_TICKET
 from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.rollout_tickets import RolloutTickets
 from learner.rollouts.rounds import Rounds
-from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
+from learner.rollouts.sent_weights import SentWeights
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.messages import ToLearner, WorkerExit
 from tests.model.conversation import Content
 from tests.model.message_content import (
@@ -32,8 +36,9 @@ from tests.model.settings import TIMEOUT_S, Settings
 from tests.support.fake_ends import BUFFERS, PARAMETERS
 
 SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"ledger", "version", "membership", "lanes", "tickets", "ready", "_placement", "_rounds", "_to_deal"}
-    | {"_weights"},
+    TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},
+    RolloutTickets: {"lanes", "ledger", "held", "ready", "rounds", "_to_deal"},
+    SentWeights: {"kept"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "versions"}
     | {"strikes", "takeovers"},
@@ -45,7 +50,9 @@ SAVED: dict[type, set[str]] = {
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"run", "max_env_copies", "worker_timeout_s", "evaluation", "_absent"},
+    TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "ledger"},
+    RolloutTickets: {"_absent"},
+    SentWeights: set(),
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
     | {"_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
@@ -134,9 +141,10 @@ class Learner:
 
     def named(self) -> list[tuple[CollectingMember, int]]:
         """Which versions the orders of which workers name."""
-        members = self.coordinator.members
-        tickets = [(members[each.peer], each.version) for each in self.coordinator.tickets.values()]
-        return tickets + [(members[peer], self.coordinator.version) for peer in self.coordinator.evaluation.holders]
+        members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation
+        versions = {number: each.version for number, each in self.coordinator.rollouts.held.items()}
+        versions |= dict.fromkeys(evaluation.held, self.coordinator.version)
+        return [(member, versions[number]) for member in members for number in member.tickets]
 
     # ---------------------------------------------------------------- inside
 
@@ -147,18 +155,18 @@ class Learner:
     def _gather(self) -> list[Outgoing]:
         """Begin to gather the rollouts of the next update."""
         out = self.coordinator.begin_update()
-        opened = len(self.coordinator._rounds._versions)
+        opened = len(self.coordinator.rollouts.rounds._versions)
         assert opened == self.settings.max_lag + 1, "an update has begun and not all of its rounds are open"
         return out + self._learn()
 
     def acts(self, number: int) -> int:
         """The version that must act in this open round."""
-        ahead = self.settings.max_lag - (number - self.coordinator._rounds.next)
+        ahead = self.settings.max_lag - (number - self.coordinator.rollouts.rounds.next)
         return self.coordinator.version + self.updating - min(self.lag, ahead)
 
     def _checkpoint(self) -> list[Outgoing]:
         coordinator = self.coordinator
-        incarnations = tuple(incarnation(lane, number) for lane, number in enumerate(coordinator.incarnations()))
+        incarnations = tuple(incarnation(lane, number) for lane, number in enumerate(coordinator.rollouts.incarnations()))
         accepted = tuple(_accepted(lane, number) for lane, (number, _, _) in enumerate(self.accepted))
         self.checkpoints.append((ticket(coordinator.ledger.issued), coordinator.ledger.used, incarnations, accepted))
         return []
@@ -180,7 +188,7 @@ class Learner:
             return []
         coordinator, ledger = self.coordinator, self.coordinator.ledger
         before = ledger.transitions_used
-        taken = coordinator.take()
+        taken = coordinator.rollouts.take()
         if taken is None:
             return []
         assert ledger.transitions_used - before == len(taken), "an update counted another number of transitions"
@@ -196,62 +204,61 @@ class Learner:
 
     def check(self) -> None:
         """The rules that hold in every state."""
-        coordinator, ledger = self.coordinator, self.coordinator.ledger
+        coordinator, ledger, rollouts = self.coordinator, self.coordinator.ledger, self.coordinator.rollouts
         waiting = waiting_rollouts(coordinator)
-        assert ledger.outstanding == len(coordinator.tickets) + len(waiting), "the ledger does not balance"
+        assert ledger.outstanding == len(rollouts.held) + len(waiting), "the ledger does not balance"
         waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
         assert ledger.transitions_waiting == waiting_steps, "transitions do not balance"
         members = coordinator.members
         self._check_rounds()
-        for lane in coordinator.lanes:
+        for lane in coordinator.rollouts.lanes:
             owners = [member.peer for member in members.values() if lane.number in member.lanes]
             assert owners == ([] if lane.owner is None else [lane.owner]), (
                 "a lane has two owners, or its owner does not know"
             )
-            mine = {number for number, each in coordinator.tickets.items() if each.lane == lane.number}
+            mine = {number for number, each in rollouts.held.items() if each.lane == lane.number}
             assert mine == lane.outstanding, "a lane does not know its tickets"
-            assert not lane.due or lane.number in coordinator._to_deal, "a lane gets no more tickets"
-        for number, each in coordinator.tickets.items():
+            assert not lane.due or lane.number in rollouts._to_deal, "a lane gets no more tickets"
+        for number, each in rollouts.held.items():
             assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
-            assert coordinator.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
-        assert sum(len(member.tickets) for member in members.values()) == len(coordinator.tickets), (
-            "a ticket has two holders"
-        )
+            assert rollouts.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
+        held = sorted([*rollouts.held, *coordinator.evaluation.held])
+        assert held == sorted(number for member in members.values() for number in member.tickets), "a ticket has two holders"
         processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
         assert coordinator.membership._of_process == processes, "the processes are not those of the members"
 
     def _check_rounds(self) -> None:
         """Each lane has every open round once: due, with a worker, or waiting. Round u acts under what `rounds.py` says."""
-        coordinator, rounds = self.coordinator, self.coordinator._rounds
+        coordinator, rounds = self.coordinator, self.coordinator.rollouts.rounds
         opened = list(rounds._versions)
         assert opened == list(range(rounds.next, rounds.next + len(opened))), "an open round is missing"
         assert len(opened) <= self.settings.max_lag + 1, "more rounds are open than the lag allows"
         versions = {number: self.acts(number) for number in opened}
         assert rounds._versions == versions, "other weights act in a round than those that were the newest"
-        found = [(each.lane, each.round, each.version) for each in coordinator.tickets.values()]
-        for number, of_round in coordinator.ready.items():
+        found = [(each.lane, each.round, each.version) for each in coordinator.rollouts.held.values()]
+        for number, of_round in coordinator.rollouts.ready.items():
             found += [(lane, number, arrived.rollout.version) for lane, arrived in of_round.items()]
-        found += [(lane.number, number, versions[number]) for lane in coordinator.lanes for number in lane.due]
-        every = [(lane.number, *of_round) for lane in coordinator.lanes for of_round in versions.items()]
+        found += [(lane.number, number, versions[number]) for lane in coordinator.rollouts.lanes for number in lane.due]
+        every = [(lane.number, *of_round) for lane in coordinator.rollouts.lanes for of_round in versions.items()]
         assert sorted(found) == every, "a lane does not have every open round once, under its version"
-        for lane in coordinator.lanes:
-            mine = [(t.round, t.sequence) for t in coordinator.tickets.values() if t.lane == lane.number]
+        for lane in coordinator.rollouts.lanes:
+            mine = [(t.round, t.sequence) for t in coordinator.rollouts.held.values() if t.lane == lane.number]
             mine += [
                 (number, of_round[lane.number].rollout.sequence)
-                for number, of_round in coordinator.ready.items()
+                for number, of_round in coordinator.rollouts.ready.items()
                 if lane.number in of_round and of_round[lane.number].incarnation == lane.incarnation
             ]
             in_order = [sequence for _, sequence in sorted(mine)]
             assert in_order == sorted(set(in_order)), "rollouts of a lane are not collected in the order of the rounds"
             assert all(sequence < lane.dealt for sequence in in_order), "a sequence number will be dealt twice"
         needed = {coordinator.version, *versions.values()}
-        assert needed.issuperset(coordinator._weights) or self.updating, "the learner keeps weights that nobody needs"
-        assert set(coordinator._weights).issuperset(needed - {-1}), "weights that are needed are dropped"
+        assert needed.issuperset(coordinator.weights.kept) or self.updating, "the learner keeps weights that nobody needs"
+        assert set(coordinator.weights.kept).issuperset(needed - {-1}), "weights that are needed are dropped"
 
 
 def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
     """Those that have come and were not taken."""
-    return [arrived for of_round in coordinator.ready.values() for arrived in of_round.values()]
+    return [arrived for of_round in coordinator.rollouts.ready.values() for arrived in of_round.values()]
 
 
 # -------------------------------------------------------------------- to tuples and back
@@ -261,8 +268,8 @@ def saved(learner: Learner, now: float) -> Content:
     coordinator = learner.coordinator
     coordinator.membership.events.clear()
     learner.check()
-    lanes, membership, rounds = coordinator.lanes, coordinator.membership, coordinator._rounds
-    tickets = sorted(coordinator.tickets.values(), key=lambda each: each.number)
+    lanes, membership, rounds = coordinator.rollouts.lanes, coordinator.membership, coordinator.rollouts.rounds
+    tickets = sorted(coordinator.rollouts.held.values(), key=lambda each: each.number)
     waiting_for = coordinator._placement._waiting_for
     return (
         ticket(coordinator.ledger.issued),
@@ -273,7 +280,7 @@ def saved(learner: Learner, now: float) -> Content:
         tuple(_ticket(each, rounds.next) for each in tickets),
         tuple(
             (number - rounds.next, rollout_content(each.rollout), incarnation(lane, each.incarnation))
-            for number, of_round in sorted(coordinator.ready.items())
+            for number, of_round in sorted(coordinator.rollouts.ready.items())
             for lane, each in sorted(of_round.items())
         ),
         tuple(
@@ -282,8 +289,8 @@ def saved(learner: Learner, now: float) -> Content:
         tuple(sorted(coordinator._placement._unplaced)),
         coordinator._placement._settled,
         None if waiting_for is None else (session(waiting_for.session), tuple(sorted(waiting_for.lanes))),
-        tuple(sorted(coordinator._to_deal)),
-        tuple(sorted(coordinator._weights)),
+        tuple(sorted(coordinator.rollouts._to_deal)),
+        tuple(sorted(coordinator.weights.kept)),
         session(membership._next_session),
         max(0.0, membership._none_silent_before_s - now),
         tuple(sorted(name(Kind.NONCE, nonce, worker_of(peer)) for peer, (nonce, _) in membership._refused.items())),
@@ -336,7 +343,7 @@ def _member(member: CollectingMember, now: float) -> Content:
         session(member.session),
         max(member.heard_s - now, -TIMEOUT_S - 1.0),
         tuple(sorted(member.lanes)),
-        tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items()),
+        tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items() if number < FIRST_TICKET),
         replies(member.replies),
         tuple((version, replies(sent_at)) for version, sent_at in sorted(member.versions.items())),
         member.strikes,
@@ -361,20 +368,22 @@ def loaded(content: Content, settings: Settings) -> Learner:
     )
     coordinator.version = version
     coordinator.ledger.transitions_received = len(ready)
-    coordinator._rounds._versions = dict(enumerate(versions))
-    coordinator._to_deal = set(to_deal)
-    coordinator._weights = {each: weights(each) for each in held}
+    coordinator.rollouts.rounds._versions = dict(enumerate(versions))
+    coordinator.rollouts._to_deal = set(to_deal)
+    coordinator.weights.kept = {each: weights(each) for each in held}
     for of_round, fields, number in ready:
         arrived = AcceptedRollout(rollout_of(fields), number.value)
-        coordinator.ready.setdefault(of_round, {})[arrived.rollout.lane] = arrived
-    for lane, (number, owner, moving, due, dealt, following, out_of_order) in zip(coordinator.lanes, lanes, strict=True):
+        coordinator.rollouts.ready.setdefault(of_round, {})[arrived.rollout.lane] = arrived
+    for lane, (number, owner, moving, due, dealt, following, out_of_order) in zip(
+        coordinator.rollouts.lanes, lanes, strict=True
+    ):
         lane.incarnation, lane.owner = number.value, None if owner is None else peer_of(owner.value)
         lane.moving, lane.due, lane.dealt = moving, list(due), dealt
         lane.next_sequence, lane.out_of_order = following, set(out_of_order)
     for number, of_lane, inc, sequence, of_round, under, worker in tickets:
         each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value))
-        coordinator.tickets[number.value] = each
-        coordinator.lanes[of_lane].outstanding.add(number.value)
+        coordinator.rollouts.held[number.value] = each
+        coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
     _load_members(coordinator.membership, members)
     coordinator.membership._none_silent_before_s = none_silent
     coordinator.membership._refused = {peer_of(nonce.scope): (nonce.value, "refused") for nonce in refused}

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parent.parent.parent
 COORDINATOR = "learner.rollouts.ticket_coordinator"
+ROLLOUTS = "learner.rollouts.rollout_tickets"
+WEIGHTS = "learner.rollouts.sent_weights"
 MEMBERS = "learner.members.coordinator"
 LANES = "learner.rollouts.lanes"
 ROUNDS = "learner.rollouts.rounds"
@@ -56,72 +58,70 @@ MUTATIONS = {
         "self._versions = dict.fromkeys([*self._versions, *opened], newest)",
     ),
     "a round is dealt under the newest weights": Mutation(
-        COORDINATOR, "self._rounds.version(round_number))", "self.version)"
+        ROLLOUTS, "self.rounds.version(round_number))", "max(self.rounds._versions.values()))"
     ),
     "an update counts rollouts of later rounds": Mutation(
-        COORDINATOR,
-        "if len(self.ready.get(self._rounds.next, ())) < len(self.lanes):",
-        "if self.rollouts_waiting() < len(self.lanes):",
+        ROLLOUTS,
+        "if len(self.ready.get(self.rounds.next, ())) < len(self.lanes):",
+        "if self.waiting() < len(self.lanes):",
     ),
     "an update takes the newest round": Mutation(
-        COORDINATOR,
-        "in sorted(self.ready.pop(self._rounds.next).items())]",
+        ROLLOUTS,
+        "in sorted(self.ready.pop(self.rounds.next).items())]",
         "in sorted(self.ready.pop(max(self.ready)).items())]",
     ),
     "a rollout is taken twice": Mutation(
-        COORDINATOR, "self.ready.pop(self._rounds.next).items()", "self.ready[self._rounds.next].items()"
+        ROLLOUTS, "self.ready.pop(self.rounds.next).items()", "self.ready[self.rounds.next].items()"
     ),
     "a rollout waits for the wrong round": Mutation(
-        COORDINATOR, "self.ready.setdefault(ticket.round, {})", "self.ready.setdefault(self._rounds.next, {})"
+        ROLLOUTS, "self.ready.setdefault(ticket.round, {})", "self.ready.setdefault(self.rounds.next, {})"
     ),
-    "a round is dealt again and again": Mutation(COORDINATOR, "            lane.due.clear()\n", "            pass\n"),
-    "the round of a lost ticket is not dealt again": Mutation(COORDINATOR, "insort(lane.due, ticket.round)", "pass"),
-    "a lane whose ticket was lost is overlooked": Mutation(COORDINATOR, "self._to_deal.add(lane.number)", "pass"),
+    "a round is dealt again and again": Mutation(ROLLOUTS, "            lane.due.clear()\n", "            pass\n"),
+    "the round of a lost ticket is not dealt again": Mutation(
+        ROLLOUTS, "insort(self._end(member, ticket).due, ticket.round)", "self._end(member, ticket)"
+    ),
+    "a lane whose ticket was lost is overlooked": Mutation(ROLLOUTS, "self._to_deal.add(ticket.lane)", "pass"),
     "a late rollout is not counted": Mutation(
-        COORDINATOR, "self.ledger.transitions_late += message.env_steps", "self.ledger.transitions_late += 0"
+        ROLLOUTS, "self.ledger.transitions_late += rollout.env_steps", "self.ledger.transitions_late += 0"
     ),
     "a repeated rollout is not counted": Mutation(
-        COORDINATOR, "self.ledger.transitions_duplicate += rollout.env_steps", "self.ledger.transitions_duplicate += 0"
+        ROLLOUTS, "self.ledger.transitions_duplicate += rollout.env_steps", "self.ledger.transitions_duplicate += 0"
     ),
     "the arrival of a rollout is not recorded": Mutation(
-        COORDINATOR,
-        "        lane.arrived(rollout.sequence)\n        self._placement",
-        "        self._placement",
+        ROLLOUTS, "self._end(member, ticket).arrived(rollout.sequence)", "self._end(member, ticket)"
     ),
     "a lost Collect is not sent again": Mutation(
-        COORDINATOR, "self._collect(member, lost) + self.evaluation", "self.evaluation"
+        COORDINATOR, "self.rollouts.send(member, lost) + self.evaluation", "self.evaluation"
     ),
     "lost weights are not sent again": Mutation(
-        COORDINATOR, "out = self._lost_weights(member, heartbeat)", "out: list[Outgoing] = []"
+        WEIGHTS, "return [(member.peer, self.kept[version]) for version in lost]", "return []"
     ),
     "weights that may be under way are sent again": Mutation(
-        COORDINATOR, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
+        WEIGHTS, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
     ),
     "weights that are sent again are not noted": Mutation(
-        COORDINATOR, "member.versions = held | dict.fromkeys(lost, member.replies)", "member.versions = held"
+        WEIGHTS, "member.versions = held | dict.fromkeys(lost, member.replies)", "member.versions = held"
     ),
     "weights that a heartbeat does not list count as held": Mutation(
-        COORDINATOR, "member.versions = held | dict", "member.versions |= dict"
+        WEIGHTS, "member.versions = held | dict", "member.versions |= dict"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
-        COORDINATOR, "out + self._with_weights(self._collect(member, lost) + ", "out + (self._collect(member, lost) + "
+        COORDINATOR, "out + self.weights.after(orders, self.members)", "out + orders"
     ),
-    "weights are never sent": Mutation(COORDINATOR, " and message.version not in member.versions:", " and False:"),
-    "weights are sent with every order": Mutation(COORDINATOR, " and message.version not in member.versions:", ":"),
+    "weights are never sent": Mutation(WEIGHTS, " and message.version not in member.versions:", " and False:"),
+    "weights are sent with every order": Mutation(WEIGHTS, " and message.version not in member.versions:", ":"),
     "weights are sent before the order that names them": Mutation(
-        COORDINATOR,
-        "out.append((peer, self._weights[message.version]))",
-        "out.insert(-1, (peer, self._weights[message.version]))",
+        WEIGHTS,
+        "out.append((peer, self.kept[message.version]))",
+        "out.insert(-1, (peer, self.kept[message.version]))",
     ),
     "the newest weights are sent to whoever holds a ticket": Mutation(
-        COORDINATOR,
-        "out.append((peer, self._weights[message.version]))",
-        "out.append((peer, self._weights[self.version]))",
+        WEIGHTS,
+        "out.append((peer, self.kept[message.version]))",
+        "out.append((peer, self.kept[max(self.kept)]))",
     ),
-    "the learner keeps only the newest weights": Mutation(
-        COORDINATOR, "if v == version or self._rounds.acts(v)}", "if v == version}"
-    ),
-    "the learner keeps all weights": Mutation(COORDINATOR, "if v == version or self._rounds.acts(v)}", "if True}"),
+    "the learner keeps only the newest weights": Mutation(WEIGHTS, "if acts(version)}", "if False}"),
+    "the learner keeps all weights": Mutation(WEIGHTS, "if acts(version)}", "if True}"),
     "heartbeats are answered with the same number": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
     "tickets of a lost worker are kept": Mutation(COORDINATOR, "for number in list(member.tickets):", "for number in ():"),
     "two tickets of a lane have one sequence number": Mutation(LANES, "self.dealt += 1", "self.dealt = 1"),
@@ -131,7 +131,7 @@ MUTATIONS = {
         "self.next_sequence, self.out_of_order = 0, set()",
     ),
     "a checkpoint repeats an incarnation": Mutation(
-        COORDINATOR, "lane.incarnation + (lane.dealt > 0) for", "lane.incarnation + 0 for"
+        ROLLOUTS, "lane.incarnation + (lane.dealt > 0) for", "lane.incarnation + 0 for"
     ),
     "lanes are placed after tickets are dealt": Mutation(
         COORDINATOR, "out = self._placement.place(self.members.values())", "out: list[Outgoing] = []"

@@ -14,9 +14,12 @@ import pytest
 
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership
+from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.lanes import Ticket, TicketedLane
+from learner.rollouts.rollout_tickets import RolloutTickets
 from learner.rollouts.rounds import Rounds
-from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
+from learner.rollouts.sent_weights import SentWeights
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from tests.model import learner_part, worker_part
 from tests.model.conversation import Content
 from tests.model.message_content import hello
@@ -111,15 +114,17 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         coordinator,
         coordinator.membership,
         CollectingMember(b"w0", hello(0, 1, 1), 0, 0, 0.0),
-        coordinator.lanes[0],
+        coordinator.rollouts,
+        coordinator.weights,
+        coordinator.rollouts.lanes[0],
         Ticket(0, 0, 0, 0, 0, 0, b"w0"),
         coordinator._placement,
-        coordinator._rounds,
+        coordinator.rollouts.rounds,
         session,
         session._current,
         session._current.rollouts,
         RolloutLane(0),
     ]
-    types = TicketCoordinator, Membership, CollectingMember, TicketedLane, Ticket, LanePlacement, Rounds
-    assert [type(each) for each in objects] == [*types, Session, _SessionState, HeldRollouts, RolloutLane]
+    types = TicketCoordinator, Membership, CollectingMember, RolloutTickets, SentWeights, TicketedLane, Ticket, LanePlacement
+    assert [type(each) for each in objects] == [*types, Rounds, Session, _SessionState, HeldRollouts, RolloutLane]
     assert {type(each): set(vars(each)) for each in objects} == known

@@ -299,7 +299,7 @@ class World:
         if self.updating or self._evaluating():
             return
         self.to_workers(self.coordinator.begin_update())
-        taken = self.coordinator.take()
+        taken = self.coordinator.rollouts.take()
         if taken is None:
             return
         rollouts = [arrived.rollout for arrived in taken]
@@ -321,7 +321,11 @@ class World:
             if evaluates:
                 self._begin_evaluation()
             if self.random.random() < 0.3:
-                self.checkpoint = (msgspec.structs.replace(coordinator.ledger), self.updates, coordinator.incarnations())
+                self.checkpoint = (
+                    msgspec.structs.replace(coordinator.ledger),
+                    self.updates,
+                    coordinator.rollouts.incarnations(),
+                )
             self._learn()
 
         self.at(self.random.uniform(0.0, 0.3), publish)
@@ -342,7 +346,7 @@ class World:
         if self.plan is None or not self.coordinator.evaluation.done:
             return self.plan is not None
         plan, self.plan = self.plan, None
-        played = self.coordinator.end_evaluation()
+        played = self.coordinator.evaluation.end()
         expected = [seed + self.coordinator.version / 1000 for seed in plan.seeds]
         assert [one.episode.reward for one in played] == expected, "the episodes are not those of the seeds"
         if plan.send_rows:
@@ -403,21 +407,23 @@ class World:
 
     def check(self) -> None:
         coordinator, ledger = self.coordinator, self.coordinator.ledger
-        in_flight = len(coordinator.tickets) + coordinator.rollouts_waiting()
+        in_flight = len(coordinator.rollouts.held) + coordinator.rollouts.waiting()
         assert ledger.issued == ledger.used + ledger.lost + in_flight, "the ledger does not balance"
         assert ledger.transitions_waiting == sum(
-            arrived.rollout.env_steps for of_round in coordinator.ready.values() for arrived in of_round.values()
+            arrived.rollout.env_steps for of_round in coordinator.rollouts.ready.values() for arrived in of_round.values()
         ), "transitions do not balance"
         if self.plan is not None:
             assert ledger.issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
         assert in_flight <= self.run.lanes * (1 + self.max_lag), "more tickets than the bound allows"
-        for lane in coordinator.lanes:
+        for lane in coordinator.rollouts.lanes:
             owners = [member for member in coordinator.members.values() if lane.number in member.lanes]
             assert len(owners) == (lane.owner is not None), "a lane has two owners"
             assert all(owner.peer == lane.owner for owner in owners)
-        for number, ticket in coordinator.tickets.items():
+        for number, ticket in coordinator.rollouts.held.items():
             assert number in coordinator.members[ticket.peer].tickets, "an outstanding ticket is with nobody"
-            assert coordinator.lanes[ticket.lane].owner == ticket.peer, "a ticket of a lane that its worker does not own"
+            assert coordinator.rollouts.lanes[ticket.lane].owner == ticket.peer, (
+                "a ticket of a lane that its worker does not own"
+            )
         if self.epoch == 0:
             for worker in self.workers.values():
                 holds = held_count(worker.session)

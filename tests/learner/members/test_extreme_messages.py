@@ -177,7 +177,7 @@ def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
         link.inbox += [(worker.name.encode(), message) for worker in honest for message in worker.says()]
         while link.inbox or link.sayings:
             hub._turn(0.0)
-        taken = coordinator.take() if turn > 2 else None
+        taken = coordinator.rollouts.take() if turn > 2 else None
         if taken is not None:
             found += [
                 (r.rollout.lane, r.rollout.ticket, r.rollout.version, r.rollout.sequence, r.incarnation) for r in taken

@@ -173,7 +173,7 @@ def test_what_is_kept_of_workers_that_left_is_limited() -> None:
     logging.disable(logging.NOTSET)
     assert set(noisy.coordinator.members) == {b"honest"}
     assert len(stages._removed_for_silence) == REMEMBERED
-    assert len(noisy.hub._weight_age._newest_used) == 0, "a rollout counts for the weights' age only if it was accepted"
+    assert len(noisy.hub.weight_age._newest_used) == 0, "a rollout counts for the weights' age only if it was accepted"
     assert stages.stages().keys() == {"step"}
     assert 0 < stages.stages()["step"] < 0.1 * (REMEMBERED + 500), "no session has taken longer than it lasted"
 
@@ -329,7 +329,7 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
         session = noisy.joins("honest", nonce)
         noisy.hears("honest", Failure(session, "boom", "", 0))
         session = noisy.joins("honest", 100 * nonce)
-        ((number, ticket),) = noisy.coordinator.tickets.items()
+        ((number, ticket),) = noisy.coordinator.rollouts.held.items()
         if between == "a rollout":
             noisy.hears("honest", fake_rollout(session, ticket.lane, number, noisy.coordinator.version, 0))
             noisy.hub.gather()

@@ -49,14 +49,14 @@ def crowd(workers: int, max_lag: int = 0) -> Learner:
 def of_rollout(learner: Learner, number: int | None = None) -> int:
     """Lines for the arrival of one rollout, and for a look whether an update can be made of all."""
     learner.coordinator.remove_silent(learner.now)
-    while learner.coordinator.take() is not None:  # what is there already
+    while learner.coordinator.rollouts.take() is not None:  # what is there already
         pass
     number = learner.tickets()[0] if number is None else number
-    rollout, peer = learner.rollout_of(number), learner.coordinator.tickets[number].peer
+    rollout, peer = learner.rollout_of(number), learner.coordinator.rollouts.held[number].peer
 
     def arrives() -> None:
         learner.coordinator.receive(peer, rollout, learner.now)
-        learner.coordinator.take()
+        learner.coordinator.rollouts.take()
         learner.coordinator.remove_silent(learner.now)
 
     return lines(arrives)
@@ -83,12 +83,12 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
             process_ends(learner.coordinator, f"w{number}", "gone")
         learner.joins(b"newcomer", pid=9998)  # is given the lane whose rollout has come
         learner.joins(b"another", pid=9999)
-        assert sum(lane.moving for lane in learner.coordinator.lanes) == 1
+        assert sum(lane.moving for lane in learner.coordinator.rollouts.lanes) == 1
         return learner
 
     def of_another(learner: Learner) -> int:
-        (moving,) = [lane for lane in learner.coordinator.lanes if lane.moving]
-        tickets = learner.coordinator.tickets.items()
+        (moving,) = [lane for lane in learner.coordinator.rollouts.lanes if lane.moving]
+        tickets = learner.coordinator.rollouts.held.items()
         return of_rollout(learner, next(number for number, ticket in tickets if ticket.peer != moving.owner))
 
     assert of_another(waiting(MANY // 2)) <= of_another(waiting(FEW)) + 5

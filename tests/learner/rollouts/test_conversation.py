@@ -71,7 +71,7 @@ def test_a_worker_without_a_lane_evaluates_too() -> None:
     def watch() -> None:
         check()
         if world.plan is not None and len(world.plan.seeds) > 2 * world.plan.copies:
-            holders.add(tuple(world.coordinator.evaluation.holders))
+            holders.add(tuple(sorted(member.peer for member in world.coordinator.evaluation.players)))
 
     world.check = watch  # type: ignore[method-assign]
     world.play(updates=20)

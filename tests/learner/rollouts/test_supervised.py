@@ -252,7 +252,7 @@ def about_to_evaluate() -> Learner:
     learner = Learner()
     learner.joins(A)
     learner.deliver_all()
-    assert learner.coordinator.take() is not None
+    assert learner.coordinator.rollouts.take() is not None
     learner.coordinator.publish(1, PARAMETERS, BUFFERS)
     learner.joins(B, host="other")
     return learner
@@ -272,20 +272,20 @@ def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent
         assert learner.now < budget_s + STALL_S
     assert learner.now > budget_s
     assert {member.peer for member in verdict.refuse} == {A, B}
-    learner.coordinator.end_evaluation()
+    learner.coordinator.evaluation.end()
     assert made.check(learner.now + 2, steps + 1) is None, "an evaluation that has ended holds nobody to account"
 
 
 @pytest.mark.parametrize(("most", "evaluators"), [(0, {A, B}), (5, {A, B}), (4, {A}), (1, {A})])
 def test_with_a_limit_of_copies_as_few_workers_play_evaluations_as_it_allows(most: int, evaluators: set[bytes]) -> None:
     learner = about_to_evaluate()
-    learner.coordinator.max_env_copies = most and most + learner.coordinator.run.lanes * learner.coordinator.run.copies - 1
+    learner.coordinator.evaluation.most_copies = most - 1 if most else None
     learner.balanced(learner.coordinator.begin_evaluation(EvaluationPlan(seeds=(1, 2, 3, 4), copies=2, most_steps=10)))
-    assert set(learner.coordinator.evaluation.holders) == evaluators
+    assert {member.peer for member in learner.coordinator.evaluation.players} == evaluators
 
 
 @pytest.mark.parametrize(("of_run", "of_machine", "least"), [(0, 0, 0), (9, 0, 9), (0, 7, 7), (9, 7, 7), (7, 9, 7)])
 def test_a_run_keeps_within_its_own_limit_of_copies_and_its_machine_s(of_run: int, of_machine: int, least: int) -> None:
     config, processes = RolloutConfig(max_env_copies=of_run), ProcessCallbacks(most_copies=of_machine)
     service = rollout_service(config, run_spec(), cast(LearnerLink, FakeLink()), processes, lambda: None)
-    assert service._hub.coordinator.max_env_copies == least
+    assert service._hub.coordinator.evaluation.most_copies == (least - 4 if least else None)

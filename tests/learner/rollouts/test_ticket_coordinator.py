@@ -93,11 +93,11 @@ class Learner:
 
     def tickets(self, peer: bytes | None = None) -> list[int]:
         """Numbers of the tickets that are with this worker, or with any."""
-        return sorted(number for number, ticket in self.coordinator.tickets.items() if peer in (None, ticket.peer))
+        return sorted(number for number, ticket in self.coordinator.rollouts.held.items() if peer in (None, ticket.peer))
 
     def rollout_of(self, number: int, sequence: int | None = None, version: int | None = None) -> Rollout:
         """The rollout of an outstanding ticket, as its worker would send it."""
-        ticket = self.coordinator.tickets[number]
+        ticket = self.coordinator.rollouts.held[number]
         return fake_rollout(
             self.session(ticket.peer),
             ticket.lane,
@@ -107,7 +107,7 @@ class Learner:
         )
 
     def delivers(self, number: int) -> list[Outgoing]:
-        return self.says(self.coordinator.tickets[number].peer, self.rollout_of(number))
+        return self.says(self.coordinator.rollouts.held[number].peer, self.rollout_of(number))
 
     def deliver_all(self) -> None:
         for number in self.tickets():
@@ -115,7 +115,7 @@ class Learner:
 
     def deliver_round(self) -> None:
         """What the next update still needs."""
-        tickets = self.coordinator.tickets.values()
+        tickets = self.coordinator.rollouts.held.values()
         oldest = min(ticket.round for ticket in tickets)
         for number in [ticket.number for ticket in tickets if ticket.round == oldest]:
             self.delivers(number)
@@ -136,7 +136,7 @@ class Learner:
         return self.says(peer, Heartbeat(self.session(peer), seen, tuple(weights), tuple(held), 0, {}, 0))
 
     def take(self) -> list[Rollout]:
-        taken = self.coordinator.take()
+        taken = self.coordinator.rollouts.take()
         assert taken is not None
         self.balanced([])
         return [arrived.rollout for arrived in taken]
@@ -157,9 +157,9 @@ class Learner:
 
     def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
         coordinator, ledger = self.coordinator, self.coordinator.ledger
-        in_flight = len(coordinator.tickets) + coordinator.rollouts_waiting()
+        in_flight = len(coordinator.rollouts.held) + coordinator.rollouts.waiting()
         assert ledger.issued == ledger.used + ledger.lost + in_flight
-        assert ledger.transitions_waiting == coordinator.rollouts_waiting()  # a fake rollout is one transition
+        assert ledger.transitions_waiting == coordinator.rollouts.waiting()  # a fake rollout is one transition
         return outs
 
 
@@ -302,10 +302,10 @@ def test_every_lane_has_a_ticket_for_every_open_round_and_no_other(max_lag: int,
     coordinator = learner.coordinator
     for update in range(5):
         open_rounds = {(number, lane) for number in range(update, update + max_lag + 1) for lane in range(lanes)}
-        assert {(ticket.round, ticket.lane) for ticket in coordinator.tickets.values()} == open_rounds
+        assert {(ticket.round, ticket.lane) for ticket in coordinator.rollouts.held.values()} == open_rounds
         assert coordinator.begin_update() == []  # it has begun
         learner.deliver_round()
-        assert len(coordinator.tickets) == lanes * max_lag
+        assert len(coordinator.rollouts.held) == lanes * max_lag
         learner.take()
         learner.publish(update + 1)
 
@@ -348,10 +348,10 @@ def test_the_round_of_a_lost_ticket_is_dealt_again_under_its_version() -> None:
     learner.deliver_round()
     learner.take()
     learner.publish(1)
-    lost = next(ticket for ticket in learner.coordinator.tickets.values() if ticket.round == 1 and ticket.lane == 0)
+    lost = next(ticket for ticket in learner.coordinator.rollouts.held.values() if ticket.round == 1 and ticket.lane == 0)
     outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(lost.number), "broken", 0.0))
     (permit,) = permits(outs)
-    again = learner.coordinator.tickets[permit.ticket]
+    again = learner.coordinator.rollouts.held[permit.ticket]
     assert (again.lane, again.round, again.version, again.sequence) == (0, 1, 0, 3)  # two and one of round 2 were dealt
 
 
@@ -371,10 +371,16 @@ def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_
     learner.joins(A)
     learner.delivers(learner.tickets()[0])  # lane 0 is done with its round
     learner.joins(B)  # a lane moves to B, at a rollout boundary
-    round_lanes = [*learner.coordinator.ready[0], *(ticket.lane for ticket in learner.coordinator.tickets.values())]
+    round_lanes = [
+        *learner.coordinator.rollouts.ready[0],
+        *(ticket.lane for ticket in learner.coordinator.rollouts.held.values()),
+    ]
     assert sorted(round_lanes) == [0, 1, 2]
     learner.says(A, Goodbye(learner.session(A), "bye", ()))
-    round_lanes = [*learner.coordinator.ready[0], *(ticket.lane for ticket in learner.coordinator.tickets.values())]
+    round_lanes = [
+        *learner.coordinator.rollouts.ready[0],
+        *(ticket.lane for ticket in learner.coordinator.rollouts.held.values()),
+    ]
     assert sorted(round_lanes) == [0, 1, 2]
 
 
@@ -382,12 +388,12 @@ def test_a_lane_that_is_to_move_finishes_what_it_was_dealt_and_the_others_go_on(
     learner = Learner(lanes=3, max_lag=1)
     learner.joins(A)
     learner.joins(B)
-    (moving,) = [lane.number for lane in learner.coordinator.lanes if lane.moving]
+    (moving,) = [lane.number for lane in learner.coordinator.rollouts.lanes if lane.moving]
     learner.deliver_round()
     learner.take()
     dealt = {permit.lane for permit in permits(learner.publish(1))}
     assert dealt == {0, 1, 2} - {moving}
-    (last,) = [ticket.number for ticket in learner.coordinator.tickets.values() if ticket.lane == moving]
+    (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == moving]
     outs = learner.delivers(last)
     (permit,) = permits(outs, B)
     assert (permit.lane, permit.incarnation, permit.sequence) == (moving, 1, 0)
@@ -421,7 +427,7 @@ def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() 
     rollout = learner.rollout_of(0)
     process_ends(learner.coordinator, "a", "killed")
     assert learner.says(A, rollout) == [(A, Rejoin(100))]
-    assert (learner.coordinator.ledger.transitions_late, learner.coordinator.ready) == (1, {})
+    assert (learner.coordinator.ledger.transitions_late, learner.coordinator.rollouts.ready) == (1, {})
 
 
 @pytest.mark.parametrize("change", [{"version": 0}, {"version": 2}, {"lane": 1}, {"sequence": 0}, {"sequence": 2}])
@@ -430,10 +436,10 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(chan
     learner.joins(A)
     learner.update()
     number, other = learner.tickets()
-    assert learner.coordinator.tickets[number].version == learner.coordinator.tickets[number].sequence == 1
+    assert learner.coordinator.rollouts.held[number].version == learner.coordinator.rollouts.held[number].sequence == 1
     outs = learner.says(A, msgspec.structs.replace(learner.rollout_of(number), **change))
     ledger = learner.coordinator.ledger
-    assert (learner.coordinator.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
+    assert (learner.coordinator.rollouts.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
     assert permits(outs) == [Permit(other + 1, 0, 0, 2)]
     assert learner.coordinator.members[A].strikes == 1
 
@@ -445,7 +451,7 @@ def test_a_rollout_of_another_workers_ticket_is_not_used_and_costs_that_worker_n
     learner.update()
     (theirs,) = learner.tickets(B)
     learner.says(A, msgspec.structs.replace(learner.rollout_of(theirs), session=learner.session(A)))
-    assert learner.coordinator.ready == {}
+    assert learner.coordinator.rollouts.ready == {}
     assert learner.tickets(B) == [theirs]
     assert (learner.coordinator.members[A].strikes, learner.coordinator.members[B].strikes) == (1, 0)
 
@@ -459,11 +465,11 @@ def test_a_lost_workers_tickets_and_lanes_are_dealt_to_the_living_with_a_higher_
     learner.joins(B)
     learner.update()
     (lost,) = learner.tickets(A)
-    lane = learner.coordinator.tickets[lost].lane
-    before = learner.coordinator.lanes[lane].incarnation
+    lane = learner.coordinator.rollouts.held[lost].lane
+    before = learner.coordinator.rollouts.lanes[lane].incarnation
     outs = learner.balanced(process_ends(learner.coordinator, "a", "killed"))
     assert [(p.lane, p.incarnation) for p in permits(outs, B)] == [(lane, before + 1)]
-    assert lost not in learner.coordinator.tickets
+    assert lost not in learner.coordinator.rollouts.held
     assert lanes_of(learner, B) == {0, 1}
 
 
@@ -484,7 +490,7 @@ def test_a_lane_that_was_never_started_keeps_its_incarnation_when_moved() -> Non
     learner.coordinator.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=2))
     learner.joins(B)
     assert (lanes_of(learner, A), lanes_of(learner, B)) == ({0}, {1})
-    learner.coordinator.end_evaluation()
+    learner.coordinator.evaluation.end()
     assert {(permit.lane, permit.incarnation) for permit in permits(learner.publish(0))} == {(0, 0), (1, 0)}
 
 
@@ -496,7 +502,7 @@ def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
     outs = learner.delivers(3)  # lane 3 is at its boundary
     assert of(outs, Release, A) == [Release(learner.session(A), (LaneIncarnation(3, 0),))]
     assert lanes_of(learner, B) == {3}
-    assert learner.coordinator.lanes[3].incarnation == 1
+    assert learner.coordinator.rollouts.lanes[3].incarnation == 1
     learner.update()
     assert len(lanes_of(learner, A)) == len(lanes_of(learner, B)) == 2
     assert learner.coordinator.ledger.lost == 0
@@ -509,7 +515,7 @@ def test_release_travels_before_what_the_lanes_new_owner_is_told() -> None:
     learner.deliver_round()
     learner.take()
     learner.publish(1)
-    (last,) = [ticket.number for ticket in learner.coordinator.tickets.values() if ticket.lane == 1]
+    (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == 1]
     outs = learner.delivers(last)  # lane 1 has nothing outstanding any more: it moves, and is dealt a ticket at once
     assert [type(message) for _, message in outs] == [Release, Collect, Weights]
     assert [permit.lane for permit in permits(outs, B)] == [1]
@@ -545,7 +551,9 @@ def test_a_lane_has_one_owner_whoever_comes_and_goes() -> None:
             owned = [n for member in learner.coordinator.members.values() for n in member.lanes]
             assert sorted(owned) == [0, 1, 2, 3, 4]
             assert all(
-                learner.coordinator.lanes[n].owner == m.peer for m in learner.coordinator.members.values() for n in m.lanes
+                learner.coordinator.rollouts.lanes[n].owner == m.peer
+                for m in learner.coordinator.members.values()
+                for n in m.lanes
             )
 
 
@@ -590,7 +598,7 @@ def test_weights_that_act_in_no_open_round_are_not_kept() -> None:
     learner.joins(A)
     for version in range(1, 9):
         learner.update_round(version)
-        assert len(learner.coordinator._weights) <= 4  # one for each open round, and the newest
+        assert len(learner.coordinator.weights.kept) <= 4  # one for each open round, and the newest
         assert len(learner.coordinator.members[A].versions) <= 4
 
 
@@ -802,7 +810,7 @@ def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the
     late = fake_rollout(session=5, lane=0, ticket=0, version=0, sequence=3)
     learner.balanced(learner.coordinator.reject_rollout(A, late, "obs are NaN", 0.0))
     assert learner.tickets(A) == [0]
-    assert learner.coordinator.lanes[0].out_of_order == set()
+    assert learner.coordinator.rollouts.lanes[0].out_of_order == set()
 
 
 @pytest.mark.parametrize("sequence", [-1, 1, 1 << 62])
@@ -811,7 +819,7 @@ def test_a_rollout_whose_sequence_cannot_be_is_not_used(sequence: int) -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.says(A, learner.rollout_of(0, sequence=sequence))
-    assert learner.coordinator.lanes[0].out_of_order == set()
+    assert learner.coordinator.rollouts.lanes[0].out_of_order == set()
     assert learner.coordinator.ledger.transitions_invalid == 1
 
 
@@ -978,11 +986,11 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:
     learner = Learner(lanes=2, publish=False)
     learner.joins(A)
-    assert learner.coordinator.incarnations() == [0, 0]
+    assert learner.coordinator.rollouts.incarnations() == [0, 0]
     learner.publish(0)
-    assert learner.coordinator.incarnations() == [1, 1]
+    assert learner.coordinator.rollouts.incarnations() == [1, 1]
     process_ends(learner.coordinator, "a", "killed")
-    assert learner.coordinator.incarnations() == [1, 1]
+    assert learner.coordinator.rollouts.incarnations() == [1, 1]
 
 
 def test_no_life_is_lived_twice_across_resumes() -> None:
@@ -1000,7 +1008,7 @@ def test_no_life_is_lived_twice_across_resumes() -> None:
             learner.update()
             process_ends(learner.coordinator, peer.decode(), "killed")
         version, ledger = learner.coordinator.version, msgspec.structs.replace(learner.coordinator.ledger)
-        incarnations = learner.coordinator.incarnations()
+        incarnations = learner.coordinator.rollouts.incarnations()
         ledger.lost += ledger.outstanding
 
 
@@ -1031,9 +1039,9 @@ def test_a_resumed_run_with_other_lanes_deals_tickets_from_there(before: int, la
 def test_a_lane_that_is_given_up_and_comes_back_does_not_live_again() -> None:
     two = Learner(lanes=2, incarnations=[3, 4, 5, 6])
     two.joins(A)
-    assert two.coordinator.incarnations() == [4, 5, 5, 6]
-    assert Learner(lanes=3, incarnations=[4, 5, 5, 6]).coordinator.incarnations() == [4, 5, 5, 6]
-    assert Learner(lanes=3, incarnations=[7]).coordinator.incarnations() == [7, 0, 0]
+    assert two.coordinator.rollouts.incarnations() == [4, 5, 5, 6]
+    assert Learner(lanes=3, incarnations=[4, 5, 5, 6]).coordinator.rollouts.incarnations() == [4, 5, 5, 6]
+    assert Learner(lanes=3, incarnations=[7]).coordinator.rollouts.incarnations() == [7, 0, 0]
 
 
 def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -> None:
@@ -1045,7 +1053,7 @@ def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -
     # The third round is collected again, after the fourth.
     learner.coordinator.reject_rollout(A, learner.rollout_of(third), "broken", 0.0)
     learner.deliver_all()
-    used = [arrived for _ in range(4) for arrived in learner.coordinator.take() or []]
+    used = [arrived for _ in range(4) for arrived in learner.coordinator.rollouts.take() or []]
     assert [(arrived.rollout.sequence, arrived.fresh) for arrived in used] == [(0, True), (1, False), (4, True), (3, True)]
 
 

@@ -59,7 +59,7 @@ class Unreliable:
     def updates(self, seconds: float) -> None:
         """Every lane collects, and an update is made of it. Raises what ends the run."""
         self.link.now += seconds
-        for number, ticket in list(self.coordinator.tickets.items()):
+        for number, ticket in list(self.coordinator.rollouts.held.items()):
             session = self.coordinator.members[ticket.peer].session
             self.hears(ticket.peer, fake_rollout(session, ticket.lane, number, ticket.version, ticket.sequence))
         self.hub.gather()
@@ -88,6 +88,6 @@ def test_a_run_in_which_a_copy_crashes_before_its_first_step_ends_at_the_fourth_
 
 def owner(run: Unreliable, lane: int) -> int:
     """Number of the worker that has the lane: after each crash another one."""
-    peer = run.coordinator.lanes[lane].owner
+    peer = run.coordinator.rollouts.lanes[lane].owner
     assert peer is not None
     return int(peer.decode().removeprefix("w"))

@@ -22,9 +22,9 @@ from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rows
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
-SAVED = {"_plan", "_version", "_first", "_seeds", "_undealt", "_held", "_played", "_rows"}
+SAVED = {"_plan", "_version", "_first", "_seeds", "_undealt", "held", "_played", "_rows"}
 """What of `EvaluationTickets` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_policy", "_facts", "_on_rows"}
+NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies"}
 
 
 class EvaluatingLearner(Learner):
@@ -49,12 +49,15 @@ class EvaluatingLearner(Learner):
             return
         assert self.coordinator.ledger.issued == self.barrier, "a ticket for a rollout was dealt during an evaluation"
         assert tickets._version == self.coordinator.version, "an evaluation belongs to another version"
-        held = [index for each in tickets._held.values() for index in each]
+        held = [number - tickets._first for number in tickets.held]
         every = sorted([*tickets._undealt, *held, *tickets._played])
         assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
-        for peer, each in tickets._held.items():
-            assert peer in members or not each, "a ticket of an evaluation is with a worker that is gone"
-            assert len(each) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"
+        for number, member in tickets.held.items():
+            assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"
+            assert number in member.tickets, "a worker does not know its ticket of an evaluation"
+        for member in tickets.players:
+            mine = [number for number in member.tickets if number >= FIRST_TICKET]
+            assert len(mine) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"
 
     # ---------------------------------------------------------------- inside
 
@@ -87,7 +90,7 @@ class EvaluatingLearner(Learner):
 
     def _end_evaluation(self) -> None:
         plan, version = self.settings.plan, self.coordinator.version
-        played = [one.episode.reward for one in self.coordinator.end_evaluation()]
+        played = [one.episode.reward for one in self.coordinator.evaluation.end()]
         assert played == [seed + version / 1000 for seed in plan.seeds], f"other episodes than those asked for: {played}"
         every = [(episode, step) for episode in range(len(plan.seeds)) for step in range(EPISODE_STEPS)]
         assert sorted(self.rows) == (every if plan.send_rows else []), "other rows than those of the episodes"
@@ -100,16 +103,19 @@ class EvaluatingLearner(Learner):
 def saved(learner: EvaluatingLearner, now: float) -> Content:
     """The training run, and the evaluation: its first ticket, their number, and more if it is pending."""
     content = learner_part.saved(learner, now)
-    tickets, members = learner.coordinator.evaluation, learner.coordinator.members
+    tickets = learner.coordinator.evaluation
     if not tickets.pending:
         return content, (tickets._first - FIRST_TICKET, len(tickets._seeds))
     held = tuple(
         (
             name(Kind.WORKER, worker_of(member.peer)),
-            tuple((index, name(Kind.REPLIES, sent_at, member.session)) for index, sent_at in sorted(mine.items())),
+            tuple(
+                (number - tickets._first, name(Kind.REPLIES, sent_at, member.session))
+                for number, sent_at in sorted(member.tickets.items())
+                if number >= FIRST_TICKET
+            ),
         )
-        for member in sorted(members.values(), key=lambda member: member.join_number)
-        if (mine := tickets._held.get(member.peer))
+        for member in sorted(tickets.players, key=lambda member: member.join_number)
     )
     played = tuple((index, tuple(e.reward for e in answer.episodes)) for index, answer in sorted(tickets._played.items()))
     rows = tuple(
@@ -143,7 +149,11 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     undealt, held, played, rows, barrier, of_learner = of_evaluation
     tickets.begin(settings.plan, learner.coordinator.version, learner._take_rows if settings.rows else None)
     tickets._undealt = list(undealt)
-    tickets._held = {peer_of(worker.value): {index: at.value for index, at in mine} for worker, mine in held}
+    for worker, mine in held:
+        member = learner.coordinator.members[peer_of(worker.value)]
+        for index, sent_at in mine:
+            tickets.held[tickets._first + index] = member
+            member.tickets[tickets._first + index] = sent_at.value
     tickets._played = {index: evaluated(0, tickets._first + index, returns) for index, returns in played}
     for index, episode, of_session, step in rows:
         come = tickets._rows.setdefault(index, {}).setdefault(episode, [])

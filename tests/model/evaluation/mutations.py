@@ -17,31 +17,33 @@ TICKETS = "learner.rollouts.evaluation_tickets"
 
 OF_THE_LEARNER = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),
-    "a ticket that was put back is lost": Mutation(TICKETS, "heapq.heappush(self._undealt, index)", "pass"),
+    "a ticket that was put back is lost": Mutation(
+        TICKETS, "heapq.heappush(self._undealt, self._end(member, number))", "self._end(member, number)"
+    ),
     "tickets for rollouts are dealt during an evaluation": Mutation(
         COORDINATOR,
-        "return self._with_weights(out + self.evaluation.deal(self._evaluators()))",
-        "out += self._with_weights(self.evaluation.deal(self._evaluators()))",
+        "orders = self.evaluation.deal(self.membership.active())\n        else:\n            orders",
+        "out += self.evaluation.deal(self.membership.active())\n        if True:\n            orders",
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
-        "self._with_weights(out + self.evaluation.deal(self._evaluators()))",
-        "out + self.evaluation.deal(self._evaluators())",
+        "return self.weights.after(out + orders, self.members)",
+        "return out + orders if self.evaluation.pending else self.weights.after(out + orders, self.members)",
     ),
-    "the lost weights of an evaluation are not sent again": Mutation(COORDINATOR, "named.add(self.version)", "pass"),
-    "a lost order to evaluate is not sent again": Mutation(
-        COORDINATOR, " + self.evaluation.send_again(member, heartbeat)", ""
-    ),
+    "the lost weights of an evaluation are not sent again": Mutation(COORDINATOR, " | self.evaluation.versions(mine)", ""),
+    "a lost order to evaluate is not sent again": Mutation(COORDINATOR, " + self.evaluation.send(member, lost)", ""),
     "the evaluation's tickets of a lost worker are kept": Mutation(
-        COORDINATOR, "self.evaluation.removed(member.peer)", "pass"
+        COORDINATOR, "dealer.lose(member, number)", "dealer is self.rollouts and dealer.lose(member, number)"
     ),
     "two evaluations number their tickets alike": Mutation(TICKETS, "self._first += len(self._seeds)", "pass"),
     "a ticket of an evaluation is dealt twice": Mutation(TICKETS, "heapq.heappop(self._undealt)", "self._undealt[0]"),
-    "an answer leaves its ticket with the worker": Mutation(TICKETS, "del self._held[member.peer][index]", "pass"),
-    "rows of a lost worker are kept": Mutation(TICKETS, "self._rows.pop(index, None)\n        heapq", "heapq"),
+    "an answer leaves its ticket with the worker": Mutation(
+        TICKETS, "del self.held[number], member.tickets[number]", "del self.held[number]"
+    ),
+    "rows of a lost worker are kept": Mutation(TICKETS, "self._rows.pop(index, None)", "pass"),
     "an answer counts without its rows": Mutation(TICKETS, "!= [one.length for one in answer.episodes]:", "== []:"),
     "an evaluation that was played again is forgotten": Mutation(
-        TICKETS, "self._put_back(index)  # a message with rows was lost", "pass  # a message with rows was lost"
+        TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(member, answer.ticket)  # a message"
     ),
 }
 OF_THE_WORKER = {

@@ -142,8 +142,8 @@ def _learners(folder: Path, accepted: Acceptance) -> list[LearnerTrace]:
 
 def _check_checkpoint(name: str, coordinator: Any, moments: list[tuple[Any, ...]]) -> None:
     ledger: Ledger = coordinator.ledger
-    began = tuple(coordinator.incarnations()), ledger.issued, ledger.used
-    if began not in [moment[1:] for moment in moments]:
+    began = tuple(coordinator.rollouts.incarnations()), ledger.issued, ledger.used
+    if began not in moments:
         raise NotAccepted(
             f"{name}: begins with incarnations, tickets issued and used {began}, of which there is no checkpoint"
         )

@@ -27,9 +27,10 @@ COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent
 METHODS = {
     "TicketCoordinator": (
         *COMMON,
-        *("reject_rollout", "refuse", "publish", "begin_update", "take", "not_used"),
-        *("begin_evaluation", "end_evaluation", "drain", "incarnations"),
+        *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "drain"),
     ),
+    "RolloutTickets": ("take", "not_used", "incarnations"),
+    "EvaluationTickets": ("end",),
     "DescribeCoordinator": (*COMMON, "finish"),
     "Membership": ("refuse", "record_activity"),
     "Session": (
@@ -37,6 +38,7 @@ METHODS = {
         *("next_work", "work_ended"),
     ),
 }
+MADE_BY_THE_COORDINATOR = ("Membership", "RolloutTickets", "EvaluationTickets")
 CHANGE_NOTHING_IF_EMPTY = ("tick", "heartbeat_if_due")
 
 
@@ -89,9 +91,9 @@ class Recorder:
         return version, digest
 
     @staticmethod
-    def _snapshot(coordinator: Any, incarnations: list[int]) -> tuple[Any, ...]:
-        """What a checkpoint may take of the coordinator."""
-        return coordinator.version, tuple(incarnations), coordinator.ledger.issued, coordinator.ledger.used
+    def _snapshot(rollouts: Any, incarnations: list[int]) -> tuple[Any, ...]:
+        """What a checkpoint may take of the tickets."""
+        return tuple(incarnations), rollouts.ledger.issued, rollouts.ledger.used
 
     def _write(self, record: tuple[Any, ...]) -> None:
         os.write(self._fd, pickle.dumps(tuple(record), 5))
@@ -123,7 +125,7 @@ def recorded(original: type[Any]) -> type[Any]:
         return call
 
     def make(self: Any, *given: Any, **named: Any) -> None:
-        if part == "Membership":  # its coordinator makes it
+        if part in MADE_BY_THE_COORDINATOR:
             original.__init__(self, *given, **named)
         else:
             _recorder_of(part, given).call(part, "__init__", original.__init__, self, *given, **named)
@@ -136,7 +138,7 @@ class _Finder(MetaPathFinder):
     """Imports some modules with recorded classes."""
 
     classes = {
-        COORDINATOR: ("TicketCoordinator", "Membership"),
+        COORDINATOR: ("TicketCoordinator", "Membership", "RolloutTickets", "EvaluationTickets"),
         DESCRIBE: ("DescribeCoordinator", "Membership"),
         SESSION: ("Session",),
     }

@@ -21,6 +21,7 @@ from tests.model.traces.record import Digests, Record, SaidMember, message_of
 from workers.conversation.session import Session
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
+MADE_BY_THE_COORDINATOR = {"Membership": "membership", "RolloutTickets": "rollouts", "EvaluationTickets": "evaluation"}
 
 
 class NotAccepted(AssertionError):
@@ -52,7 +53,7 @@ class Rules:
     def begun(self) -> None:
         """The next update begins, unless it has."""
         learner = self._learner
-        if len(learner.begun) == self._coordinator._rounds.next:
+        if len(learner.begun) == self._coordinator.rollouts.rounds.next:
             learner.begun.append(self._coordinator.version)
 
     def published(self) -> None:
@@ -77,7 +78,7 @@ class Rules:
         self._learner.check()
         evaluation = self._coordinator.evaluation
         if evaluation.pending:
-            held = [index for each in evaluation._held.values() for index in each]
+            held = [number - evaluation._first for number in evaluation.held]
             every = sorted([*evaluation._undealt, *held, *evaluation._played])
             assert every == list(range(len(evaluation._seeds))), "a ticket of an evaluation is not in one place"
             assert evaluation._version == self._coordinator.version, "an evaluation belongs to another version"
@@ -132,9 +133,10 @@ class Replay:
 
     def _call(self, record: Record, given: list[Any], named: dict[str, Any]) -> None:
         coordinator: Any = self.parts.get("TicketCoordinator", self.parts.get("DescribeCoordinator"))
-        called = coordinator.membership if record.part == "Membership" else self.parts[record.part]
+        name = MADE_BY_THE_COORDINATOR.get(record.part)
+        called = self.parts[record.part] if name is None else getattr(coordinator, name)
         given = [_member(each, coordinator) for each in given]
-        waiting = waiting_rollouts(coordinator) if record.part == "TicketCoordinator" else []
+        waiting = waiting_rollouts(coordinator) if self._rules is not None else []
         match record.method:
             case "publish":
                 version, digest = given
@@ -145,11 +147,11 @@ class Replay:
         result = getattr(called, record.method)(*given, **named)
         found = self._digests.result(result)
         if record.method == "incarnations":
-            found = coordinator.version, tuple(result), coordinator.ledger.issued, coordinator.ledger.used
+            found = tuple(result), coordinator.ledger.issued, coordinator.ledger.used
         assert found == record.result, f"expected {record.result}, got {found}"
         if coordinator is not None:
             coordinator.membership.events.clear()
-        if record.part == "TicketCoordinator":
+        if self._rules is not None:
             self._follow(record.method, result, waiting)
 
     def _follow(self, method: str, result: Any, waiting: Sequence[AcceptedRollout]) -> None:

@@ -1,0 +1,173 @@
+"""The tickets for rollouts: which rounds are open, which worker collects what, and what has come. Pure.
+
+Rule: a ticket is the permission for one rollout: of this lane, in this round, under this version. `rounds.py` says which
+rounds are open, and each lane gets a ticket for every one of them. When a ticket is lost, its round is dealt again, under
+the same version. Every ticket and every transition is counted in the ledger.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from learner.members.membership import Member, Outgoing
+from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
+from learner.rollouts.ledger import Ledger
+from learner.rollouts.rounds import Rounds
+from protocol.messages import Collect, Permit, Received, Rollout
+
+
+class RolloutTickets:
+    """Lanes, rounds, tickets and the ledger."""
+
+    def __init__(self, lanes: int, max_lag: int, ledger: Ledger | None = None, incarnations: Sequence[int] = ()) -> None:
+        """`incarnations`: the first of each lane; there may be more or fewer of them than lanes."""
+        self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(lanes)]
+        self.ledger = ledger or Ledger()
+        self.held: dict[int, Ticket] = {}
+        """the tickets that workers hold, by number"""
+        self.ready: dict[int, dict[int, AcceptedRollout]] = {}
+        """the rollouts that have come and were not taken, by round and by lane"""
+        self.rounds = Rounds(max_lag)
+        self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had, and may have again
+        self._to_deal = set[int]()  # lanes with rounds that are to be dealt
+
+    # ---------------------------------------------------------------- the learner's side
+
+    def begin_update(self, version: int) -> None:
+        """The next update begins, unless it has begun, while this version is the newest: its rounds are to be dealt."""
+        for number in self.rounds.begin(version):
+            for lane in self.lanes:
+                lane.due.append(number)
+        self._to_deal |= {lane.number for lane in self.lanes if lane.due}
+
+    def take(self) -> list[AcceptedRollout] | None:
+        """The rollouts of the next update, in lane order, or None while there are too few."""
+        if len(self.ready.get(self.rounds.next, ())) < len(self.lanes):
+            return None
+        taken = [rollout for _, rollout in sorted(self.ready.pop(self.rounds.next).items())]
+        self.rounds.end()
+        self.ledger.used += len(taken)
+        self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
+        return [self._marked(arrived) for arrived in taken]
+
+    def not_used(self, taken: list[AcceptedRollout]) -> None:
+        """Count rollouts that `take` returned as lost: no update was made of them."""
+        self.ledger.used -= len(taken)
+        self.ledger.lost += len(taken)
+        env_steps = sum(arrived.rollout.env_steps for arrived in taken)
+        self.ledger.transitions_used -= env_steps
+        self.ledger.transitions_late += env_steps
+
+    def awaited(self) -> list[Ticket]:
+        """The tickets of the next update that workers hold."""
+        return [ticket for ticket in self.held.values() if ticket.round == self.rounds.next]
+
+    def waiting(self) -> int:
+        """Number of rollouts that have come and were not taken."""
+        return sum(map(len, self.ready.values()))
+
+    def incarnations(self) -> list[int]:
+        """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
+        return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
+
+    # ---------------------------------------------------------------- out
+
+    def deal(self, members: Mapping[bytes, Member]) -> list[Outgoing]:
+        """Deal the rounds that no worker collects, each to the owner of its lane."""
+        dealt: dict[bytes, list[int]] = {}
+        for lane in [self.lanes[number] for number in sorted(self._to_deal)]:
+            if lane.owner is None or lane.moving:
+                continue
+            for round_number in lane.due:
+                ticket = lane.deal(self.ledger.issued, round_number, self.rounds.version(round_number))
+                self.held[ticket.number] = ticket
+                dealt.setdefault(lane.owner, []).append(ticket.number)
+                self.ledger.issued += 1
+            lane.due.clear()
+            self._to_deal.remove(lane.number)
+        return [order for peer, numbers in dealt.items() for order in self.send(members[peer], numbers)]
+
+    def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
+        """The orders for these tickets, those of a rollout among them: one for each version that they name."""
+        chosen = [self.held[number] for number in tickets if number in self.held]
+        member.tickets |= {ticket.number: member.replies for ticket in chosen}
+        out: list[Outgoing] = []
+        for version in sorted({ticket.version for ticket in chosen}):
+            permits = tuple(
+                Permit(each.number, each.lane, each.incarnation, each.sequence) for each in chosen if each.version == version
+            )
+            out.append((member.peer, Collect(member.session, version, permits, self.received(member))))
+        return out
+
+    def versions(self, tickets: Iterable[int]) -> set[int]:
+        """The versions that these tickets name, those of a rollout among them."""
+        return {self.held[number].version for number in tickets if number in self.held}
+
+    def received(self, member: Member) -> tuple[Received, ...]:
+        """The lanes of this worker, and what has come of them."""
+        mine = [self.lanes[number] for number in member.lanes]
+        return tuple(Received(lane.number, lane.incarnation, lane.next_sequence, tuple(lane.out_of_order)) for lane in mine)
+
+    # ---------------------------------------------------------------- in
+
+    def take_in(self, member: Member, rollout: Rollout) -> str:
+        """Take a rollout that has come, unless it came before. Returns what is wrong with it, or nothing.
+
+        What is wrong is not counted: see `invalid` and `reject`.
+        """
+        ticket = self.held.get(rollout.ticket)
+        if ticket is None:
+            self.ledger.transitions_received += rollout.env_steps
+            self.ledger.transitions_duplicate += rollout.env_steps
+            return ""
+        expected = ticket.peer, ticket.lane, ticket.version, ticket.sequence
+        if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:
+            expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
+            got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
+            return f"ticket {ticket.number}: expected {expects}, got {got}"
+        self.ledger.transitions_received += rollout.env_steps
+        self._end(member, ticket).arrived(rollout.sequence)
+        member.stepped = True
+        self.ready.setdefault(ticket.round, {})[ticket.lane] = AcceptedRollout(rollout, ticket.incarnation)
+        return ""
+
+    def late(self, rollout: Rollout) -> None:
+        """Count a rollout of a session that has ended."""
+        self.ledger.transitions_received += rollout.env_steps
+        self.ledger.transitions_late += rollout.env_steps
+
+    def invalid(self, rollout: Rollout) -> None:
+        """Count a rollout that cannot be used."""
+        steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
+        self.ledger.transitions_received += steps
+        self.ledger.transitions_invalid += steps
+
+    def reject(self, member: Member, number: int) -> None:
+        """What came for this ticket cannot be used. The ticket, if this member holds it, is lost."""
+        if number in self.held and number in member.tickets:
+            ticket = self.held[number]
+            self.lanes[ticket.lane].arrived(ticket.sequence)  # so that its worker drops it
+            self.lose(member, number)
+
+    def lose(self, member: Member, number: int) -> None:
+        """The ticket, which this member holds, is lost: its round is to be dealt again."""
+        ticket = self.held[number]
+        insort(self._end(member, ticket).due, ticket.round)
+        self._to_deal.add(ticket.lane)
+        self.ledger.lost += 1
+
+    # ---------------------------------------------------------------- inside
+
+    def _end(self, member: Member, ticket: Ticket) -> TicketedLane:
+        """The ticket is outstanding no more. Returns its lane."""
+        del self.held[ticket.number], member.tickets[ticket.number]
+        lane = self.lanes[ticket.lane]
+        lane.outstanding.remove(ticket.number)
+        return lane
+
+    def _marked(self, arrived: AcceptedRollout) -> AcceptedRollout:
+        """The rollout, which an update uses next, marked as fresh or not."""
+        lane = self.lanes[arrived.rollout.lane]
+        return replace(arrived, fresh=not lane.use(arrived.incarnation, arrived.rollout.sequence))

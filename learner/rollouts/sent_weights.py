@@ -1,0 +1,47 @@
+"""The weights that orders name, and which workers hold them. Pure.
+
+Rule: weights are kept while they are the newest or act in a round that is open. They are sent to a worker after the first
+order that names them, and again if its Heartbeat shows that they were lost on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+
+from learner.members.membership import Outgoing
+from learner.rollouts.collecting_member import CollectingMember
+from protocol.messages import Collect, Evaluate, Heartbeat, Weights
+
+
+class SentWeights:
+    """The weights of a run that workers need."""
+
+    def __init__(self) -> None:
+        self.kept: dict[int, Weights] = {}
+        """by version"""
+
+    def publish(self, weights: Weights, acts: Callable[[int], bool]) -> None:
+        """Set the newest weights. `acts`: whether a version acts in an open round; others are dropped."""
+        self.kept = {version: each for version, each in self.kept.items() if acts(version)}
+        self.kept[weights.version] = weights
+
+    def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
+        """These messages; after each order that names a version that its worker does not hold, these weights."""
+        out: list[Outgoing] = []
+        for peer, message in orders:
+            out.append((peer, message))
+            member = members[peer]
+            if isinstance(message, Collect | Evaluate) and message.version not in member.versions:
+                out.append((peer, self.kept[message.version]))
+                needed = {version: sent_at for version, sent_at in member.versions.items() if version in self.kept}
+                member.versions = needed | {message.version: member.replies}
+        return out
+
+    def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
+        """Those of the `named` versions that were lost on the way to this worker, as its heartbeat shows."""
+        sent = member.versions.items()
+        # What it does not list was dropped or lost, unless it may still be on its way.
+        held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}
+        lost = sorted(set(named) - held.keys())
+        member.versions = held | dict.fromkeys(lost, member.replies)
+        return [(member.peer, self.kept[version]) for version in lost]
