@@ -59,7 +59,7 @@ class Coordinator(ABC, Generic[M]):
             return welcome if joined is None else welcome + self._joined()
         if isinstance(message, Alive):
             answer, exits = self.membership.hear_supervisor(peer, message, now)
-            return [*answer, *(self._ended(exits) if exits else [])]
+            return [*answer, *(self._deal() if exits else [])]
         member = self.membership.member_of_session(peer, message, now)
         if member is None:
             self._late(message)
@@ -92,7 +92,7 @@ class Coordinator(ABC, Generic[M]):
 
     def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
         """A process of this program has ended."""
-        return self._ended([worker_exit]) if self.membership.record_exit(worker_exit) else []
+        return self._deal() if self.membership.record_exit(worker_exit) else []
 
     def remove_silent(self, now: float) -> list[Outgoing]:
         """Remove workers that were silent for longer than `worker_timeout_s`.
@@ -145,10 +145,6 @@ class Coordinator(ABC, Generic[M]):
 
     def _failed(self, failed: Failed) -> None:
         """A member has failed, and was removed."""
-
-    def _ended(self, exits: Sequence[WorkerExit]) -> list[Outgoing]:
-        """The processes of members have ended, and these were removed."""
-        return self._deal()
 
     # ---------------------------------------------------------------- inside
 

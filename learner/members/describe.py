@@ -13,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
+from learner.members.events import Event
+from learner.members.failure_count import FailureCount
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from protocol.envs.description import DescribedEnv
@@ -57,12 +59,16 @@ def described_by_workers(
         spec,
         int.from_bytes(os.urandom(6), "little"),
         worker_timeout_s=settings.worker_timeout_s,
-        max_env_failures=settings.max_env_failures,
         decliners_to_end=1 if processes.expected else settings.launched_workers,
         accept=accept,
     )
+    failures = FailureCount(settings.max_env_failures, began_s=clock())
+
+    def count(event: Event) -> None:
+        failures.count(event, clock())
+
     members = coordinator.membership.members
-    callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), lambda event: None)
+    callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), count)
     server_settings = ServerSettings(log_joins=False)
     server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)
     began_s = logged_s = clock()
@@ -70,8 +76,9 @@ def described_by_workers(
         while coordinator.described is None:
             server.listen(POLL_S)
             check_interrupt()
-            if coordinator.failure is not None:
-                raise coordinator.failure
+            failures.check()
+            if coordinator.unsuitable is not None:
+                raise coordinator.unsuitable
             now = clock()
             server.check_members(settings.no_workers_timeout_s)
             waiting_for = _waiting_for(link, server, sorted(member.hello.worker for member in members.values()))

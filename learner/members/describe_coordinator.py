@@ -2,21 +2,19 @@
 
 Rule: the first description that can be read and is accepted is that of the run; other workers are compared with it when they
 open their lanes. A worker that declines, or describes what is not accepted, is refused, and the learner waits for another;
-once `decliners_to_end` different workers have been, the start ends with the reason. An environment that fails counts; its
-worker may come back.
+once `decliners_to_end` different workers have been, the start ends with the reason. A worker whose environment fails may
+come back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from learner.members.coordinator import Coordinator
-from learner.members.events import Failed
-from learner.members.failure_count import FailureCount
 from learner.members.membership import Member, Membership, Outgoing
 from protocol.alive import NO_SLOT
 from protocol.envs.description import DescribedEnv, read_description
-from protocol.errors import BadMessage, EnvironmentFailed, UsageError, UserFacingError
+from protocol.errors import BadMessage, UsageError
 from protocol.messages import (
     TOLD_TO_STOP,
     Described,
@@ -24,7 +22,6 @@ from protocol.messages import (
     Rejoin,
     Status,
     ToLearner,
-    WorkerExit,
 )
 from protocol.specs import DescribeSpec
 
@@ -45,7 +42,6 @@ class DescribeCoordinator(Coordinator[Member]):
         first_session: int,
         *,
         worker_timeout_s: float,
-        max_env_failures: int,
         decliners_to_end: int,
         accept: Accept = accept_any,
     ) -> None:
@@ -54,9 +50,8 @@ class DescribeCoordinator(Coordinator[Member]):
         self.spec = spec
         self.described: DescribedEnv | None = None
         """What the first usable description says."""
-        self.failure: UserFacingError | None = None
-        """Why the start cannot go on."""
-        self._failures = FailureCount(max_env_failures)
+        self.unsuitable: UsageError | None = None
+        """Why the start cannot go on: too many workers declined."""
         self._decliners_to_end, self._accept = decliners_to_end, accept
         self._decliners: set[str] = set()
 
@@ -96,19 +91,5 @@ class DescribeCoordinator(Coordinator[Member]):
             self._decliners.add(member.hello.worker)
             if len(self._decliners) >= self._decliners_to_end:
                 self.membership.take_events()  # the reason is the error's text, and need not be logged too
-                self.failure = self.failure or UsageError(reason)
+                self.unsuitable = self.unsuitable or UsageError(reason)
         return refusal
-
-    def _ended(self, exits: Sequence[WorkerExit]) -> list[Outgoing]:
-        for worker_exit in exits:
-            if worker_exit.failed:
-                self._count_failure(worker_exit.worker, f" {worker_exit.reason}", "")
-        return []
-
-    def _failed(self, failed: Failed) -> None:
-        self._count_failure(failed.worker, f" ({failed.host}): {failed.error}", failed.traceback)
-
-    def _count_failure(self, worker: str, what: str, detail: str) -> None:
-        why = self._failures.failed((worker,), False, 0.0)
-        if why and self.failure is None and self.described is None:
-            self.failure = EnvironmentFailed(f"worker {worker}{what}; {why}", detail)

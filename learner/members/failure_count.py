@@ -14,8 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from learner.members.events import Failed
+from learner.members.events import Event, Failed, PolicyRaised
 from protocol.bounds import MAX_LINE, one_line
+from protocol.errors import EnvironmentFailed, PolicyFailed
 
 MOST_IN_A_ROW = 10
 AFTER_STEPS = 0.25
@@ -29,6 +30,7 @@ class FailureCount:
         """`allowed`: `max_env_failures`. `copies`: the env copies of the run. `began_s`: when the learner began."""
         self._allowed, self._copies, self._began_s = allowed, copies, began_s
         self._in_a_row: dict[int | str, float] = {}
+        self._error: EnvironmentFailed | PolicyFailed | None = None
         self._failed_at_s: list[float] = []  # times of the failures of the last hour, of those after env steps
 
     def failed(self, lanes: Collection[int | str], stepped: bool, now: float) -> str:
@@ -51,10 +53,18 @@ class FailureCount:
         why = f" (one after env steps counts as {AFTER_STEPS:g}{hint})" if in_a_row % 1 else ""
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
 
-    def line(self, event: Failed, now: float) -> str:
-        """Count this failure. Returns the line of the error that ends the run, or an empty string."""
-        why = self.failed(event.lanes or (event.worker,), event.stepped, now)
-        return one_line(f"worker {event.worker} ({event.host}): {event.error}; {why}", 4 * MAX_LINE) if why else ""
+    def count(self, event: Event, now: float) -> None:
+        """Count an event that is a failure, of the environment or of the user's policy: they are counted together."""
+        if not isinstance(event, Failed) or event.spare or self._error is not None:
+            return
+        if why := self.failed(event.lanes or (event.worker,), event.stepped, now):
+            line = one_line(f"worker {event.worker} ({event.host}): {event.error}; {why}", 4 * MAX_LINE)
+            self._error = (PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed)(line, event.traceback)
+
+    def check(self) -> None:
+        """Raise the error that ends the run: the first failure that was one too many, if there was one."""
+        if self._error is not None:
+            raise self._error
 
     def collected(self, lane: int) -> None:
         """A rollout of this lane has arrived."""

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
-from learner.members.events import Event, Failed, PolicyRaised
 from learner.members.failure_count import FailureCount
 from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
@@ -33,7 +32,7 @@ from protocol.address import name_for_people
 from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import Stages, one_line
-from protocol.errors import BadRollout, EnvironmentFailed, PolicyFailed, Stalled
+from protocol.errors import BadRollout, Stalled
 from protocol.messages import Evaluated, Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
 from protocol.wire.learner_link import LearnerLink
@@ -132,9 +131,8 @@ class Hub:
         self._progress = Progress()
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
-        self._failure: EnvironmentFailed | PolicyFailed | None = None
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
-        callbacks = ServerCallbacks(self._answer, self.status, self._on_event)
+        callbacks = ServerCallbacks(self._answer, self.status, lambda event: self._failures.count(event, clock()))
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)
 
@@ -305,9 +303,8 @@ class Hub:
         self._listen(timeout_s)
         self._check_interrupt()
         while self._processes.failed:
-            self._on_event(self._processes.failed.pop(0))
-        if self._failure is not None:
-            raise self._failure
+            self._failures.count(self._processes.failed.pop(0), self._clock())
+        self._failures.check()
         self._server.check_members(self.settings.no_workers_timeout_s)
 
     def _listen(self, timeout_s: float, short: bool = False) -> None:
@@ -335,11 +332,3 @@ class Hub:
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
         return status(self.coordinator, self._progress, now, self.waiting(now))
-
-    def _on_event(self, event: Event) -> None:
-        """Count the failures of environments and of the user's policy together; that which is one too many is the error."""
-        if not isinstance(event, Failed) or event.spare or self._failure is not None:
-            return
-        if line := self._failures.line(event, self._clock()):
-            kind = PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed
-            self._failure = kind(line, event.traceback)

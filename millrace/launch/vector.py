@@ -135,7 +135,13 @@ def make_vec(
         kwargs=kwargs,
         wrappers=wrappers,
     )
-    deaths = _Deaths(FailureCount(settings.max_env_failures, len(settings.envs), time.monotonic()))
+    deaths = FailureCount(settings.max_env_failures, len(settings.envs), time.monotonic())
+
+    def died(event: Failed) -> None:
+        for lane in event.lanes if event.stepped else ():
+            deaths.collected(lane)  # every step is a result of its own
+        deaths.count(event, time.monotonic())
+
     timeouts = _call_timeouts(settings.timeout_s)
     flags = timeout_flags(timeouts)
     local_workers = settings.local_workers
@@ -150,7 +156,7 @@ def make_vec(
     try:
         started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
         made = started.vector_env(started.describe(describe))
-        made.call_on_death(deaths.died)
+        made.call_on_death(died)
         made.watch(deaths.check)
         made.wait_for(local_workers or settings.lane_count, join_timeout_s)
         made.make_copies()
@@ -160,28 +166,6 @@ def make_vec(
         if isinstance(error, EnvironmentFailed) and error.detail:
             error.add_note(error.detail)
         raise
-
-
-class _Deaths:
-    """Ends a vector environment whose environment ends its workers too often."""
-
-    def __init__(self, failures: FailureCount) -> None:
-        self._failures = failures
-        self._error: EnvironmentFailed | None = None
-
-    def died(self, event: Failed) -> None:
-        """Count the death of a worker in the environment's code. That which is one too many is the error."""
-        if self._error is not None:
-            return
-        for lane in event.lanes if event.stepped else ():
-            self._failures.collected(lane)  # every step is a result of its own
-        if line := self._failures.line(event, time.monotonic()):
-            self._error = EnvironmentFailed(line)
-
-    def check(self) -> None:
-        """Raise `EnvironmentFailed` if there were too many deaths."""
-        if self._error is not None:
-            raise self._error
 
 
 @dataclass(frozen=True)

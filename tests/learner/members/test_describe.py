@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import cast
 
@@ -12,6 +13,7 @@ from gymnasium import spaces
 
 from learner.members.describe import LOG_WAITING_EVERY_S, DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
+from learner.members.events import EnvironmentRaised, Failed, WorkerProcessFailed
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from protocol.alive import NO_SLOT
@@ -51,9 +53,7 @@ SETTINGS = DescribeSettings(worker_timeout_s=5, no_workers_timeout_s=60, stall_t
 
 
 def coordinator(*, decliners_to_end: int = 1, accept: Accept = accept_any) -> DescribeCoordinator:
-    return DescribeCoordinator(
-        SPEC, 10, worker_timeout_s=5, max_env_failures=1, decliners_to_end=decliners_to_end, accept=accept
-    )
+    return DescribeCoordinator(SPEC, 10, worker_timeout_s=5, decliners_to_end=decliners_to_end, accept=accept)
 
 
 def of_three(env: DescribedEnv) -> None:
@@ -117,15 +117,15 @@ def test_a_message_that_exceeds_the_bounds_gets_its_sender_refused() -> None:
 def test_a_worker_of_ours_that_declines_ends_the_start_with_its_reason() -> None:
     made = coordinator()
     made.receive(A, Goodbye(join(made, A), "environment Fake-v0 is not registered", ()), 1.0)
-    assert isinstance(made.failure, UsageError)
-    assert str(made.failure) == "environment Fake-v0 is not registered"
+    assert isinstance(made.unsuitable, UsageError)
+    assert str(made.unsuitable) == "environment Fake-v0 is not registered"
     assert not made.membership.take_events()  # the error's line is the only one
 
 
 def test_a_worker_from_elsewhere_that_declines_is_refused_and_the_learner_waits_on() -> None:
     made = coordinator(decliners_to_end=0)
     made.receive(A, Goodbye(join(made, A), "environment Fake-v0 is not registered", ()), 1.0)
-    assert made.failure is None
+    assert made.unsuitable is None
     ((_, refusal),) = made.receive(A, hello(A), 2.0)
     assert refusal == Refuse("environment Fake-v0 is not registered")
     made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
@@ -136,8 +136,8 @@ def test_a_description_that_is_not_accepted_ends_the_start_if_the_worker_is_ours
     made = coordinator(accept=of_three)
     made.receive(A, Described(join(made, A), OF_NINE), 1.0)
     assert made.described is None
-    assert isinstance(made.failure, UsageError)
-    assert str(made.failure) == "expected Discrete(3), got Discrete(9)"
+    assert isinstance(made.unsuitable, UsageError)
+    assert str(made.unsuitable) == "expected Discrete(3), got Discrete(9)"
     assert not made.membership.take_events()  # the error's line is the only one
 
 
@@ -145,10 +145,10 @@ def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_an
     made = coordinator(decliners_to_end=0, accept=of_three)
     ((peer, refusal),) = made.receive(A, Described(join(made, A), OF_NINE), 1.0)
     assert (peer, refusal) == (A, Refuse("expected Discrete(3), got Discrete(9)"))
-    assert (made.described, made.failure) == (None, None)
+    assert (made.described, made.unsuitable) == (None, None)
     made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
     assert made.described is not None
-    assert made.failure is None
+    assert made.unsuitable is None
 
 
 def test_the_start_ends_once_all_workers_of_the_launcher_have_declined() -> None:
@@ -156,10 +156,10 @@ def test_the_start_ends_once_all_workers_of_the_launcher_have_declined() -> None
     for nonce in (1, 2):  # the first is started again, and counts once
         answer = made.receive(A, Goodbye(join(made, A, nonce), "environment Fake-v0 is not registered", ()), 1.0)
         assert answer == [(A, Refuse("environment Fake-v0 is not registered"))]
-        assert made.failure is None
+        assert made.unsuitable is None
     made.receive(B, Goodbye(join(made, B), "environment Fake-v0 is not registered", ()), 1.0)
-    assert isinstance(made.failure, UsageError)
-    assert str(made.failure) == "environment Fake-v0 is not registered"
+    assert isinstance(made.unsuitable, UsageError)
+    assert str(made.unsuitable) == "environment Fake-v0 is not registered"
 
 
 @pytest.mark.parametrize("decliners_to_end", [0, 1])
@@ -167,20 +167,17 @@ def test_the_start_ends_once_all_workers_of_the_launcher_have_declined() -> None
 def test_a_worker_that_must_leave_says_nothing_of_the_environment(decliners_to_end: int, reason: str) -> None:
     made = coordinator(decliners_to_end=decliners_to_end)
     made.receive(A, Goodbye(join(made, A), reason, ()), 1.0)
-    assert made.failure is None
+    assert made.unsuitable is None
     assert isinstance(made.receive(A, hello(A), 2.0)[0][1], Welcome)
 
 
-def test_failures_are_counted_and_the_worker_may_come_back() -> None:
+def test_failures_are_told_and_the_worker_may_come_back() -> None:
     made = coordinator()
     for nonce in (1, 2):
-        assert made.failure is None
         made.receive(A, Failure(join(made, A, nonce), "OSError: no display", "where\nit was", None), 1.0)
-    assert isinstance(made.failure, EnvironmentFailed)
-    assert (
-        str(made.failure) == "worker w0 (host): OSError: no display; failure 2 in a row; max_env_failures allows 1 in a row"
-    )
-    assert made.failure.detail == "where\nit was"
+    failed = EnvironmentRaised("w0", "host", "OSError: no display", "where\nit was")
+    assert [event for event in made.events if isinstance(event, Failed)] == [failed, failed]
+    assert made.unsuitable is None
 
 
 def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
@@ -190,12 +187,12 @@ def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
     made.process_ended(WorkerExit("w0", 1, why, failed=True))  # a process of this program
     made.process_ended(WorkerExit("w0", 1, why, failed=True))
     made.process_ended(WorkerExit("w1", 1, "ended with exit code 3", failed=True))  # it had not joined
-    assert made.failure is None
     join(made, A, 2)
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 3, why, failed=True),)), 1.0)  # not the member's nonce
-    assert made.failure is None
+    failed = WorkerProcessFailed("w0", "host", f"its process {why}")
+    assert [event for event in made.events if isinstance(event, Failed)] == [failed]
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 2, why, failed=True),)), 1.0)
-    assert "w0 ended with exit code 0 in the construction of its environment; failure 2 in a row" in str(made.failure)
+    assert [event for event in made.events if isinstance(event, Failed)] == [failed, failed]
 
 
 def test_heartbeats_are_answered_and_silence_is_the_end() -> None:
@@ -252,6 +249,17 @@ def test_the_shell_returns_the_description_and_asks_for_another_hello() -> None:
     found, sent = shell(link)
     assert found.action_space == spaces.Discrete(2)  # type: ignore[attr-defined]
     assert isinstance(sent[-1][1], Rejoin)
+
+
+def test_one_failure_too_many_ends_the_start() -> None:
+    link = FakeLink()
+    failure, again = ("OSError: no display", "where\nit was", None), [hello(A, 2)]
+    goodbye = Goodbye(0, "of a session that has ended", ())
+    saying(link, lambda session: Failure(session, *failure), lambda session: again.pop() if again else goodbye)
+    line = "worker w0 (host): OSError: no display; failure 2 in a row; max_env_failures allows 1 in a row"
+    with pytest.raises(EnvironmentFailed, match=f"^{re.escape(line)}$") as raised:
+        shell(link)
+    assert raised.value.detail == "where\nit was"
 
 
 def test_nobody_comes() -> None:
