@@ -57,7 +57,7 @@ class Failed:
     stepped: bool = False
     """Whether the worker's process is known to have made an env step."""
     spare: bool = False
-    """Whether it held no lane and no ticket while every lane had a worker. Such a failure does not count against the run."""
+    """Whether it held no lane while every lane had a worker. Such a failure does not count against the run."""
 
 
 @dataclass(frozen=True)

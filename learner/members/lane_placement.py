@@ -42,8 +42,8 @@ L = TypeVar("L", bound=PlacedLane)
 
 
 def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
-    """Whether the worker has nothing to do with the environment: it holds no lane and no ticket, and none waits for it."""
-    return not member.lanes and not member.tickets and all(lane.owner is not None for lane in lanes)
+    """Whether the run needs no environment of this worker: it holds no lane, and every lane has a worker."""
+    return not member.lanes and all(lane.owner is not None for lane in lanes)
 
 
 class LanePlacement(Generic[L]):

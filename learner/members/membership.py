@@ -198,7 +198,7 @@ class Membership(Generic[M]):
     ) -> None:
         """`on_removed` is called with each member that was removed, and why: it takes back what that member held.
 
-        `is_spare`: whether a member has nothing to do with the environment, so that its failures do not count.
+        `is_spare`: whether the run needs no environment of a member, so that its failures do not count.
         """
         self.members: dict[bytes, M] = {}
         self.events: list[Event] = []

@@ -125,13 +125,15 @@ def test_an_exit_on_purpose_and_that_of_a_spare_count_as_no_failure() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.joins(B, host="other")
+    learner.coordinator.begin_evaluation(EvaluationPlan(seeds=(1, 2), copies=1, most_steps=10))
+    assert learner.coordinator.members[B].tickets  # of the evaluation; the learner can do without it
     learner.coordinator.membership.take_events()
     learner.says(SUPERVISOR, Alive((), (WorkerExit("b", 1000 * len("other") + 1, "was killed", True),)))
     (failed, _) = learner.coordinator.membership.take_events()
     assert isinstance(failed, WorkerProcessFailed)
     assert failed.spare
     learner.says(SUPERVISOR, Alive((), (WorkerExit("a", NONCE, "ended with exit code 1", False),)))
-    assert learner.coordinator.membership.take_events() == [WorkerLeft("a", "ended with exit code 1", 1, False)]
+    assert learner.coordinator.membership.take_events() == [WorkerLeft("a", "ended with exit code 1", 2, False)]
 
 
 def test_a_supervisor_learns_that_the_run_is_over() -> None:
