@@ -17,6 +17,7 @@ from protocol.messages import (
     PROTOCOL_VERSION,
     Call,
     Collect,
+    Described,
     Drain,
     Evaluate,
     Failure,
@@ -38,7 +39,8 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.specs import StepSpec
+from protocol.space_spec import DiscreteSpace, EnvDescription
+from protocol.specs import DescribeSpec, StepSpec
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 from workers.conversation.connection_rules import wait_limits_s
 from workers.conversation.held import KEPT_RESULTS
@@ -508,6 +510,24 @@ def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     (heartbeat,) = sent(session.tick(1.0), Heartbeat)
     assert heartbeat == Heartbeat(SESSION, 4, (0,), (7, 8), 120, {"step": 0.5}, 0)
     assert session.due_s == 2.0
+
+
+def test_a_description_is_sent_at_once_and_with_every_heartbeat_of_its_session() -> None:
+    """One that is lost on the way must not stall the start."""
+    three = DiscreteSpace(3, 0, "int64")
+    said = Described(SESSION, EnvDescription(three, three, np.zeros(0, np.uint8), "", 0, ""))
+    session = joining()
+    session.tick(0.0)
+    session.handle(Welcome(SESSION, FIRST, DescribeSpec(EnvSpec("Fake-v0"))), 0.0)
+    assert sent(session.tick(session.due_s), Described) == []
+    assert session.described(said.description) == [Send(said)]
+    for _ in range(2):
+        effects = session.tick(session.due_s)
+        assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [said])
+    session.handle(Rejoin(SESSION), 5.0)
+    session.handle(Welcome(SESSION + 1, FIRST + 1, DescribeSpec(EnvSpec("Fake-v0"))), 5.0)
+    effects = session.tick(session.due_s)
+    assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [])
 
 
 def test_a_heartbeat_lists_the_ticket_in_progress_and_no_finished_one() -> None:

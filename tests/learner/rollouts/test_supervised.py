@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import cast
 
 import pytest
@@ -197,6 +198,15 @@ def test_env_steps_calls_and_rollouts_are_progress() -> None:
         assert made.check(learner.now, arrived) is None
 
 
+@pytest.mark.parametrize(("calls", "progress"), [(0, 0), (1, 1)])
+def test_the_first_call_that_has_returned_is_progress_although_nothing_was_said_before(calls: int, progress: int) -> None:
+    learner = Learner()
+    learner.joins(A)
+    before = learner.coordinator.membership.progress
+    speaks(learner, activity("waiting", calls=calls))
+    assert learner.coordinator.membership.progress - before == progress
+
+
 def test_a_call_within_its_timeout_is_no_standstill_and_one_beyond_it_is() -> None:
     learner = Learner()
     learner.joins(A)
@@ -276,6 +286,21 @@ def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent
     assert {member.peer for member in verdict.refuse} == {A, B}
     learner.coordinator.evaluation.end()
     assert made.check(learner.now + 2, steps + 1) is None, "an evaluation that has ended holds nobody to account"
+
+
+@pytest.mark.parametrize(("tickets", "shares"), [(7, (2, 2)), (5, (2, 1)), (4, (1, 1)), (3, (1, 1))])
+def test_a_worker_holds_a_second_ticket_of_an_evaluation_only_while_there_are_plenty_and_never_a_third(
+    tickets: int, shares: tuple[int, int]
+) -> None:
+    """Every Heartbeat deals, so it must not give one more to a worker that has its share."""
+    learner = about_to_evaluate()
+    plan = EvaluationPlan(seeds=tuple(range(tickets)), copies=1, most_steps=10)
+    learner.balanced(learner.coordinator.begin_evaluation(plan))
+    dealt = dict(learner.coordinator.evaluation.held)
+    assert Counter(member.peer for member in dealt.values()) == {A: shares[0], B: shares[1]}
+    for peer in (A, B, A, B):
+        learner.beats(peer)
+        assert learner.coordinator.evaluation.held == dealt
 
 
 @pytest.mark.parametrize(("most", "evaluators"), [(0, {A, B}), (5, {A, B}), (4, {A}), (1, {A})])
