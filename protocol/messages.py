@@ -89,8 +89,9 @@ class Weights(Message, frozen=True):
     """[B] float32, observation mean and standard deviation if observations are normalized; then ε for action values, or the
     scale of the noise (deterministic actions); last, for actions in [-1, 1], 1 while they are drawn uniformly, else 0"""
     env_attributes: Array | None = None
-    """[bytes] uint8, `protocol.wire.plain_values`: attributes that every env copy gets when its next rollout starts, by
-    name
+    """[bytes] uint8, `protocol.wire.plain_values`: attributes by name, which the copies of a lane get before its next rollout
+    under these weights, new copies before their first reset. They keep them until other weights name them. Copies that play
+    evaluations get none
     """
 
 
@@ -130,6 +131,7 @@ class LaneIncarnation(msgspec.Struct, frozen=True, array_like=True):
 
     lane: Natural
     incarnation: Natural
+    """the lane is closed if its incarnation is this one or a lower one"""
 
 
 class Release(Message, frozen=True):
@@ -148,9 +150,11 @@ class Heartbeat(Message, frozen=True):
     versions: Versions
     """of the weights held, ascending: the newest that has come, and those that unfinished tickets name"""
     tickets: Tickets
-    """tickets that are held and not finished"""
+    """tickets that are held and not finished: those that wait, and those of the work in progress"""
     steps: Natural
-    """env steps since the worker started"""
+    """env steps since the worker started, in all sessions: valid rows of rollouts, steps of evaluations, and with `StepSpec` one
+    for each copy and Step
+    """
     stages: Stages
     """seconds spent in each stage since the worker started"""
     resident_bytes: Natural
@@ -212,7 +216,7 @@ class Evaluate(Message, frozen=True):
     """true: take the most probable actions; false: draw them, from random numbers that follow from the first seed and that
     no environment with this seed draws"""
     most_steps: Count
-    """an episode that reaches this number of steps is cut"""
+    """an episode that reaches this number of steps without an end is cut"""
     send_rows: bool
     """also send every row, as `EpisodeRows`"""
     send_frames: bool
@@ -220,7 +224,7 @@ class Evaluate(Message, frozen=True):
 
 
 class EpisodeRows(Message, frozen=True):
-    """Some consecutive rows of one episode of an `Evaluate`. They keep the row format; L is their number."""
+    """Some consecutive rows of one episode of an `Evaluate`. L is their number. They come before their `Evaluated`."""
 
     session: Natural
     ticket: Natural
@@ -237,7 +241,7 @@ class EpisodeRows(Message, frozen=True):
     terminated: Array
     """[L] bool"""
     truncated: Array
-    """[L] bool"""
+    """[L] bool; also set in the last row of an episode that was cut"""
     frames: Array | None = None
     """[L+1, H, W, 3] uint8, what the environment rendered"""
 
@@ -248,8 +252,9 @@ class Evaluated(Message, frozen=True):
     session: Natural
     ticket: Natural
     episodes: Annotated[tuple[Episode, ...], Meta(max_length=MAX_SEEDS)]
+    """one for each seed"""
     cut: Annotated[tuple[bool, ...], Meta(max_length=MAX_SEEDS)]
-    """whether the episode was cut at `most_steps`"""
+    """for each episode whether it was cut at `most_steps`; one that ends at this step was not"""
 
 
 class Reset(Message, frozen=True):
@@ -299,7 +304,9 @@ class Call(Message, frozen=True):
     assign: bool
     """true: set the attribute"""
     given: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: (arguments, keyword arguments); with `assign`, a value for each copy"""
+    """[bytes] uint8, `protocol.wire.plain_values`: a pair of the arguments, a list or a tuple, and the keyword arguments, a dict;
+    with `assign`, a list of one value for each of `copies`
+    """
 
 
 class Stepped(Message, frozen=True):
@@ -332,7 +339,9 @@ class Returned(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     results: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each copy; no bytes if the call raised"""
+    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each of `copies`, an empty list with `assign`; no bytes
+    if the call raised
+    """
     error: Line
     """type and message of the exception, in one line, if the call raised; else empty"""
     traceback: Text

@@ -67,6 +67,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     state: Array
     """[N, S] float32: state of the recurrent core before obs[0]; S is 0 without a core"""
     episodes: tuple[Episode, ...] = ()
+    """the episodes that ended in this rollout, ordered by step, then by copy"""
     mask: Array | None = None
     """[T+1, N, choices] bool: which actions were allowed in `obs`; none unless `RunSpec.masked`"""
     extras: tuple[Array, ...] = ()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import textwrap
 import typing
@@ -81,7 +82,6 @@ WORDS: Mapping[str, str] = {
     "received": "one entry for each lane of this worker; a lane that is not listed belongs to another worker",
     "lanes": "the lanes (in `RunSpec`: their number)",
     "run": "the run that the worker joins",
-    "episodes": "the episodes that ended in this rollout",
     "length": "number of steps",
     "seconds": "wall-clock seconds",
     "env": "the environment",
@@ -108,6 +108,34 @@ WORDS: Mapping[str, str] = {
     "name": "its name",
     "reward": "raw rewards",
     "render_mode": "gymnasium's render mode; empty if none",
+}
+# Where the document says when a message is sent, and what follows.
+STEPS, COLLECTS, REPAIRS = "Environment profile", "Collector profile", "The heartbeat repairs"
+OF_WORKER, OF_LEARNER = "The worker's half", "The learner's half"
+PROSE: Mapping[type, tuple[str, ...]] = {
+    Hello: ("Transport", OF_WORKER),
+    messages.Alive: ("What a worker does in a session",),
+    messages.Described: ("Describe",),
+    Rollout: (COLLECTS, "Packed arrays"),
+    messages.Heartbeat: (OF_WORKER, REPAIRS),
+    messages.Goodbye: (OF_WORKER,),
+    messages.Failure: (OF_WORKER,),
+    messages.EpisodeRows: (COLLECTS,),
+    messages.Evaluated: (COLLECTS,),
+    messages.Stepped: (STEPS,),
+    messages.Returned: (STEPS,),
+    messages.Welcome: ("What a worker does in a session", OF_LEARNER),
+    messages.Refuse: (OF_WORKER,),
+    messages.Rejoin: (OF_WORKER, OF_LEARNER),
+    Weights: (COLLECTS, "The ticket law"),
+    Collect: (OF_WORKER, "The ticket law"),
+    messages.Release: (STEPS, OF_WORKER),
+    messages.Evaluate: (COLLECTS,),
+    messages.HeartbeatReply: (OF_WORKER, REPAIRS),
+    messages.Drain: (OF_WORKER,),
+    messages.Reset: (STEPS,),
+    messages.Step: (STEPS,),
+    messages.Call: (STEPS,),
 }
 # What each limit bounds. A new MAX_* constant without a line here fails a test.
 LIMITS: Mapping[tuple[ModuleType, str], str] = {
@@ -157,6 +185,35 @@ def one_line(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
+def in_words(kind: ast.expr) -> str:
+    """A type as it is written, in words."""
+    match kind:
+        case ast.Subscript(ast.Name("Annotated"), ast.Tuple([base, ast.Call(keywords=limits)])):
+            bounded = {limit.arg: _limit(limit.value) for limit in limits}
+            return f"{in_words(base)}, {bounded.get('min_length', 0)} to {bounded['max_length']}"
+        case ast.Subscript(ast.Name("tuple"), ast.Tuple([base, _])):
+            return f"list of {in_words(base)}"
+        case ast.Subscript(ast.Name("dict"), ast.Tuple([key, value])):
+            return f"map of {in_words(key)} to {in_words(value)}"
+        case ast.Subscript(ast.Name("Literal"), ast.Tuple(values)):
+            return "one of " + ", ".join(f"`{ast.literal_eval(value)}`" for value in values)
+        case ast.BinOp(one, ast.BitOr(), other):
+            text = f"{in_words(one)} or {in_words(other)}"
+            every = " or ".join(f"`{space.__name__}`" for space in typing.get_args(space_spec.SpaceSpec))
+            return text.replace(every, "`SpaceSpec`")
+        case ast.Constant(None):
+            return "null"
+    return f"`{ast.unparse(kind)}`"
+
+
+def _limit(value: ast.expr) -> int:
+    """The number of a bound: a constant, or the name of one."""
+    if isinstance(value, ast.Constant):
+        return int(ast.literal_eval(value))
+    (found,) = {getattr(module, ast.unparse(value)) for module in (bounds, space_spec) if hasattr(module, ast.unparse(value))}
+    return int(found)
+
+
 def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
     """Name, type, default and meaning of each field, as they are written."""
     rows: list[tuple[str, str, str, str]] = []
@@ -167,8 +224,8 @@ def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
         meaning = ""
         if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str):
             meaning = after.value.value
-        default = "" if node.value is None else ast.unparse(node.value)
-        rows.append((node.target.id, ast.unparse(node.annotation), default, meaning))
+        default = "" if node.value is None else json.dumps(ast.literal_eval(node.value))
+        rows.append((node.target.id, in_words(node.annotation), default, meaning))
     fields = msgspec.structs.fields(kind)
     assert [row[0] for row in rows] == [field.name for field in fields]
     return [
@@ -177,10 +234,17 @@ def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
     ]
 
 
+def links(sections: tuple[str, ...]) -> str:
+    """Links to these headings of the document."""
+    anchor = {section: re.sub(r"[^a-z0-9 -]", "", section.lower()).replace(" ", "-") for section in sections}
+    return " and ".join(f"[{section}](#{anchor[section]})" for section in sections)
+
+
 def record(kind: type[msgspec.Struct]) -> str:
     """A heading, what the class says of itself, and its fields: with their places, if they go by position."""
     config = kind.__struct_config__
-    lines = [f"#### `{kind.__name__}`", "", one_line(inspect.getdoc(kind) or ""), ""]
+    told = f" See {links(PROSE[kind])}." if kind in PROSE else ""
+    lines = [f"#### `{kind.__name__}`", "", one_line(inspect.getdoc(kind) or "") + told, ""]
     rows = fields_of(kind)
     if not config.array_like:
         lines += [f"A map; `{config.tag_field}` is `{kind.__name__}`." if config.tag else "A map.", ""]
@@ -192,7 +256,7 @@ def record(kind: type[msgspec.Struct]) -> str:
         places = "| place " if config.array_like else ""
         lines += [f"{places}| field | type | meaning |", "|---" * (4 if places else 3) + "|"]
         for place, (name, annotation, default, meaning) in enumerate(rows, 1 if config.tag else 0):
-            text = f"`{one_line(annotation)}`" + (f" = `{one_line(default)}`" if default else "")
+            text = annotation + (f" = `{one_line(default)}`" if default else "")
             at = f"| {place} " if places else ""
             lines.append(f"{at}| `{name}` | {text} | {one_line(meaning or WORDS.get(name, ''))} |")
         lines.append("")
@@ -271,10 +335,12 @@ def part_limits() -> str:
 def part_types() -> str:
     """A row for each bounded type: its base and its bounds."""
     lines = ["| type | is | bounds |", "|---|---|---|"]
-    for module in (bounds, space_spec, messages):
+    seen = set[str]()
+    for module in (bounds, space_spec, env_spec, messages, specs):
         for name, kind in vars(module).items():
-            if kind is getattr(bounds, name, None) and module is not bounds:
+            if name in seen or not (name[0].isupper() and typing.get_origin(kind)):
                 continue
+            seen.add(name)
             if typing.get_origin(kind) is typing.Annotated:
                 base, meta = typing.get_args(kind)
                 told = {"ge": "at least", "le": "at most", "min_length": "length at least", "max_length": "length at most"}
@@ -290,6 +356,8 @@ def part_types() -> str:
                 lines.append(f"| `{name}` | map | any of the names of `Stage`, each with `Seconds`; it may be empty |")
             elif kind is space_spec.SpaceSpec:
                 lines.append(f"| `{name}` | record | {', '.join(f'`{one.__name__}`' for one in typing.get_args(kind))} |")
+            elif kind is env_spec.Scalar:
+                lines.append(f"| `{name}` | any of these | {', '.join(f'`{one.__name__}`' for one in typing.get_args(kind))} |")
     return "\n".join(lines) + "\n"
 
 
@@ -341,6 +409,21 @@ OF_OBSERVERS = (messages.Inquire, messages.Status)
 def test_every_message_and_field_says_what_it_means(kind: type) -> None:
     assert ast.get_docstring(class_of(kind))
     assert [name for name, _, _, meaning in fields_of(kind) if not (meaning or WORDS.get(name))] == []
+
+
+@pytest.mark.parametrize("kind", [*ToLearner.__args__, *ToWorker.__args__], ids=lambda kind: kind.__name__)
+def test_every_message_points_to_the_text_about_it(kind: type) -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert all(re.search(rf"^##+ {re.escape(section)}$", text, re.MULTILINE) for section in PROSE[kind])
+
+
+def test_no_type_is_written_in_python() -> None:
+    tables = part_messages()
+    assert not re.findall(r"Annotated|Literal|Meta\(|tuple\[|dict\[", tables)
+    types = [row.split(" | ")[-2] for row in tables.splitlines() if row.startswith("| ")]
+    named = set(re.findall(r"`([A-Z]\w+)`", " ".join(each for each in types if not each.startswith("one of"))))
+    explained = part_types() + "".join(re.findall("#### .*", tables)) + "`Array` `PickledCallable`"
+    assert named <= set(re.findall(r"`(\w+)`", explained))
 
 
 def test_a_field_is_named_as_on_the_wire() -> None:
