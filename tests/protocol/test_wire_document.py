@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-import json
 import re
 import textwrap
 import typing
@@ -216,7 +215,7 @@ def _limit(value: ast.expr) -> int:
 
 def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
     """Name, type, default and meaning of each field, as they are written."""
-    rows: list[tuple[str, str, str, str]] = []
+    rows: list[tuple[str, str, str]] = []
     body = class_of(kind).body
     for node, after in zip(body, [*body[1:], None], strict=True):
         if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
@@ -224,14 +223,19 @@ def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
         meaning = ""
         if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str):
             meaning = after.value.value
-        default = "" if node.value is None else json.dumps(ast.literal_eval(node.value))
-        rows.append((node.target.id, in_words(node.annotation), default, meaning))
+        rows.append((node.target.id, in_words(node.annotation), meaning))
     fields = msgspec.structs.fields(kind)
     assert [row[0] for row in rows] == [field.name for field in fields]
     return [
-        (field.encode_name, row[1], "" if field.required else row[2], row[3])
+        (field.encode_name, row[1], "" if field.required else default_of(field), row[2])
         for field, row in zip(fields, rows, strict=True)
     ]
+
+
+def default_of(field: msgspec.structs.FieldInfo) -> str:
+    """A field's default, as JSON."""
+    made = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
+    return msgspec.json.encode(made).decode()
 
 
 def links(sections: tuple[str, ...]) -> str:
