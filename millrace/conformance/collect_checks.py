@@ -97,8 +97,11 @@ class Collecting:
         self.deal(*permits)
         yield Wait(self.rollout_s / 5)
 
-    def rollout(self, permit: Permit, rule: Rule = rules.TICKETS) -> Script[Rollout]:
-        """The rollout of a permit that was dealt, or has come already. If none comes, this rule is broken."""
+    def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
+        """The rollout of a permit that was dealt, or has come already. If none comes, this rule, or the likely one, is broken."""
+        if rule is None:
+            is_first = self.learner.has_had_a_session and not permit.sequence
+            rule = rules.FORGETS if is_first else rules.TICKETS
         if isinstance(found := self.learner.watch.answers.get(permit.ticket), Rollout):
             return found
         text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
@@ -438,7 +441,7 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
     session.give(session.weights(2))
     learner.answers_heartbeats = True
     text = f"the rollout of ticket {permit.ticket}: late copies of replies 6 and 2 close no lane"
-    yield from learner.expect(Rollout, rules.HEARTBEAT_REPLIES, text, ticket=permit.ticket)
+    yield from learner.expect(Rollout, rules.LATE_REPLY, text, ticket=permit.ticket)
 
 
 # --------------------------------------------------------------------------------------------------------------- faults
@@ -452,7 +455,7 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
     permit = again.permit()
     again.order(permit)
     text = "no rollout before the first Weights of the session"
-    yield from learner.quiet(Rollout, rules.SESSION, text, for_s=2 * QUIET_S)
+    yield from learner.quiet(Rollout, rules.FORGETS, text, for_s=2 * QUIET_S)
     again.give(again.weights(1))
     yield from again.rollout(permit)
 

@@ -69,18 +69,22 @@ class LaneRows:
             for n in np.flatnonzero(valid & (rollout.terminated[t] | rollout.truncated[t])).tolist():
                 expected.append((float(self._return[n]), int(self._length[n])))
                 self._return[n], self._length[n] = 0.0, 0
-        for (total, length), episode in zip(expected, rollout.episodes, strict=True):  # `validate` has counted them
+        got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has counted them
+        if not _same(expected, got) and _same(sorted(expected), sorted(got)):
+            lengths = [length for _, length in expected]
+            raise Broken(
+                rules.EPISODE_ORDER,
+                f"episodes of sequence {rollout.sequence} of the lengths {lengths}, in the order of their last steps",
+                f"{[length for _, length in got]}",
+            )
+        for (total, length), episode in zip(expected, rollout.episodes, strict=True):
             if episode.length != length:
                 raise Broken(
                     rules.EPISODES, f"length {length}, as the rows of sequence {rollout.sequence} say", f"{episode.length}"
                 )
-            if abs(episode.reward - total) > RETURN_TOLERANCE * max(1.0, abs(total)):
-                raise Broken(
-                    rules.EPISODES,
-                    f"return {total:g}, the sum of the rewards of its {length} steps (episodes in the order of their ends, "
-                    "then of their copies)",
-                    f"{episode.reward:g}",
-                )
+            if not _is_return(episode.reward, total):
+                expected_return = f"return {total:g}, the sum of the rewards of its {length} steps"
+                raise Broken(rules.EPISODES, expected_return, f"{episode.reward:g}")
 
     def _check_log_prob(self, rollout: Rollout, weights: Weights) -> None:
         policy = make_policy(self._run.policy)
@@ -90,9 +94,20 @@ class LaneRows:
         apart = np.where(rollout.valid, np.abs(expected - rollout.log_prob), 0.0)
         if (apart > LOG_PROB_TOLERANCE * np.maximum(1.0, np.abs(expected))).any():
             t, n = np.unravel_index(int(apart.argmax()), apart.shape)
+            rounded = weights.parameters.dtype != np.float32
+            normalized = self._run.policy.normalize_observations
             raise Broken(
-                rules.LOG_PROB,
+                rules.ROUNDED if rounded else rules.NORMALIZED if normalized else rules.LOG_PROB,
                 f"log_prob {expected[t, n]:.5f} at step {t}, copy {n} (within {LOG_PROB_TOLERANCE:g}), for action "
                 f"{rollout.action[t, n].tolist()} under version {rollout.version}",
                 f"{rollout.log_prob[t, n]:.5f}",
             )
+
+
+def _is_return(got: float, total: float) -> bool:
+    return abs(got - total) <= RETURN_TOLERANCE * max(1.0, abs(total))
+
+
+def _same(one: list[tuple[float, int]], other: list[tuple[float, int]]) -> bool:
+    """Whether these episodes have the same returns and lengths, in this order."""
+    return all(a == b and _is_return(y, x) for (x, a), (y, b) in zip(one, other, strict=True))

@@ -88,7 +88,10 @@ class Learner:
         """what the client has described, in this whole run of the test"""
         self.step_s = 0.0
         """how long a step takes that is long enough to act meanwhile; 0: it was not measured yet"""
+        self.has_had_a_session = False
+        """whether the process was in a session before the current one"""
         self._sessions = count(0x5EED_0001)
+        self._in_session = False  # whether the process was welcomed
         self._steps = 0  # env steps that the process has reported
         self._watch: Watch | None = None  # of the current session
 
@@ -120,6 +123,7 @@ class Learner:
         """Answer the newest Hello: a new session begins."""
         assert self.hello is not None
         self.answers_heartbeats = True
+        self.has_had_a_session, self._in_session = self._in_session, True
         self._watch = Watch(Welcome(next(self._sessions), self.hello.attempt, run), self.now, self._steps)
         self.send(self._watch.welcome)
 
@@ -159,7 +163,7 @@ class Learner:
 
     def _forget_process(self) -> None:
         self.runs, self.hello, self._watch = False, None, None
-        self.may_leave, self._steps = False, 0
+        self.may_leave, self._in_session, self._steps = False, False, 0
 
     def _take_hello(self, hello: Hello, is_wanted: bool) -> None:
         if self.hello is not None and hello.process_nonce != self.hello.process_nonce and not self.may_leave:

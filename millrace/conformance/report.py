@@ -33,7 +33,7 @@ def explanation(result: Result, earlier: Sequence[Result] = ()) -> list[str]:
     if same is not None:
         return [f"           as in: {same.name}"]
     parts = {
-        "rule": f"{result.rule.text}. ({DOCUMENT}, “{result.rule.section}”)",
+        "rule": result.rule.text + (f". ({DOCUMENT}, “{result.rule.section}”)" if result.rule.section else ""),
         "expected": result.expected,
         "got": result.got,
         "next": result.rule.mend,

@@ -1,6 +1,6 @@
 """The rules of the wire document that a client is checked against, in its words, and what a client's author does next.
 
-Rule: every failure names one of these. `section` is a heading of protocol/README.md.
+Rule: every failure names one of these. The words of each stand in its section of protocol/README.md, which a test holds.
 """
 
 from __future__ import annotations
@@ -15,86 +15,101 @@ class Rule:
     """One rule of the wire document."""
 
     section: str
-    """heading of protocol/README.md"""
+    """heading of protocol/README.md; empty for a rule of the check itself"""
     text: str
-    """the rule, in the document's words"""
+    """the rule, in the document's words; an ellipsis stands for what is left out between them"""
     mend: str
     """what the author of a client that breaks it does next"""
 
 
 FRAMES = Rule(
     "Frames",
-    "Frame 0 is one msgpack array: the name of the message's type, then its fields in order. All fields must be "
-    "present and nothing more. The head names every frame once, and the frame's length matches dtype and shape",
+    "Frame 0, the head, is one msgpack array: the name of the message's type, then its fields in order … All fields "
+    "must be present and nothing more … The head must name every frame exactly once, and the frame's length must "
+    "match dtype and shape",
     "compare the bytes that the client sends with the table of that message, field by field",
 )
 LIMITS = Rule(
     "Limits",
-    "A message stays within the limits: bytes of the head, frames of a message, items of a list, characters of a text",
+    "Every message stays within these limits",
     "cut texts and lists before they are sent, and send arrays in frames of their own",
 )
 HELLO = Rule(
-    "Messages, Hello",
-    "A worker's first message is Hello, a map with protocol, worker, host, pid, life, software and attempt; `worker` "
-    "is also its routing id, and `attempt` is `life` + 1 when the process first joins",
-    "set the DEALER's routing id to the name before connecting; draw `life` once for each process; send Hello before "
-    "all else",
+    "Hello",
+    "the worker's name; also its routing id … `life` + 1 when the process first joins, and one more each time that "
+    "it starts to join again",
+    "set the DEALER's routing id to the name before connecting; draw `life` once for each process; send Hello "
+    "before all else",
+)
+ROUTING_ID = Rule(
+    "Transport",
+    "With keys, a zero byte and a tag follow, which nobody else can compute: BLAKE2b of the name, with a digest of "
+    "16 bytes and the 32 raw bytes of the client's secret key as its key, in 32 hexadecimal digits, lower case",
+    "make the routing id of the name, a zero byte and the tag; decode the key from the token's base64 first, and "
+    "use no other form of it",
 )
 PROTOCOL = Rule(
     "How it may evolve",
-    "Both sides speak exactly one version, which Hello names",
+    "Both sides speak exactly one version, `PROTOCOL_VERSION`",
     "write the client for the version that the wire document names, and send that number",
 )
 HELLO_AGAIN = Rule(
-    "Messages, Hello",
-    "Hello is repeated with backoff until it is answered: after 0.25 s, then each wait is twice as long as the last, "
-    "at most 4 s. A repeated Hello keeps `attempt`",
-    "keep a timer while joining, and send the same Hello again when it is due",
+    "Hello",
+    "Repeated with backoff until it is answered … A repeated Hello keeps the number",
+    "keep a timer while joining, and send the same Hello again when it is due: after 0.25 s, then after twice the "
+    "last wait, at most 4 s",
 )
 WELCOME_ATTEMPT = Rule(
     "The worker's half",
-    "A worker accepts a Welcome only if `attempt` is its newest",
+    "It accepts a `Welcome` only if `attempt` is its newest",
     "compare `attempt` of each Welcome with that of the last Hello, and ignore the message when they differ",
 )
 REPEATED_WELCOME = Rule(
     "The worker's half",
-    "In the state ready, a repeated Welcome of the same session changes nothing",
+    "In a session, a copy of its `Welcome` changes nothing",
     "compare the session of a Welcome with the current one before anything is closed",
 )
 REFUSE = Rule(
     "The worker's half",
-    "Refuse: the worker leaves, with exit code 2, in every state",
+    "On `Refuse` it leaves in every state … The exit code is 0 after a `Drain` and after a request to stop, 2 after "
+    "a `Refuse`, and when it declines what the learner asks for; else 1",
     "show the reason to the user and end the process with exit code 2",
+)
+AFTER_REFUSE = Rule(
+    "The worker's half",
+    "After a `Refuse`, and when it joins again, the worker says neither",
+    "on Refuse, end the process without Goodbye",
 )
 DRAIN_JOINING = Rule(
     "The worker's half",
-    "Drain while joining: the worker leaves",
+    "while it joins, a worker heeds only `Welcome`, `Refuse` and `Drain`, and leaves on the last two",
     "end the process with exit code 0: the run is over",
 )
 DRAIN = Rule(
     "The worker's half",
-    "Drain while ready: the worker finishes its work in progress, sends it, says Goodbye with the tickets that it did"
-    " not finish, and leaves",
+    "On `Drain`, or when it is asked to stop, it takes no new work, finishes a rollout or an order in progress, "
+    "sends it, says `Goodbye` with the tickets that it did not finish, and leaves",
     "on Drain, start no new work; after the work in progress send Goodbye, then end the process with exit code 0",
 )
 STOP = Rule(
     "The worker's half",
-    "StopRequested (SIGTERM): as Drain; the worker finishes its work in progress, says Goodbye and leaves",
+    "On `Drain`, or when it is asked to stop, it takes no new work, finishes a rollout or an order in progress, "
+    "sends it, says `Goodbye` with the tickets that it did not finish, and leaves",
     "catch SIGTERM, finish the work in progress, send Goodbye, then end the process with exit code 0",
 )
 AFTER_GOODBYE = Rule(
     "The worker's half",
-    "In the state left, a worker says nothing more",
+    "`Goodbye` is the last message of a session, or `Failure` in its place",
     "send Goodbye as the last message",
 )
 JOINING_IGNORES = Rule(
     "The worker's half",
-    "While joining, every message but Welcome, Refuse and Drain is ignored",
+    "while it joins, a worker heeds only `Welcome`, `Refuse` and `Drain`, and leaves on the last two",
     "look at the state before a message is handled",
 )
 REJOIN = Rule(
     "The worker's half",
-    "Rejoin while ready: the worker is joining again, and says Hello with a later `attempt`",
+    "`Rejoin` makes it join again, with a later `attempt`",
     "on Rejoin of the current session, add 1 to `attempt` and send Hello at once",
 )
 OTHER_SESSION = Rule(
@@ -104,274 +119,361 @@ OTHER_SESSION = Rule(
 )
 SESSION = Rule(
     "Words",
-    "The session of the Welcome stands in every later message of the session; when a session ends, the worker forgets"
-    " its env copies, tickets, rollouts and weights",
+    "also its number, which the learner draws and which stands in `Welcome` and in every later message of the session",
     "take the number from the newest accepted Welcome, and drop unfinished work of the session before",
 )
-SILENT = Rule(
+FORGETS = Rule(
     "The worker's half",
-    "LearnerSilent: when no message of the learner has followed a Heartbeat for `learner_timeout_s`, the worker says Hello "
-    "again with a later `attempt`; any message counts as a sign of life",
+    "When a session ends, the worker forgets its env copies, tickets, rollouts and weights",
+    "empty all that is kept by lane, ticket and version when a session ends, so that each session begins with "
+    "sequence 0; if this check fails also when it runs alone (--only), look for the permit's ticket, lane and "
+    "sequence",
+)
+SILENT = Rule(
+    "The heartbeat repairs",
+    "`RunSpec.learner_timeout_s` (a worker that heard nothing after a Heartbeat for so long joins again) … Any "
+    "message counts as a sign of life",
     "note the time of the first Heartbeat after each message that arrives; `learner_timeout_s` later, join again",
 )
 IGNORE_UNREADABLE = Rule(
-    "Frames",
-    "A worker ignores a message that it cannot read, or whose fields are not exactly those of the table, and goes on",
+    "The worker's half",
+    "A worker ignores a message that it cannot read, such as one with a field more or less than its table, and continues",
     "check the number of fields and frames of each message before it is used; log it, and do not end",
 )
 STAYS = Rule(
     "The worker's half",
-    "A worker leaves after Refuse, after Drain, when it is asked to stop, or when it fails; else it stays",
-    "start the client's command by itself and look at what it prints; it must outlive lost connections, and messages that "
-    "it ignores",
+    "It leaves for no other reason, unless it fails: not for what it cannot read, nor because its connection is lost",
+    "start the client's command by itself and look at what it prints; it must outlive lost connections, and "
+    "messages that it ignores",
 )
 CONNECTION = Rule(
-    "Transport",
-    "All rules hold even if messages of any type are lost: a session outlives its connection",
+    "The worker's half",
+    "It may lose its connection and make another without leaving the session",
     "let the socket connect again by itself, and keep the state of the session meanwhile",
 )
 HEARTBEAT = Rule(
-    "Messages, Heartbeat",
-    "A worker in a session sends a Heartbeat every `heartbeat_s`, also while its environment works",
+    "The worker's half",
+    "In a session, it sends a `Heartbeat` every `heartbeat_s`, also while its environment works and while it drains",
     "send heartbeats from a timer, or between env steps, as long as there is a session",
 )
 HEARTBEAT_REPLIES = Rule(
-    "The heartbeat repairs",
-    "`replies` is the number of the last HeartbeatReply received. A reply whose number is not larger than that of the"
-    " last one is a late copy, and is ignored",
+    "Heartbeat",
+    "number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost",
     "keep the largest number of a HeartbeatReply of this session, from 0, and report it",
 )
+LATE_REPLY = Rule(
+    "The worker's half",
+    "A reply whose number is not larger than that of the last one is a late copy: it does not list what came after "
+    "it, and is ignored",
+    "compare the number of a HeartbeatReply with the largest of this session, before its lanes are looked at",
+)
 HEARTBEAT_TICKETS = Rule(
-    "Messages, Heartbeat",
-    "`tickets` lists the tickets that are held and not finished, of this session and of the worker's own lanes",
+    "Heartbeat",
+    "tickets that are held and not finished: those that wait, and those of the work in progress",
     "list a ticket from its arrival until its work is done, and no other",
 )
 HEARTBEAT_STEPS = Rule(
-    "Messages, Heartbeat",
-    "`steps` counts the env steps since the worker started: it never falls",
+    "Heartbeat",
+    "env steps since the worker started, in all sessions",
     "count env steps of the process, not of the session",
 )
 HEARTBEAT_VERSIONS = Rule(
-    "Messages, Heartbeat",
-    "`versions` lists the weights held, ascending; with each session it begins empty",
+    "Heartbeat",
+    "of the weights held, ascending: the newest that has come, and those that unfinished tickets name",
     "list the version of every Weights that is held, and drop all weights when a session ends",
 )
 DESCRIBE = Rule(
     "Describe",
-    "A worker that is welcomed with a DescribeSpec makes one env copy, sends Described, and closes the copy",
+    "The worker makes one env copy, sends `Described` and then closes the copy",
     "answer a Welcome whose run has the type DescribeSpec with Described",
 )
 DESCRIBE_AGAIN = Rule(
     "Describe",
-    "Described is repeated with every Heartbeat, because a message may be lost",
+    "It repeats `Described` with every `Heartbeat`, before or after it, because a message may be lost",
     "keep the description until the session ends, and send it after each Heartbeat",
 )
 ORDER_ANSWERED = Rule(
-    "Messages, Reset and Step",
-    "A Reset or a Step is answered by Stepped, with the session, ticket, lane and incarnation of the order",
+    "Environment profile",
+    "Each `Reset` and `Step` is answered by `Stepped`, each `Call` by `Returned`, with the session, ticket, lane "
+    "and incarnation of the order; nothing else is",
     "copy these four numbers from the order into the answer",
 )
 ORDER_ONLY = Rule(
-    "Messages, Reset and Step",
-    "Stepped and Returned answer an order, and are sent for nothing else; an order is answered once for each time "
-    "that it arrives",
+    "Environment profile",
+    "Each `Reset` and `Step` is answered by `Stepped`, each `Call` by `Returned`, with the session, ticket, lane "
+    "and incarnation of the order; nothing else is",
     "send Stepped only from the code that executes an order, or that repeats the answer to an order that came again",
 )
 ORDER_ONCE = Rule(
-    "Messages, Reset",
-    "Tickets rise with every order. An order is executed once, and answered again, with the same answer, if it is repeated",
+    "Environment profile",
+    "An order that comes again is not executed again: the same answer is sent again",
     "keep the last answer of each lane, and send it again when its ticket comes again",
 )
 ORDER_OLD = Rule(
-    "Messages, Reset",
-    "Tickets rise with every order: an order with a smaller ticket than the last one of its lane is a late copy and "
-    "is ignored",
+    "The worker's half",
+    "An order with a smaller ticket than the newest one of its lane is a late copy and is ignored",
     "compare the ticket of an order with the newest of its lane",
 )
 INCARNATION = Rule(
     "The worker's half",
-    "A higher incarnation starts the lane again, on new env copies; an order or permit of a lower one is ignored",
+    "A permit or an order of a higher incarnation starts the lane again: new env copies, sequence 0, nothing is "
+    "kept. One of a lower incarnation is ignored",
     "keep the incarnation of each lane, and compare it first",
 )
 RESET_SOME = Rule(
-    "Messages, Reset",
-    "Reset starts episodes in the copies that it lists, and leaves the others as they are; Stepped has a row for every copy",
+    "Environment profile",
+    "`Reset` starts episodes in the copies that it names … The rows of the other copies in `Stepped` stay what they were",
     "reset only the listed copies, with a seed for each, and answer with the rows of all",
 )
+OPTIONS = Rule(
+    "Reset",
+    "the options of `Env.reset`, or None; a list has those of each copy",
+    "unpack `options`, and give them to the environment's reset",
+)
 STEPPED_ARRAYS = Rule(
-    "Messages, Stepped",
-    "obs has one array [N, *leaf] for each leaf in its dtype; reward is [N] float64; terminated and truncated are [N]"
-    " bool; infos is [bytes] uint8",
+    "Stepped",
+    "one array [N, *leaf] for each leaf of the observation … [N] float64, raw … [N] bool … [bytes] uint8: a list of "
+    "pairs of copy and info",
     "send dtypes and shapes as `StepSpec` and the table say; N is the number of copies of the lane",
 )
 AFTER_RESET = Rule(
-    "Messages, Reset",
-    "A copy that was reset has reward 0, and neither flag",
+    "Environment profile",
+    "Their reward is then 0 and their flags false",
     "clear reward, terminated and truncated of each copy that is reset",
 )
 NEXT_STEP = Rule(
-    "Records inside messages, StepSpec",
-    "With autoreset NextStep, the step after an episode's end ignores the action and only resets that copy: reward 0,"
-    " neither flag, and the first observation of the next episode",
+    "Environment profile",
+    "With autoreset `NextStep`, a copy whose episode has ended, or that has none, ignores its action and is reset "
+    "without a seed: reward 0, both flags false",
     "remember which copies have ended; their next step is a reset",
+)
+SAME_STEP = Rule(
+    "Environment profile",
+    "With `SameStep` it is reset in the step that ends the episode: `Stepped` has the first observation of the next "
+    "one, and its info the last one of the old as `final_obs`, with `final_info`",
+    "after the step that ends an episode, reset the copy at once, without a seed; keep the reward and the flags of "
+    "that step",
+)
+DISABLED = Rule(
+    "Environment profile",
+    "With `Disabled` it is stepped in any case",
+    "leave a copy whose episode has ended as it is, until a Reset names it",
 )
 OWN_ROW = Rule(
     "Environment profile",
-    "Row n of every array is that of copy n, in actions and in answers",
+    "Row n of every array is that of copy n",
     "give row n of the actions to copy n, and write what comes of it to row n of every array",
 )
 TRUNCATED = Rule(
-    "Messages, Rollout and Stepped",
-    "truncated: a time limit ended the episode. An episode is at most `longest_episode` steps long",
+    "What a worker does in a session",
+    "An episode has at most `longest_episode` steps: at the last of them `truncated` is set, unless the task itself ended",
     "count the steps of each episode; at the limit set truncated, unless the task itself ended",
 )
 SEEDED = Rule(
-    "Messages, Reset",
-    "`seeds` has the reset seed of each copy: the same seed begins the same episode",
+    "Environment profile",
+    "The same seed begins the same episode",
     "seed the environment's generator with the given seed",
 )
 IN_SPACE = Rule(
-    "Records inside messages, EnvDescription",
-    "`observation` describes the arrays of an observation: observations are within its bounds, and finite",
+    "What a worker does in a session",
+    "Observations are finite, and within the bounds of the space that it described",
     "describe the space as it is, or mend the environment",
 )
 RETURNED = Rule(
-    "Messages, Call",
-    "A Call is answered by Returned: one result for each copy, or the exception's type and message in `error`",
+    "Environment profile",
+    "Each `Reset` and `Step` is answered by `Stepped`, each `Call` by `Returned`, with the session, ticket, lane "
+    "and incarnation of the order; nothing else is … A worker without attributes answers a `Call` with `error`, and "
+    "with no bytes as `results`",
     "answer every Call; a client without attributes answers with `error` set",
 )
 RELEASE = Rule(
-    "Messages, Release",
-    "Release: these lanes belong to other workers now. The worker closes them, drops their tickets, and sends nothing"
-    " of them",
+    "The worker's half",
+    "The worker closes a lane that a `Release` names, and one that the `received` of a `HeartbeatReply` does not "
+    "list: it drops the env copies, tickets and rollouts of the lane, and sends nothing more of them",
     "on Release drop the lane with its orders, tickets and rollouts",
 )
 UNLISTED = Rule(
     "The worker's half",
-    "The worker closes a lane that the `received` of a HeartbeatReply does not list",
+    "The worker closes a lane that a `Release` names, and one that the `received` of a `HeartbeatReply` does not "
+    "list: it drops the env copies, tickets and rollouts of the lane, and sends nothing more of them",
     "compare the lanes that are held with those of each new HeartbeatReply, and drop the others",
 )
 LANES = Rule(
     "Words",
-    "A worker works only for lanes that it was given, each in its newest incarnation",
+    "a ticket as a `Collect` lists it: with the lane, incarnation and sequence of its rollout",
     "take the number of the lane from the order or permit",
 )
 TICKETS = Rule(
-    "The worker's half",
-    "A ticket is permission for one rollout: a rollout carries the ticket, lane and incarnation of a permit that is held",
+    "Words",
+    "permission for one rollout, under one version … a ticket as a `Collect` lists it: with the lane, incarnation "
+    "and sequence of its rollout",
     "take ticket and lane of a rollout from its permit",
 )
 ROLLOUT_ONCE = Rule(
     "The worker's half",
-    "A ticket is collected once. The rollout is sent again, the same, only if the learner asks for that ticket again",
+    "A ticket is collected once. The worker keeps the rollout until `received` says that it has arrived. If it is "
+    "asked for that ticket again, it sends the same rollout again",
     "keep each rollout until `received` covers its sequence, and send it only once for each Collect that names its ticket",
 )
 RECEIVED = Rule(
     "The worker's half",
-    "The worker keeps a rollout until `received` says that it has arrived. After that, a late repeat of its Collect is "
-    "ignored",
+    "A `Collect` of a rollout that was received is ignored",
     "ignore a permit whose sequence is lower than that of its lane's next rollout, unless its rollout is kept",
 )
 SEQUENCE = Rule(
     "Words",
-    "`sequence` is the number of the rollout within this lane and incarnation, from 0, as its permit says",
+    "number of the rollout within this lane and incarnation, from 0; lane, incarnation and sequence identify a rollout",
     "take the sequence of a rollout from its permit",
 )
 IN_ORDER = Rule(
     "The worker's half",
-    "The rollouts of a lane are collected in the order of `Permit.sequence`, from 0 in every incarnation. A permit waits "
-    "for those before it",
+    "The rollouts of a lane are collected in the order of `Permit.sequence`, from 0 in every incarnation. A permit "
+    "waits for those before it",
     "keep the sequence of each lane's next rollout, and start only the permit that has it",
 )
 VERSION = Rule(
     "The worker's half",
-    "A rollout is collected under exactly the version that its Collect names, also if newer weights have come. It waits "
-    "until these weights are held",
+    "A rollout is collected under exactly the version that its `Collect` names, also if newer weights have come. It "
+    "waits until these weights are held",
     "keep the version with each ticket, keep weights by version, and load those of the ticket before the rollout starts",
 )
 HOLDS_WEIGHTS = Rule(
     "The worker's half",
-    "The worker holds the newest weights that have come, and those that an unfinished ticket names. It drops all others "
-    "when a piece of work ends",
-    "keep weights in a map by version; after each rollout or evaluation drop those that are neither the newest nor named by "
-    "a ticket that is left",
+    "The worker holds the newest weights that have come, and those that an unfinished ticket names, whether of a "
+    "rollout or of an evaluation. It drops all others when a piece of work ends",
+    "keep weights in a map by version; after each rollout or evaluation drop those that are neither the newest nor "
+    "named by a ticket that is left",
 )
 ROWS = Rule(
-    "Messages, Rollout",
-    "The arrays of a rollout have the shapes and dtypes of the table, finite values, actions of the space, and "
-    "valid[t+1] == not (terminated[t] or truncated[t])",
-    "write the rows as docs/explanation/rows.md says",
+    "Collector profile",
+    "The row after the end of an episode only resets that copy … its reward 0, its action any action of the space. "
+    "For every copy `valid[t+1]` is not (`terminated[t]` or `truncated[t]`) … All values are finite, integers are "
+    "in their space",
+    'compare what the section "Collector profile" says of rows with what the client writes, and dtypes and shapes '
+    "with the table of Rollout",
 )
 LAST_OBSERVATION = Rule(
     "Collector profile",
     "The row after the end of an episode only resets that copy: its observation is the last one of the old episode, "
-    "obs[t+1] the first one of the new",
+    "`obs[t+1]` the first one of the new",
     "do not reset a copy in the step that ends its episode: write the observation of that step, and reset in the next row",
 )
 INDEPENDENT = Rule(
-    "Records inside messages, RunSpec",
-    "Env copies and action generators are seeded by (seed, lane, incarnation, …): no copy repeats what another one does",
-    "seed each env copy with a number of its own, made of the run's seed, the lane, the incarnation and the copy's number",
+    "Collector profile",
+    "No copy repeats what another one does: its seeds and random numbers are its own, in each lane and incarnation",
+    "seed each env copy, and its actions, with numbers of their own, made of the run's seed, the lane, the "
+    "incarnation and the copy's number",
 )
 FIRST_VALID = Rule(
-    "Messages, Rollout",
-    "valid is False on the row in which a finished copy is reset, also when that is the first row of the next rollout",
+    "Collector profile",
+    "the first row of a rollout is not valid if `obs[0]` is the last observation of an episode",
     "carry over which copies ended in the last row of a rollout",
 )
 CONTINUES = Rule(
-    "Messages, Rollout",
-    "Rollouts of a lane continue each other: obs[0] is the last observation, obs[T], of the rollout before",
+    "Collector profile",
+    "The rollouts of a lane continue each other: `obs[0]` is `obs[T]` of the one before, and an episode that has "
+    "not ended continues",
     "keep the copies and their last observations between two rollouts of a lane",
 )
 EPISODES = Rule(
-    "Records inside messages, Episode",
-    "An episode's return is the undiscounted sum of its raw rewards, and its length the number of its steps, also "
-    "where it began in an earlier rollout",
-    "add up rewards and steps of valid rows, from an episode's first step to its last",
+    "Episode",
+    "the return: undiscounted sum of raw rewards … number of steps",
+    "add up rewards and steps of valid rows, from an episode's first step to its last, also where it began in an "
+    "earlier rollout",
+)
+EPISODE_ORDER = Rule(
+    "Rollout",
+    "the episodes that ended in this rollout, ordered by step, then by copy",
+    "go through the steps first, and through the copies in each step",
 )
 LOG_PROB = Rule(
-    "Messages, Rollout",
-    "log_prob is that of the action under the policy that acted, computed from the weights of `version`",
-    "compare the layers, their order in the flat vector and the activation function with the policy section; sample "
-    "from these same probabilities",
+    "Collector profile",
+    "The learner needs `log_prob` to be that of the policy of `version`",
+    "compare the layers, their order in the flat vector and the activation function with Parameters and Acting "
+    "there; sample from these same probabilities",
+)
+ROUNDED = Rule(
+    "Collector profile",
+    "float16 and bfloat16 (as uint16: the upper half of a float32) are converted to float32",
+    "look at the dtype of `Weights.parameters`: a uint16 is shifted 16 bits up and read as float32",
+)
+NORMALIZED = Rule(
+    "Collector profile",
+    "If normalized: (x − mean) / std, clipped to ±10, computed in the dtype of the observation",
+    "read means and standard deviations of all features from `Weights.buffers`, and clip what comes of them",
+)
+ATTRIBUTES = Rule(
+    "Weights",
+    "attributes by name, which the copies of a lane get before its next rollout under these weights",
+    "set these attributes in every copy of a lane before its first step under these weights, or decline",
 )
 EVALUATE = Rule(
-    "Messages, Evaluate",
-    "Evaluate is answered by Evaluated: an episode for each seed, in their order, each cut at `most_steps`",
+    "Evaluate",
+    "Play one episode for each seed, on copies of their own, under weights of this version. Answered by `Evaluated`",
     "play the episodes on copies of their own, under the weights of the order's version",
+)
+CUT = Rule(
+    "Evaluated",
+    "for each episode whether it was cut at `most_steps`; one that ends at this step was not",
+    "set `cut` where an episode reaches `most_steps` and neither flag is set",
+)
+EVALUATE_SEEDS = Rule(
+    "Collector profile",
+    "The result depends on the order and the weights alone: the same seeds give the same episodes",
+    "reset the copies of an evaluation with the seeds of its order, one each, before every evaluation",
+)
+GREEDY = Rule(
+    "Evaluate",
+    "true: take the most probable actions; false: draw them",
+    "look at `greedy` of each order; the most probable action is that under the weights of its `version`, which may "
+    "be others than the newest",
+)
+EPISODE_ROWS = Rule(
+    "EpisodeRows",
+    "one array [L+1, *leaf] for each leaf of the observation … [L] float64, raw … also set in the last row of an "
+    "episode that was cut",
+    "compare dtypes, shapes and flags of EpisodeRows with its table; its reward is float64, that of a Rollout float32",
+)
+ROWS_FIRST = Rule(
+    "Collector profile",
+    "`EpisodeRows` come before the `Evaluated` that they belong to; the rows of an episode follow each other without a gap",
+    "send all rows of an evaluation, from step 0 of each episode to its end, and then its Evaluated; rows only if "
+    "the order asks for them",
 )
 EVALUATE_ONCE = Rule(
     "Collector profile",
-    "An Evaluate is executed once. The last 8 answers are kept, and sent again if the order comes again",
+    "The last 8 answers are kept, and sent again if the order comes again",
     "keep each Evaluated by its ticket, and send it when that ticket comes again",
 )
 EVALUATE_VERSION = Rule(
     "Collector profile",
-    "An Evaluate is executed under exactly its version: it waits until those weights are held",
+    "An `Evaluate` is executed once, under exactly its version: it waits until those weights are held, and is "
+    "dropped if newer ones are",
     "look for the order's version among the weights held before the first episode",
 )
 REAPPEARS = Rule(
-    "Messages, Hello",
-    "`life` is drawn at random for each process, and every attempt has a number of its own",
+    "Hello",
+    "drawn at random for each process, for pids repeat in containers",
     "draw `life` at start from a random source, not from the time or the process id",
 )
-PATIENCE = Rule(
-    "The worker's half",
-    "The whole check ends within its deadline",
-    "look for the step at which the client waits; run this check alone with --only",
-)
 DECLINED = Rule(
-    "The worker's half",
-    "A worker that cannot take part in what the Welcome asks for says Goodbye with the reason, and leaves with exit code 2",
+    "What a worker does in a session",
+    "A worker that cannot do it says `Goodbye` with the reason, and leaves with exit code 2",
     "if the client is not meant to do this, choose the other --profile, or another --env",
 )
 DRAINING_IGNORES = Rule(
     "The worker's half",
-    "While draining, every message but Weights, HeartbeatReply, Rejoin and Refuse is ignored: no new work is taken",
+    "While it drains, it sends heartbeats, and heeds only `Weights`, `HeartbeatReply`, `Rejoin` and `Refuse`",
     "look at the state before a message is handled",
 )
 DRAINING_LEAVES = Rule(
     "The worker's half",
-    "Refuse and Rejoin while draining: the worker leaves",
+    "`Rejoin` makes it join again, with a later `attempt`; while it drains, it leaves instead. On `Refuse` it "
+    "leaves in every state",
     "end the process when one of them arrives after Drain, and say Hello no more",
+)
+PATIENCE = Rule(
+    "",
+    "The whole check ends within its deadline",
+    "look for the step at which the client waits; run this check alone with --only",
 )

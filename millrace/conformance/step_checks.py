@@ -270,8 +270,7 @@ def executes_an_order_once(learner: Learner) -> Script[None]:
     plain = yield from steps.walk(actions)
     order = steps.reset(seed=3)
     yield from steps.do(order)
-    learner.send(order)
-    yield from steps.answer(order)
+    yield from _again(learner, order)
     for each, expected in zip(actions, plain, strict=True):
         again = steps.step(actions=each)
         found = yield from steps.do(again)
@@ -282,10 +281,13 @@ def executes_an_order_once(learner: Learner) -> Script[None]:
                 "others",
             )
         for _ in range(2):
-            learner.send(again)
-            yield from learner.expect(
-                Stepped, rules.ORDER_ONCE, f"the answer to ticket {again.ticket} again", ticket=again.ticket
-            )
+            yield from _again(learner, again)
+
+
+def _again(learner: Learner, order: Reset | Step) -> Script[None]:
+    """Repeat an order, and wait for the same answer again."""
+    learner.send(order)
+    yield from learner.expect(Stepped, rules.ORDER_ONCE, f"the answer to ticket {order.ticket} again", ticket=order.ticket)
 
 
 def ignores_an_old_order(learner: Learner) -> Script[None]:

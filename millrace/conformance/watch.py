@@ -21,15 +21,18 @@ from protocol.messages import (
     Call,
     Collect,
     Described,
+    Drain,
     EpisodeRows,
     Evaluate,
     Evaluated,
+    Failure,
     Goodbye,
     Heartbeat,
     HeartbeatReply,
     Order,
     Permit,
     Received,
+    Refuse,
     Release,
     Reset,
     Returned,
@@ -81,6 +84,7 @@ class Watch:
         self.answers: dict[int, Answer | Rollout] = {}
         """the first answer to each order, and the first rollout of each permit, by ticket"""
         self.said_goodbye = False
+        self._refused = self._drains = False  # whether the learner has sent Refuse, or Drain
         self._description: Described | None = None
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
         self._lanes: dict[int, int] = {}  # the client's lanes, each in its highest incarnation
@@ -115,6 +119,10 @@ class Watch:
                     self._lanes.pop(lane.lane, None)
             case HeartbeatReply(session, number) if session == self.session:
                 self.replies = max(self.replies, number)
+            case Refuse():
+                self._refused = True
+            case Drain():
+                self._drains = True
 
     def _asks(self, order: Order | Permit) -> None:
         self._asked[order.ticket] += 1
@@ -174,6 +182,8 @@ class Watch:
             case Evaluated() | EpisodeRows():
                 if not isinstance(self.orders.get(message.ticket), Evaluate):
                     raise Broken(rules.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
+            case Goodbye() | Failure() if self._refused and not self._drains:  # else it may have been on its way
+                raise Broken(rules.AFTER_REFUSE, "no last words after Refuse", brief(message))
             case Goodbye():
                 self._see_tickets(message.tickets)
                 self.said_goodbye = True
@@ -233,7 +243,9 @@ class Watch:
     def _see_lane(self, message: Answer | Rollout, order: Order | Permit) -> None:
         if message.lane != order.lane:
             expected = f"lane {order.lane}, as in the {type(order).__name__} with ticket {order.ticket}"
-            raise Broken(rules.LANES, expected, f"lane {message.lane}")
+            raise Broken(
+                rules.LANES if isinstance(order, Permit) else rules.ORDER_ANSWERED, expected, f"lane {message.lane}"
+            )
 
     def _is_first(self, message: Answer | Rollout, too_often: Rule, differs: Rule) -> bool:
         """Whether its ticket was not answered before. The rules: for too many answers, and for one that differs."""

@@ -37,7 +37,7 @@ MUTANTS = [
     Mutant("wrong dtype", "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "got float32[2]"),
     Mutant("wrong order", "environment", "describes its environment", rules.FRAMES, "Heartbeat.replies"),
     Mutant("wrong shape", "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "got float32[2, 4, 1]"),
-    Mutant("lane not owned", "environment", "serves two lanes", rules.LANES, "lane"),
+    Mutant("lane not owned", "environment", "serves two lanes", rules.ORDER_ANSWERED, "lane"),
     Mutant("lane not owned", "collector", "collects rollouts", rules.LANES, "lane 1"),
     Mutant("missing truncated", "environment", "truncates an episode", rules.TRUNCATED, "no end after 500 steps"),
     Mutant("missing truncated in rollouts", "collector", "truncates an episode", rules.ROWS, "valid: expected"),

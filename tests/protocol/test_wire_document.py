@@ -209,7 +209,9 @@ def _limit(value: ast.expr) -> int:
     """The number of a bound: a constant, or the name of one."""
     if isinstance(value, ast.Constant):
         return int(ast.literal_eval(value))
-    (found,) = {getattr(module, ast.unparse(value)) for module in (bounds, space_spec) if hasattr(module, ast.unparse(value))}
+    (found,) = {
+        getattr(module, ast.unparse(value)) for module in (bounds, space_spec) if hasattr(module, ast.unparse(value))
+    }
     return int(found)
 
 
@@ -361,7 +363,9 @@ def part_types() -> str:
             elif kind is space_spec.SpaceSpec:
                 lines.append(f"| `{name}` | record | {', '.join(f'`{one.__name__}`' for one in typing.get_args(kind))} |")
             elif kind is env_spec.Scalar:
-                lines.append(f"| `{name}` | any of these | {', '.join(f'`{one.__name__}`' for one in typing.get_args(kind))} |")
+                lines.append(
+                    f"| `{name}` | any of these | {', '.join(f'`{one.__name__}`' for one in typing.get_args(kind))} |"
+                )
     return "\n".join(lines) + "\n"
 
 

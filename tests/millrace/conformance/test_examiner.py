@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import msgspec
@@ -358,15 +360,30 @@ def test_the_report_has_the_rule_and_where_it_stands() -> None:
     assert [each["rule"] for each in data["checks"]] == ["", rules.REFUSE.text, rules.REFUSE.text, ""]
 
 
-def test_every_rule_names_a_part_of_the_wire_document() -> None:
-    every = [value for value in vars(rules).values() if isinstance(value, Rule)]
-    assert len(every) > 40
-    text = DOCUMENT.read_text()
-    for rule in every:
-        heading, _, names = rule.section.partition(", ")
-        assert f"# {heading}" in text, rule.section
-        for name in filter(None, names.split(" and ")):
-            assert f"`{name}`" in text, rule.section
+def plain(text: str) -> str:
+    """A text of the wire document in one line, without what marks bold words."""
+    return " ".join(text.replace("**", "").split())
+
+
+def sections() -> dict[str, str]:
+    """The text of each section of the wire document, with the sections inside it."""
+    parts = re.split(r"^(#+) (.+)$", DOCUMENT.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    found = list(zip(map(len, parts[::3]), parts[1::3], parts[2::3], strict=True))
+    texts: dict[str, str] = {}
+    for n, (level, name, text) in enumerate(found):
+        inner = takewhile(lambda part, level=level: part[0] > level, found[n + 1 :])  # type: ignore[misc]
+        texts[name.replace("`", "")] = plain(" ".join([text, *(part[2] for part in inner)]))
+    return texts
+
+
+def test_every_rule_stands_in_its_section_in_these_words() -> None:
+    every = {name: value for name, value in vars(rules).items() if isinstance(value, Rule) and value is not rules.PATIENCE}
+    assert len(every) > 60
+    text_of = sections()
+    for name, rule in every.items():
+        where = text_of[rule.section]
+        for words in rule.text.split(" … "):
+            assert words in where, f"{name}: not in {rule.section}: {words}"
 
 
 def test_no_two_checks_of_a_profile_have_one_name() -> None:
