@@ -141,8 +141,9 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `my_package.envs:MyEnv`, that returns an environment
     """
     kwargs: dict[str, Scalar] = {}
-    """keyword arguments of `gymnasium.make`. In texts, braces around integers, `+ - * // %` and at least one of `number`, `lane`,
-    `copy` and `slot` (`millrace.EnvCopy`) are computed for each copy, as in `{5000 + slot}`. A worker that cannot do so declines
+    """keyword arguments of `gymnasium.make`. In texts, braces around integers, `+ - * // %` and at least one of `number`,
+    `lane`, `copy` and `slot` (`millrace.EnvCopy`) are computed for each copy, as in `{5000 + slot}`. A worker that cannot
+    do so declines
     """
     factory: PickledCallable | None = None
     """a cloudpickled callable that returns one environment; `id` is then only its name"""

@@ -89,9 +89,9 @@ class Weights(Message, frozen=True):
     """[B] float32, observation mean and standard deviation if observations are normalized; then ε for action values, or the
     scale of the noise (deterministic actions); last, for actions in [-1, 1], 1 while they are drawn uniformly, else 0"""
     env_attributes: Array | None = None
-    """[bytes] uint8, `protocol.wire.plain_values`: attributes by name, which the copies of a lane get before its next rollout
-    under these weights, new copies before their first reset. They keep them until other weights name them. Copies that play
-    evaluations get none
+    """[bytes] uint8, `protocol.wire.plain_values`: attributes by name, which the copies of a lane get before its next
+    rollout under these weights, new copies before their first reset. They keep them until other weights name them. Copies
+    that play evaluations get none
     """
 
 
@@ -152,8 +152,8 @@ class Heartbeat(Message, frozen=True):
     tickets: Tickets
     """tickets that are held and not finished: those that wait, and those of the work in progress"""
     steps: Natural
-    """env steps since the worker started, in all sessions: valid rows of rollouts, steps of evaluations, and with `StepSpec` one
-    for each copy and Step
+    """env steps since the worker started, in all sessions: valid rows of rollouts, steps of evaluations, and with `StepSpec`
+    one for each copy and Step
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""
@@ -304,8 +304,8 @@ class Call(Message, frozen=True):
     assign: bool
     """true: set the attribute"""
     given: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: a pair of the arguments, a list or a tuple, and the keyword arguments, a dict;
-    with `assign`, a list of one value for each of `copies`
+    """[bytes] uint8, `protocol.wire.plain_values`: a pair of the arguments, a list or a tuple, and the keyword arguments, a
+    dict; with `assign`, a list of one value for each of `copies`
     """
 
 
@@ -339,8 +339,8 @@ class Returned(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     results: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each of `copies`, an empty list with `assign`; no bytes
-    if the call raised
+    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each of `copies`, an empty list with `assign`;
+    no bytes if the call raised
     """
     error: Line
     """type and message of the exception, in one line, if the call raised; else empty"""
