@@ -98,7 +98,7 @@ class Collecting:
         yield Wait(self.rollout_s / 5)
 
     def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
-        """The rollout of a permit that was dealt, or has come already. If none comes, this rule is broken, or the likely one."""
+        """The rollout of a permit that was dealt, or has come. If none comes, this rule or the likely one is broken."""
         if rule is None:
             is_first = self.learner.has_had_a_session and not permit.sequence
             rule = rules.FORGETS if is_first else rules.TICKETS
