@@ -1,26 +1,33 @@
-"""The address, keys and socket of a learner that starts local workers, or lets workers elsewhere join.
+"""The address, keys and socket of a learner, and its workers: they are started here, or join from elsewhere.
 
-Rule: whatever happens, closing `resources` releases all that was acquired.
+Rule: whatever happens, closing `resources` releases all that was acquired, and no worker outlives `Endpoint.workers`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from learner.members.bound import Bound, bind, listen
 from learner.members.endpoint import BindSettings
+from learner.members.process_callbacks import ProcessCallbacks
 from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
+from protocol.alive import CallTimeouts
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
-from workers.supervise.supervisor import Running
+from workers.slots import copies_per_machine
+from workers.supervise.supervisor import STOP_WITHIN_S, Running, Supervisor
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from workers.worker_thread import WorkerThread
 
 
-def _nothing_handed(name: str) -> InheritedDescriptors | None:
-    return None
+class StartedWorkers(NamedTuple):
+    """The workers that were started here: none if they join from elsewhere."""
+
+    supervisor: Supervisor
+    processes: ProcessCallbacks
 
 
 @dataclass(frozen=True)
@@ -29,22 +36,46 @@ class Endpoint(Bound):
 
     token: Token | None
     """Token of local workers."""
+    where: BindSettings
+    """Where workers from elsewhere join, if they do."""
 
-    def starter(
-        self, flags: WorkerFlags, handed: Callable[[str], InheritedDescriptors | None] = _nothing_handed
-    ) -> Callable[[str], Running]:
-        """A function that starts the local worker of a name: a thread if the address is inproc, else a process.
+    @contextmanager
+    def workers(
+        self,
+        count: int,
+        flags: WorkerFlags,
+        timeouts: CallTimeouts,
+        stop_within_s: float = STOP_WITHIN_S,
+        handed: Callable[[str], InheritedDescriptors | None] = lambda name: None,
+    ) -> Iterator[StartedWorkers]:
+        """Start `count` workers here; or, if they join from elsewhere, start none, and log how one joins.
 
-        `flags` and `handed`: its flags and log, and the file descriptors that it inherits, by its name.
+        A worker is a thread if the address is inproc, else a process. `flags` and `handed`: its flags and log, and the file
+        descriptors that it inherits, by its name. `timeouts`: of a call of the environment. At the end, workers that still
+        run are asked to leave, and killed after `stop_within_s`.
         """
-        if self.link.address.startswith("inproc://"):
-            return lambda name: WorkerThread(self.link.address, name, self.context)
 
-        def start(name: str) -> WorkerProcess:
+        def start(name: str) -> Running:
+            if self.link.address.startswith("inproc://"):
+                return WorkerThread(self.link.address, name, self.context)
             own, log_file = flags(name)
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, own, handed(name)))
 
-        return start
+        if self.where.bind:
+            count = 0
+            self.announce(self.where.advertise)
+        supervisor = Supervisor(start, count, timeouts=timeouts)
+        processes = ProcessCallbacks(
+            supervisor.poll,
+            supervisor.activities,
+            lower_priority=supervisor.lower_priority,
+            expected=count,
+            most_copies=copies_per_machine() if count else 0,
+        )
+        try:
+            yield StartedWorkers(supervisor, processes)
+        finally:
+            supervisor.stop(stop_within_s)
 
 
 def open_endpoint(where: BindSettings, transport: str, resources: ExitStack, code: str = "") -> Endpoint:
@@ -57,4 +88,4 @@ def open_endpoint(where: BindSettings, transport: str, resources: ExitStack, cod
     else:
         keyring, token = temporary_keys(transport, where.keys, insecure=where.insecure)
         bound = bind(private_address(transport, resources), keyring, resources, code)
-    return Endpoint(bound.link, bound.context, bound.keyring, token)
+    return Endpoint(bound.link, bound.context, bound.keyring, token, where)

@@ -26,10 +26,10 @@ from learner.run import (
 )
 from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import local_processes, no_flags, stopped_on_error, worker_flags
+from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
 from workers.slots import LIMIT_VARIABLE, copies_per_machine
-from workers.supervise.supervisor import STOP_WITHIN_S, Supervisor
+from workers.supervise.supervisor import STOP_WITHIN_S
 
 log = logging.getLogger("millrace.learner")
 
@@ -59,10 +59,9 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         observer = stack.enter_context(prometheus_observer(config))
         folder = stack.enter_context(run_folder(config, resume))
         flags = no_flags if config.transport == "inproc" else worker_flags(config, folder.path)
-        supervisor = Supervisor(endpoint.starter(flags), config.workers, timeouts=config.call_timeouts())
+        supervisor, processes = stack.enter_context(endpoint.workers(config.workers, flags, config.call_timeouts()))
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
-        processes = local_processes(supervisor, config.workers)
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
         with interrupts, one_thread():

@@ -1,4 +1,4 @@
-"""Options of local workers: their address, keys, flags and cores, and what the learner may ask of them.
+"""Options of local workers: their address, keys, flags and cores.
 
 Rule: a socket file is in its own folder, which only this user can enter (0700). The folder is removed with it.
 """
@@ -17,12 +17,10 @@ from pathlib import Path
 from learner.config.config import Config
 from learner.config.rollout_config import RolloutConfig
 from learner.members.endpoint import generate_run_keys
-from learner.members.process_callbacks import ProcessCallbacks
 from learner.run_folder.regular_files import open_regular, reason, subfolder
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
-from workers.slots import copies_per_machine
 from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
 
 LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
@@ -47,17 +45,6 @@ def private_address(transport: str, stack: ExitStack) -> str:
             return f"ipc://{folder}/learner"
         case _:
             raise UsageError(f"transport: expected ipc, tcp or inproc, got {transport!r}")
-
-
-def local_processes(supervisor: Supervisor, workers: int) -> ProcessCallbacks:
-    """The processes of this supervisor, as the learner sees them. `workers`: the number that the user asked for."""
-    return ProcessCallbacks(
-        supervisor.poll,
-        supervisor.activities,
-        lower_priority=supervisor.lower_priority,
-        expected=workers,
-        most_copies=copies_per_machine(),
-    )
 
 
 @contextmanager

@@ -15,17 +15,15 @@ from typing import Literal
 from learner.config.rollout_config import RolloutConfig
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
-from learner.members.process_callbacks import ProcessCallbacks
 from learner.policy_player import PolicyPlayer, SavedPolicy
 from learner.rollout_service.service import describe_settings
 from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import WorkerFlags, local_processes
+from millrace.launch.local_worker_options import WorkerFlags
 from millrace.launch.vector import listen
 from workers.copies.split_vector_env import SplitVectorEnv
-from workers.supervise.supervisor import Supervisor
 
 
 @dataclass(frozen=True)
@@ -80,13 +78,8 @@ def _player(
 ) -> PolicyPlayer:
     """A player whose workers act."""
     endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
-    if which.bind:
-        processes = ProcessCallbacks()
-        endpoint.announce("")
-    else:
-        supervisor = Supervisor(endpoint.starter(_own_logs(stack)), which.workers, timeouts=which.settings.call_timeouts())
-        stack.callback(supervisor.stop, 2.0)
-        processes = local_processes(supervisor, which.workers)
+    started = endpoint.workers(which.workers, _own_logs(stack), which.settings.call_timeouts(), 2.0)
+    _, processes = stack.enter_context(started)
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
 
 

@@ -14,18 +14,17 @@ from learner.config.validation import workers_to_wait_for
 from learner.env_spaces import EnvSpaces
 from learner.members.describe import described_by_workers
 from learner.members.endpoint import BindSettings
-from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollout_service.spec import rollout_spec
 from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import local_processes, stopped_on_error, worker_cores
+from millrace.launch.local_worker_options import stopped_on_error, worker_cores
 from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.specs import DescribeSpec, RunSpec
-from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
+from workers.supervise.supervisor import core_flags, timeout_flags
 
 
 @dataclass(frozen=True)
@@ -57,19 +56,13 @@ def start(
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
     link = endpoint.link
-    supervisor = None
-    processes = ProcessCallbacks()
-    if listens:
-        endpoint.announce(config.advertise)
-    else:
-        cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
-        start_worker = endpoint.starter(lambda name: ([*timeouts, *core_flags(cores, name)], None))
-        supervisor = Supervisor(start_worker, config.workers, timeouts=config.call_timeouts())
-        resources.callback(supervisor.stop)
-        processes = local_processes(supervisor, config.workers)
-    with ExitStack() as starting:
-        if supervisor is not None:
-            starting.enter_context(stopped_on_error(supervisor))
+    cores, timeouts = [] if listens else worker_cores(config), config.call_timeouts()
+
+    def flags(name: str) -> tuple[list[str], None]:
+        return [*timeout_flags(timeouts), *core_flags(cores, name)], None
+
+    supervisor, processes = resources.enter_context(endpoint.workers(config.workers, flags, timeouts))
+    with stopped_on_error(supervisor):
         spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
         described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
         spaces = EnvSpaces.of_description(described, config.action_masks)

@@ -21,14 +21,13 @@ from learner.members.describe_coordinator import Accept, accept_any
 from learner.members.endpoint import BindSettings
 from learner.members.events import Failed
 from learner.members.failure_count import FailureCount
-from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import RequestedCopies, requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
 from millrace.arguments import checked
-from millrace.launch.endpoint import Endpoint, open_endpoint
-from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags, local_processes
+from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
+from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
 from protocol.cpu_cores import usable_cores
@@ -38,7 +37,7 @@ from protocol.envs.wrappers import WrapperLike
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
-from workers.supervise.supervisor import Supervisor, timeout_flags
+from workers.supervise.supervisor import timeout_flags
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
@@ -196,14 +195,9 @@ class ListeningVectorEnv:
 
     def start(self, flags: WorkerFlags, timeouts: CallTimeouts) -> StartedVectorEnv:
         """Start the local workers with these flags. `timeouts`: of a call of the environment. Call it once."""
-        count = self.settings.local_workers
-        start = self.endpoint.starter(flags, self._handed)
-        supervisor = Supervisor(start, count, timeouts=timeouts) if count else None
-        if supervisor is not None:
-            self.resources.callback(supervisor.stop, LEAVE_AT_ONCE_S)  # if there will be no hub to close
-        else:
-            self.endpoint.announce(self.settings.listen.advertise)
-        return StartedVectorEnv(self, supervisor)
+        # They are stopped at once if there will be no hub to close.
+        started = self.endpoint.workers(self.settings.local_workers, flags, timeouts, LEAVE_AT_ONCE_S, self._handed)
+        return StartedVectorEnv(self, self.resources.enter_context(started))
 
     def _handed(self, worker: str) -> InheritedDescriptors | None:
         """The file descriptors that this worker inherits."""
@@ -218,7 +212,7 @@ class StartedVectorEnv:
     """A vector environment whose local workers were started. They have not necessarily joined."""
 
     listening: ListeningVectorEnv
-    supervisor: Supervisor | None
+    workers: StartedWorkers
 
     def describe(
         self,
@@ -231,11 +225,9 @@ class StartedVectorEnv:
 
         Raises `UserFacingError`, and what `check_interrupt` raises.
         """
-        spec, processes = self.listening.requested.to_describe, ProcessCallbacks()
+        spec, link = self.listening.requested.to_describe, self.listening.endpoint.link
         spec = spec if env is None else msgspec.structs.replace(spec, env=env)
-        if self.supervisor is not None:
-            processes = local_processes(self.supervisor, self.listening.settings.local_workers)
-        return described_by_workers(self.listening.endpoint.link, spec, settings, processes, check_interrupt, accept=accept)
+        return described_by_workers(link, spec, settings, self.workers.processes, check_interrupt, accept=accept)
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
         """The vector environment. Call it once; it does not wait until workers have joined."""
@@ -249,7 +241,7 @@ class StartedVectorEnv:
             listening.endpoint.link,
             description.step,
             first_session=int.from_bytes(os.urandom(6), "little"),
-            local_workers=self.supervisor,
+            local_workers=self.workers.supervisor,
             shared=shared,
             worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
             spin_s=SPIN_S if settings.local_workers < usable_cores() else 0.0,  # only if one core is free for the learner
