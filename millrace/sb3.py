@@ -140,7 +140,7 @@ class Sb3VecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute of each env copy to the same value."""
         copies = sorted(set(self._copies(indices)))
-        self.env.assign_some(copies, attr_name, [value] * len(copies))
+        self.env.calls.assign(copies, attr_name, [value] * len(copies))
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of each env copy."""
@@ -152,7 +152,7 @@ class Sb3VecEnv(VecEnv):
         if self._monitored and issubclass(Monitor, wrapper_class):
             return [True for _ in copies]
         ascending, name = sorted(set(copies)), class_name(wrapper_class)
-        found = dict(zip(ascending, self.env.describe_copies(ascending), strict=True))
+        found = dict(zip(ascending, self.env.calls.describe(ascending), strict=True))
         return [(copy := found[n]) is not None and name in copy.wrappers for n in copies]
 
     def get_images(self) -> Sequence[Array | None]:
@@ -163,7 +163,7 @@ class Sb3VecEnv(VecEnv):
         """The result of each env copy, in the order of `indices`."""
         copies = self._copies(indices)
         ascending = sorted(set(copies))
-        results = dict(zip(ascending, self.env.call_some(ascending, name, *args, **kwargs), strict=True))
+        results = dict(zip(ascending, self.env.calls.call(ascending, name, args, kwargs), strict=True))
         return [results[n] for n in copies]
 
     def _copies(self, indices: Indices) -> list[int]:

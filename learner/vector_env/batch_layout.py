@@ -21,10 +21,15 @@ class BatchLayout:
         self.rows = [slice(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
         """Rows of each lane, by lane."""
         self._firsts = [rows.start for rows in self.rows]
+        self._copies = [range(rows.start, rows.stop) for rows in self.rows]
 
     def copies(self, lane: int) -> range:
         """The env copies of a lane, numbered as in the whole batch."""
-        return range(self.rows[lane].start, self.rows[lane].stop)
+        return self._copies[lane]
+
+    def copies_of(self, lanes: Iterable[int]) -> list[int]:
+        """The env copies of these lanes."""
+        return [n for lane in lanes for n in self.copies(lane)]
 
     def size(self, lane: int) -> int:
         """Number of env copies of a lane."""

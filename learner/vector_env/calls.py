@@ -1,22 +1,82 @@
-"""`call`, `get_attr`, `set_attr` and descriptions of copies: what to send to each lane, and what its answer means. Pure."""
+"""Calls of env copies, and their descriptions: what to send to each lane, and what its answer means."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gymnasium import Space
+
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import call_order
+from learner.vector_env.lost_lanes import RESET_ATTEMPTS
 from learner.vector_env.order_coordinator import MakeOrder
+from learner.vector_env.send_recv import SendRecv, VectorEnvParts
 from protocol.bounds import MAX_LINE, one_line
 from protocol.envs.description import DescribedEnv, read_description
-from protocol.errors import BadMessage, EnvironmentFailed, UsageError
-from protocol.messages import Answer, Described, Returned
+from protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost
+from protocol.messages import DESCRIPTION, Described, Returned
 from protocol.wire.codec import decode_to_learner
 from protocol.wire.plain_values import unpack
 
 USE_INSTEAD = ("reset", "step", "close")
 """Methods of an environment that only the vector environment may call."""
+
+
+class CopyCalls:
+    """Calls, reads and assigns attributes of the env copies of one vector environment, and describes them."""
+
+    def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, known: Mapping[str, Any]) -> None:
+        """`known`: attributes of every copy that are no plain data, and so cannot travel."""
+        self.known, self._send_recv, self._parts = known, send_recv, parts
+
+    def call(self, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
+        """Call, or get, the attribute of these copies. The results are in ascending order of the copies.
+
+        Raises as `ZmqVectorEnv.call`.
+        """
+        if name in self.known:
+            return (self.known[name],) * len(copies)
+        return _results(name, self._answers(call_orders(self._parts.layout, copies, name, args, kwargs)))
+
+    def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
+        """Set the attribute of these copies, in ascending order, to one value each."""
+        _results(name, self._answers(assign_orders(self._parts.layout, copies, name, values)))
+
+    def describe(self, copies: Sequence[int]) -> list[DescribedEnv | None]:
+        """What each of these copies is, in ascending order; None where a client cannot say it. Raises as `call`."""
+        described: list[DescribedEnv | None] = []
+        for lane, answer in sorted(self._answers(call_orders(self._parts.layout, copies, DESCRIPTION, (), {})).items()):
+            count = len(self._parts.layout.by_lane(copies)[lane])
+            try:
+                described += _descriptions(answer, count)
+            except BadMessage as error:
+                self._parts.hub.refuse_owner(lane, f"lane {lane}: description cannot be read: {error}")
+                described += [None] * count
+        return described
+
+    def make(self, spaces: tuple[Space[Any], Space[Any]]) -> None:
+        """Make all copies, before they are reset. Raises as `call`, and `EnvironmentFailed` also if their spaces differ."""
+        described: list[DescribedEnv | None] = []
+        for attempt in range(RESET_ATTEMPTS):
+            try:
+                described = self.describe(range(self._parts.layout.num_envs))
+                break
+            except WorkerLost:  # another worker may make them
+                if attempt == RESET_ATTEMPTS - 1:
+                    raise
+        for n, copy in enumerate(described):
+            if copy is not None and (copy.observation_space, copy.action_space) != spaces:
+                raise EnvironmentFailed(
+                    f"copy {n}: its observations {copy.observation_space} and actions {copy.action_space} are not those of "
+                    f"copy 0, {spaces[0]} and {spaces[1]}; all copies must have the same, and each machine the same version "
+                    "of the environment"
+                )
+
+    def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
+        self._send_recv.call(orders)
+        ready = self._send_recv.recv_all()
+        return {lane.lane: lane.result for lane in ready if isinstance(lane.result, Returned)}
 
 
 def call_orders(
@@ -56,21 +116,19 @@ def _check_name(name: object) -> None:
         raise UsageError(f"call: expected the name of an attribute, text of 1 to {MAX_LINE:,} characters, got {got}")
 
 
-def call_results(name: str, answers: Mapping[int, Answer]) -> tuple[Any, ...]:
-    """The results of all lanes, in the order of the copies. Raises what `call_error` says if an environment raised."""
+def _results(name: str, answers: Mapping[int, Returned]) -> tuple[Any, ...]:
+    """The results of all lanes, in the order of the copies. Raises what `_error` makes if an environment raised."""
     results: list[Any] = []
     for lane in sorted(answers):
         answer = answers[lane]
-        assert isinstance(answer, Returned)
         if answer.error:
-            raise call_error(name, lane, answer)
+            raise _error(name, lane, answer)
         results += unpack(answer.results.data)
     return tuple(results)
 
 
-def described_copies(answer: Answer, count: int) -> list[DescribedEnv | None]:
+def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
     """What each of a lane's `count` copies is; None where the client cannot say it. Raises `BadMessage`."""
-    assert isinstance(answer, Returned)
     if answer.error:
         return [None] * count
     sent, found = unpack(answer.results.data), dict[tuple[bytes, ...], DescribedEnv]()
@@ -85,7 +143,7 @@ def described_copies(answer: Answer, count: int) -> list[DescribedEnv | None]:
     return [found[tuple(frames)] for frames in sent]
 
 
-def call_error(name: str, lane: int, answer: Returned) -> Exception:
+def _error(name: str, lane: int, answer: Returned) -> Exception:
     """The exception of a call, with the worker's traceback. An `AttributeError` keeps its type, as `hasattr` needs it."""
     line = f"call of {name!r}, lane {lane}: {answer.error}"
     missing = answer.error.startswith("AttributeError")

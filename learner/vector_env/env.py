@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,26 +17,18 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from learner.members.events import Failed
-from learner.members.membership import Member
 from learner.vector_env.arguments import Options, action_arrays, seed_list, take_reset_mask
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.calls import assign_orders, call_orders, call_results, described_copies
-from learner.vector_env.infos import Infos, OfSomeCopies, unpack_infos
-from learner.vector_env.lane_orders import packed, reset_order, step_order
-from learner.vector_env.lost_lanes import RESET_ATTEMPTS, UNKNOWN_REASON, LostLanes, worker_lost
-from learner.vector_env.order_coordinator import MakeOrder
-from learner.vector_env.send_recv import SendRecv, VectorEnvParts, WaitSettings, numbered
+from learner.vector_env.calls import CopyCalls
+from learner.vector_env.infos import InfoReader, merged
+from learner.vector_env.lost_lanes import LostLanes
+from learner.vector_env.send_recv import SendRecv, VectorEnvParts, numbered
+from learner.vector_env.sent_lanes import Infos, ReadyLane
 from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
-from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import make_flatten
-from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers, UsageError, WorkerLost
-from protocol.messages import DESCRIPTION, Answer, Status, Stepped
-from protocol.wire.plain_values import repr_paths
-from protocol.wire.shared_memory import SharedMemory
 
 log = logging.getLogger("millrace.learner")
 
@@ -51,13 +43,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         description: VectorEnvDescription,
         hub: StepHub,
         *,
-        memory: SharedMemory | None = None,
         timeout_s: float = 60.0,
         on_worker_loss: Literal["truncate", "raise"] = "truncate",
         copy: bool = True,
         on_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """`memory` is shared with local workers. `timeout_s`: how long a worker may take to answer.
+        """`timeout_s`: how long a worker may take to answer.
 
         `on_close` is called once: by `close`, when this object is garbage collected, or when the interpreter exits.
         """
@@ -71,44 +62,31 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.single_action_space = description.action_space
         self.observation_space = batch_space(self.single_observation_space, N)
         self.action_space = batch_space(self.single_action_space, N)
-        self.timeout_s, self.on_worker_loss, self.copy = timeout_s, on_worker_loss, copy
+        self.copy = copy
         self.merge_infos = True
         """whether infos are returned, merged as gymnasium does it; otherwise only `infos_by_copy` has them"""
         self.infos_by_copy: dict[int, Infos] = {}
         """the newest infos that are not empty, as each copy returned them"""
-        self._described = {
-            "spec": self.spec,
-            "observation_space": self.single_observation_space,
-            "action_space": self.single_action_space,
-        }
-        """attributes of every copy that are no plain data"""
-        self._hub, self._memory = hub, memory
-        self._autoreset = step.autoreset
-        read = make_flatten(self.single_action_space)
+        self.hub = hub
+        """who is asked; it may be told what to call while it waits"""
+        self._action_leaves, self._read_actions = step.action, make_flatten(self.single_action_space)
         self._layout = BatchLayout(step.lanes)
+        memory = None if hub.shared is None else hub.shared.memory
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
-        self._lost_lanes = LostLanes()
-        self._pending: Literal["", "step"] = ""
-        self._asked: Sequence[int] = ()  # lanes that the last step was asked of
-        self._stepping: Sequence[int] = ()  # lanes that the pending step was ordered of: those that are not lost
-        self._ever_reset, self._all_were_reset = np.zeros(N, bool), False
-        self._seeds: list[int | None] = [None] * N  # of each copy's last seeded reset
-        self._warned_infos: set[str] = set()  # keys of infos that arrived as their repr
+        self._step_is_pending = False
+        self._info_reader = InfoReader(self._layout, hub.refuse_owner)
+        seeds, ever_reset = list[int | None]([None] * N), np.zeros(N, bool)
         parts = VectorEnvParts(
-            hub=hub,
-            layout=self._layout,
-            batch=self._batch,
-            memory=memory,
-            lost_lanes=self._lost_lanes,
-            read_actions=lambda actions, count: action_arrays(actions, read, step.action, count),
-            autoreset=step.autoreset,
-            seeds=self._seeds,
-            ever_reset=self._ever_reset,
+            hub, self._layout, self._batch, LostLanes(), step.autoreset, seeds, ever_reset, on_worker_loss
         )
-        self._parts, self._send_recv = parts, SendRecv(parts)
+        self._send_recv = SendRecv(parts, timeout_s)
+        known = {"spec": self.spec, "observation_space": self.single_observation_space}
+        known["action_space"] = self.single_action_space
+        self.calls = CopyCalls(self._send_recv, parts, known)
+        """calls of some copies"""
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
-    # ---------------------------------------------------------------- reset
+    # ---------------------------------------------------------------- reset and step
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Options = None) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
@@ -120,50 +98,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._check_idle("reset")
         seeds = seed_list(seed, self.num_envs)
         mask, options = take_reset_mask(options, self.num_envs)
-        copies = self._layout.by_lane(np.flatnonzero(mask).tolist())
-        self._parts.check_reset(copies)
-        self._seeds[:] = [new if new is not None else old for new, old in zip(seeds, self._seeds, strict=True)]
-        if mask.all():
-            self._hub.rebalance()
-        self._lost_lanes.add(self._hub.take_lost())
-        self._lost_lanes.forget(lane for lane, chosen in copies.items() if len(chosen) == self._layout.size(lane))
-        infos = self._reset_copies(copies, seeds, options)
-        self._ever_reset |= mask
-        return self._batch.observation(copy=self.copy), self._merge_infos(infos)
-
-    def _reset_copies(
-        self, copies: Mapping[int, list[int]], seeds: Sequence[int | None], options: Options
-    ) -> dict[int, bytes]:
-        """Begin episodes in these copies of these lanes, and again wherever a worker is lost. Packed infos by lane."""
-        infos: dict[int, bytes] = {}
-        waiting = dict(copies)
-        for attempt in range(RESET_ATTEMPTS):
-            orders = {}
-            for lane, chosen in waiting.items():
-                rows = self._layout.rows[lane]
-                lane_seeds = seeds[rows]
-                lane_options = [options[rows][n] for n in chosen] if isinstance(options, list) else options
-                orders[lane] = reset_order(chosen, [lane_seeds[n] for n in chosen], packed(lane_options))
-            self._hub.send_orders(orders)
-            answers = self._hub.wait_for_answers(self.timeout_s)
-            infos |= self._store(answers)
-            waiting = {lane: chosen for lane, chosen in waiting.items() if lane not in answers}
-            lost = self._hub.take_lost()
-            self._lost_lanes.add({lane: why for lane, why in lost.items() if self._is_to_report(lane, waiting)})
-            if not waiting:
-                return infos
-            if self.on_worker_loss == "raise" or attempt == RESET_ATTEMPTS - 1:
-                self._lost_lanes.expect_reset(waiting)
-                raise worker_lost(lost, self._layout)
-        return infos
-
-    def _is_to_report(self, lane: int, waiting: Mapping[int, list[int]]) -> bool:
-        """Whether the next step reports a lane that was lost during a reset: if copies were lost that are not reset."""
-        if lane in waiting:
-            return len(waiting[lane]) < self._layout.size(lane)
-        return not self._hub.is_started(lane)
-
-    # ---------------------------------------------------------------- step
+        self._send_recv.reset(np.flatnonzero(mask).tolist(), seeds, options)
+        ready = self._send_recv.recv_all()
+        return self._batch.observation(copy=self.copy), self._infos(ready)
 
     def step(self, actions: Any) -> StepResult:
         """Step every copy. Returns observations, rewards, terminated, truncated and infos.
@@ -177,45 +114,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.step_async(actions)
         return self.step_wait()
 
-    def step_lanes(self, lanes: Sequence[int], actions: Any) -> StepResult:
-        """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
-        self._order_step(lanes, actions)
-        return self.step_wait()
-
-    def step_async(self, actions: Any) -> None:
-        """Order every copy to step; `step_wait` returns the results."""
-        self._order_step(self._layout.lanes, actions)
-
-    def _order_step(self, lanes: Sequence[int], actions: Any) -> None:
+    def step_async(self, actions: Any, lanes: Sequence[int] | None = None) -> None:
+        """Order every copy to step, or those of these lanes; `step_wait` returns the results."""
         self._check_idle("step_async")
-        arrays, fit = self._parts.read_actions(actions, self.num_envs)
-        if not self._all_were_reset:
-            if never := [n for n in self._copies_of(lanes) if not self._ever_reset[n]]:
-                raise UsageError(f"step before reset of copies {never}: call reset() first")
-            self._all_were_reset = bool(self._ever_reset.all())
-        self._lost_lanes.add(self._hub.take_lost())
-        if ended := self._parts.ended_copies(range(self.num_envs)):
-            raise UsageError(
-                f"copies {ended} have ended: autoreset_mode is Disabled, expected reset(options={{'reset_mask': ended}}) "
-                "before the next step"
-            )
-        awaiting_reset, lost = self._lost_lanes.awaiting_reset, self._lost_lanes.unreported
-        if awaiting_reset and self.on_worker_loss == "raise":
-            raise WorkerLost(f"lanes {sorted(awaiting_reset)} were lost with their worker; call reset() first")
-        self._asked = lanes
-        self._stepping = [lane for lane in lanes if lane not in lost]
-        self._pending = "step"
-        if (
-            fit
-            and self._memory is not None
-            and not awaiting_reset
-            and all(map(self._hub.uses_shared_memory, self._stepping))
-        ):
-            for array, leaf in zip(self._memory.actions, arrays, strict=True):
-                array[:] = leaf
-            self._hub.step_shared(self._stepping)
-        else:
-            self._hub.send_orders({lane: self._step_order(lane, arrays) for lane in self._stepping})
+        arrays = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
+        self._send_recv.step(self._layout.lanes if lanes is None else lanes, arrays, self._layout.rows, together=True)
+        self._step_is_pending = True
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """Wait for the pending step. Returns and raises what `step` does, and `NoAsyncCallError` if there is none.
@@ -224,69 +128,15 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """
         if self.closed:
             raise ClosedEnvironmentError("step_wait after close()")
-        if self._pending != "step":
+        if not self._step_is_pending:
             raise NoAsyncCallError("step_wait without step_async before it", "step")
-        hub, timeout_s = self._hub, self.timeout_s if timeout is None else timeout
-        try:
-            answers = hub.wait_for_answers(timeout_s)
-        except Exception:
-            self._pending = ""
-            self._lost_lanes.expect_reset(hub.take_lost())
-            raise
-        self._pending = ""
-        infos = self._store(answers)
-        if hub.stepped:
-            infos |= {lane: hub.infos(lane, timeout_s) for lane in sorted(hub.stepped)}
-        if any(lane in self._asked for lane in self._lost_lanes.unreported) or len(answers) + len(hub.stepped) < len(
-            self._stepping
-        ):
-            return self._step_result_with_losses(infos, {*answers, *hub.stepped})
-        batch = self._batch
-        return (
-            batch.observation(copy=self.copy),
-            batch.reward.copy(),
-            batch.terminated.copy(),
-            batch.truncated.copy(),
-            self._merge_infos(infos),
-        )
-
-    def _copies_of(self, lanes: Sequence[int]) -> list[int]:
-        return [n for lane in lanes for n in self._layout.copies(lane)]
-
-    def _step_order(self, lane: int, actions: Sequence[Array]) -> MakeOrder:
-        rows = self._layout.rows[lane]
-        if lane in self._lost_lanes.awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
-            seeds = self._parts.replacement_seeds(lane)
-            return reset_order(range(len(seeds)), seeds, packed(None))
-        return step_order([array[rows] for array in actions])
-
-    def _step_result_with_losses(self, infos: dict[int, bytes], answered: set[int]) -> StepResult:
-        """The result of a step that some lanes did not answer: their copies are truncated at their newest observation."""
-        batch, layout = self._batch, self._layout
-        self._lost_lanes.add(self._hub.take_lost())
-        lost = self._lost_lanes.report([lane for lane in self._asked if lane not in answered])
-        if self.on_worker_loss == "raise":
-            raise worker_lost(lost, layout)
-        for lane, why in lost.items():
-            copies = layout.copies(lane)
-            log.warning("%s; its lane %d comes back truncated (copies %d to %d)", why, lane, copies[0], copies[-1])
-            batch.truncate(lane)
-        results = batch.reward.copy(), batch.terminated.copy(), batch.truncated.copy()
-        loss_infos: dict[int, Infos] = {n: {"worker_lost": True} for lane in lost for n in layout.copies(lane)}
-        if self._autoreset == "SameStep":
-            for n, info in loss_infos.items():
-                info |= {"final_obs": batch.observation_of(n), "final_info": {"worker_lost": True}}
-            infos |= self._reset_copies(
-                {lane: list(range(layout.size(lane))) for lane in lost}, self._replacement_seeds(lost), None
-            )
-        return batch.observation(copy=self.copy), *results, self._merge_infos(infos, loss_infos)
-
-    def _replacement_seeds(self, lost: Iterable[int]) -> list[int | None]:
-        """The seeds of all copies, with new ones for the copies of lost lanes."""
-        seeds = list(self._seeds)
-        for lane in lost:
-            seeds[self._layout.rows[lane]] = self._parts.replacement_seeds(lane)
-        return seeds
+        self._step_is_pending = False
+        ready = self._send_recv.recv_all(timeout)
+        batch, truncated = self._batch, self._batch.truncated.copy()
+        if lost := [n for lane in ready if lane.loss_infos for n in lane.loss_infos]:
+            truncated[lost] = True
+        observation = batch.observation(copy=self.copy)
+        return observation, batch.reward.copy(), batch.terminated.copy(), truncated, self._infos(ready)
 
     # ---------------------------------------------------------------- lanes that do not wait for each other
 
@@ -302,11 +152,14 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         A single seed s gives copy n the seed s + n; a list has one for each of `env_ids`. Raises `AlreadyPendingCallError`
         if one of the copies, or another one of its lane, has not come back.
         """
-        self._check_no_step("async_reset")
+        self._check_idle("async_reset", of_sent=True)
         copies = numbered(env_ids, self.num_envs)
+        self._layout.check(copies)
         if isinstance(seed, int | np.integer):
             seed = [int(seed) + n for n in copies]
-        self._send_recv.reset(copies, seed_list(seed, len(copies)), options)
+        seeds = np.full(self.num_envs, None)
+        seeds[copies] = seed_list(seed, len(copies))
+        self._send_recv.reset(copies, seeds.tolist(), options)
 
     def send(self, actions: Any, env_ids: Sequence[int] | Array | None = None) -> None:
         """Step these copies, by default all, with one action each, in the order of `env_ids`; `recv` returns the results.
@@ -323,8 +176,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             observation, reward, terminated, truncated, infos = envs.recv()
             envs.send(policy(observation), infos["env_id"])
         """
-        self._check_no_step("send")
-        self._send_recv.send(actions, numbered(env_ids, self.num_envs), self.on_worker_loss)
+        self._check_idle("send", of_sent=True)
+        copies = numbered(env_ids, self.num_envs)
+        at = self._layout.positions(copies)
+        arrays = action_arrays(actions, self._read_actions, self._action_leaves, len(copies))
+        self._send_recv.step(list(at), arrays, at, together=False)
 
     def recv(self, min_envs: int = 1, timeout: float | None = None) -> StepResult:
         """The results of all copies that are ready; waits until at least `min_envs` are. 0 does not wait.
@@ -338,14 +194,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `WorkerLost` and `NoWorkers`. After an error, all other copies can still be received, and those that are lost come
         back truncated or are named by `WorkerLost`.
         """
-        self._check_no_step("recv")
-        wait = WaitSettings(min_envs, self.timeout_s if timeout is None else timeout, self.on_worker_loss)
-        ready = self._send_recv.recv(wait)
+        self._check_idle("recv", of_sent=True)
+        ready = self._send_recv.recv(min_envs, timeout)
         batch, copies = self._batch, [n for lane in ready for n in lane.copies]
         truncated = batch.truncated[copies]
-        loss_infos = {n: dict(info) for lane in ready for n, info in lane.loss_infos.items()}
-        truncated[[n in loss_infos for n in copies]] = True
-        infos = self._merge_infos({lane.lane: lane.infos for lane in ready}, loss_infos, copies)
+        if lost := {n for lane in ready if lane.loss_infos for n in lane.loss_infos}:
+            truncated[[n in lost for n in copies]] = True
+        infos = self._infos(ready, copies)
         infos["env_id"] = np.array(copies, np.int64)
         return batch.observation_of_some(copies), batch.reward[copies], batch.terminated[copies], truncated, infos
 
@@ -364,18 +219,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         `spec`, `observation_space` and `action_space` are as a worker described them, for such objects cannot travel.
         """
-        return self.call_some(range(self.num_envs), name, *args, **kwargs)
+        if name not in self.calls.known:
+            self._check_idle("call")
+        return self.calls.call(range(self.num_envs), name, args, kwargs)
 
-    def call_some(self, copies: Sequence[int], name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """As `call`, for some copies. The results are in ascending order of the copies."""
-        if name in self._described:
-            return (self._described[name],) * len(copies)
-        self._check_idle("call")
-        return call_results(name, self._answers_of_call(call_orders(self._layout, copies, name, args, kwargs)))
-
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every copy; see `call`."""
-        return self.call(name)
+    get_attr = call
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute. A list or tuple has one value for each copy; any other value goes to all copies."""
@@ -383,12 +231,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             values = [values] * self.num_envs
         if len(values) != self.num_envs:
             raise ValueError(f"values: expected one for each of {self.num_envs} copies, got {len(values)}")
-        self.assign_some(range(self.num_envs), name, values)
-
-    def assign_some(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
-        """Set an attribute of some copies, in ascending order, to one value each."""
         self._check_idle("call")
-        call_results(name, self._answers_of_call(assign_orders(self._layout, copies, name, values)))
+        self.calls.assign(range(self.num_envs), name, values)
 
     def render(self) -> tuple[Any, ...]:
         """What `render` of every copy returns."""
@@ -399,91 +243,23 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The seed of each copy's random generator, as `SyncVectorEnv` shows it."""
         return self.get_attr("np_random_seed")
 
-    def describe_copies(self, copies: Sequence[int]) -> list[DescribedEnv | None]:
-        """What each of these copies is, in ascending order; None where a client cannot say it. Raises as `call`."""
-        self._check_idle("describe_copies")
-        orders = call_orders(self._layout, copies, DESCRIPTION, (), {})
-        described: list[DescribedEnv | None] = []
-        for lane, answer in sorted(self._answers_of_call(orders).items()):
-            count = len(self._layout.by_lane(copies)[lane])
-            try:
-                described += described_copies(answer, count)
-            except BadMessage as error:
-                self._hub.refuse_owner(lane, f"lane {lane}: description cannot be read: {error}")
-                described += [None] * count
-        return described
-
-    def make_copies(self) -> None:
-        """Make all copies, before they are reset. Raises as `reset`, and `EnvironmentFailed` also if their spaces differ."""
-        expected = self.single_observation_space, self.single_action_space
-        described: list[DescribedEnv | None] = []
-        for attempt in range(RESET_ATTEMPTS):
-            try:
-                described = self.describe_copies(range(self.num_envs))
-                break
-            except WorkerLost:  # another worker may make them
-                if attempt == RESET_ATTEMPTS - 1:
-                    raise
-        for n, copy in enumerate(described):
-            if copy is not None and (copy.observation_space, copy.action_space) != expected:
-                raise EnvironmentFailed(
-                    f"copy {n}: its observations {copy.observation_space} and actions {copy.action_space} are not those of "
-                    f"copy 0, {expected[0]} and {expected[1]}; all copies must have the same, and each machine the same "
-                    "version of the environment"
-                )
-
-    def _answers_of_call(self, orders: Mapping[int, MakeOrder]) -> dict[int, Answer]:
-        self._hub.send_orders(orders)
-        answers = self._hub.wait_for_answers(self.timeout_s)
-        if unanswered := [lane for lane in orders if lane not in answers]:
-            self._lost_lanes.add(self._hub.take_lost())
-            if self.on_worker_loss == "raise":
-                raise worker_lost(self._lost_lanes.report(unanswered), self._layout)
-            # The next step also reports it: a caller that goes on must see that the episodes ended.
-            lost = self._lost_lanes.unreported
-            raise worker_lost({lane: lost.get(lane, UNKNOWN_REASON) for lane in unanswered}, self._layout)
-        return answers
-
     # ---------------------------------------------------------------- workers
 
     @property
     def address(self) -> str:
         """The address that workers connect to."""
-        return self._hub.address
+        return self.hub.address
 
     @property
     def workers(self) -> int:
         """Number of workers that have joined."""
-        return len(self.members())
-
-    def members(self) -> list[Member]:
-        """The workers that have joined, as the learner sees them. For any thread."""
-        return self._hub.members
-
-    def wait_for(self, workers: int, timeout_s: float) -> None:
-        """Wait until this many workers have joined. Raises `NoWorkers`."""
-        self._hub.wait_for(workers, timeout_s)
-
-    def no_workers(self, timeout_s: float) -> NoWorkers:
-        """The error when no worker has been there for this long."""
-        return self._hub.no_workers(timeout_s)
-
-    def watch(self, callback: Callable[[], None]) -> None:
-        """Set what is called regularly during each wait. An exception that it raises ends the wait."""
-        self._hub.call_while_waiting(callback)
-
-    def call_on_death(self, callback: Callable[[Failed], None]) -> None:
-        """Call this, in the thread that uses this, when a worker's process has ended in its environment."""
-        self._hub.call_on_death(callback)
-
-    def answer_for(self, run: Callable[[float], Status]) -> None:
-        """Answer `millrace status` for this run, which acts on these copies. `run` takes the time and gives its status."""
-        self._hub.answer_for(run)
+        return len(self.hub.coordinator.members)
 
     # ---------------------------------------------------------------- close
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ask the workers to leave, and end the local ones. Never hangs."""
+        self._send_recv.closed = True
         self._close_once()
 
     def __enter__(self) -> ZmqVectorEnv:
@@ -494,55 +270,18 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     # ---------------------------------------------------------------- inside
 
-    def _check_idle(self, doing: str) -> None:
-        self._check_no_step(doing)
-        if copies := self._send_recv.copies():
-            raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
-
-    def _check_no_step(self, doing: str) -> None:
+    def _check_idle(self, doing: str, *, of_sent: bool = False) -> None:
+        """Raise if this cannot be done now. `of_sent`: it may be done while copies have not come back."""
         if self.closed:
             raise ClosedEnvironmentError(f"{doing} after close()")
-        if self._pending:
-            raise AlreadyPendingCallError(f"{doing} while a step is pending: expected step_wait() first", self._pending)
+        if self._step_is_pending:
+            raise AlreadyPendingCallError(f"{doing} while a step is pending: expected step_wait() first", "step")
+        if not of_sent and (copies := self._send_recv.copies()):
+            raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
 
-    def _store(self, answers: Mapping[int, Answer]) -> dict[int, bytes]:
-        """Write results that came as messages to the batch. Packed infos by lane."""
-        infos = {}
-        for lane, answer in answers.items():
-            if isinstance(answer, Stepped) and answer.ticket > 0:
-                self._batch.store(lane, answer)
-                infos[lane] = bytes(answer.infos.data)
-        self._lost_lanes.answered(answers.keys())
-        return infos
-
-    def _merge_infos(
-        self,
-        packed_infos: Mapping[int, bytes],
-        loss_infos: Mapping[int, Infos] | None = None,
-        copies: Sequence[int] | None = None,
-    ) -> Infos:
-        """Infos as gymnasium merges them, in the order of the copies, with a row for each of `copies`; None: for all."""
-        by_copy: dict[int, Infos] = dict(loss_infos or {})
-        for lane, data in packed_infos.items():
-            if not data:
-                continue
-            try:
-                for n, info in unpack_infos(data, self._layout.copies(lane)).items():
-                    by_copy[n] = by_copy.get(n, {}) | info
-            except BadMessage as error:
-                self._hub.refuse_owner(lane, f"lane {lane}: infos cannot be read: {error}")
-        self.infos_by_copy = by_copy
-        infos: Infos = {}
-        merged: VectorEnv[Any, Any, Array] = self if copies is None else OfSomeCopies(len(copies))
-        row_of = range(self.num_envs) if copies is None else {n: row for row, n in enumerate(copies)}
-        for n in sorted(by_copy):
-            if self.merge_infos:
-                infos = merged._add_info(infos, by_copy[n], row_of[n])
-            for key in repr_paths(by_copy[n]):
-                if key not in self._warned_infos:
-                    self._warned_infos.add(key)
-                    log.warning("info %s of copy %d is no plain data: it arrives as its repr, a string", key, n)
-        return infos
+    def _infos(self, ready: Sequence[ReadyLane], copies: Sequence[int] | None = None) -> Infos:
+        self.infos_by_copy = self._info_reader.by_copy(ready)
+        return merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
 
 
 def _call_in_process(pid: int, function: Callable[[], None]) -> None:

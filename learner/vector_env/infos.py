@@ -1,16 +1,20 @@
-"""The infos of one lane: packed bytes to one dict for each env copy; and gymnasium's merging for some copies. Pure."""
+"""The infos of a step: packed bytes of each lane to one dict for each env copy, and these merged as gymnasium does it."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 
+from learner.vector_env.batch_layout import BatchLayout
+from learner.vector_env.sent_lanes import Infos, ReadyLane
 from protocol.arrays import Array
 from protocol.errors import BadMessage
-from protocol.wire.plain_values import unpack
+from protocol.wire.plain_values import repr_paths, unpack
 
-Infos = dict[str, Any]
+log = logging.getLogger("millrace.learner")
 
 
 class OfSomeCopies(VectorEnv[Any, Any, Array]):
@@ -20,6 +24,47 @@ class OfSomeCopies(VectorEnv[Any, Any, Array]):
 
     def __init__(self, count: int) -> None:
         self.num_envs = count
+
+
+class InfoReader:
+    """Reads the infos of lanes that came back."""
+
+    def __init__(self, layout: BatchLayout, refuse: Callable[[int, str], None]) -> None:
+        """`refuse` is called with a lane whose infos cannot be read, and why."""
+        self._layout, self._refuse = layout, refuse
+        self._warned: set[str] = set()  # keys of infos that arrived as their repr
+
+    def by_copy(self, ready: Iterable[ReadyLane]) -> dict[int, Infos]:
+        """The infos that are not empty, in the order of the copies."""
+        found: dict[int, Infos] = {}
+        for lane in ready:
+            if lane.loss_infos:
+                found |= {n: dict(info) for n, info in lane.loss_infos.items()}
+            if not isinstance(lane.result, bytes) or not lane.result:
+                continue
+            try:
+                for n, info in unpack_infos(lane.result, self._layout.copies(lane.lane)).items():
+                    found[n] = found.get(n, {}) | info
+            except BadMessage as error:
+                self._refuse(lane.lane, f"lane {lane.lane}: infos cannot be read: {error}")
+        if not found:
+            return found
+        for n in sorted(found):
+            for key in repr_paths(found[n]):
+                if key not in self._warned:
+                    self._warned.add(key)
+                    log.warning("info %s of copy %d is no plain data: it arrives as its repr, a string", key, n)
+        return dict(sorted(found.items()))
+
+
+def merged(by_copy: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], copies: Sequence[int] | None = None) -> Infos:
+    """Infos as gymnasium merges them, with a row for each of these copies; None: for all of the vector environment."""
+    infos: Infos = {}
+    rows = OfSomeCopies(len(copies)) if copies is not None else env
+    row_of = range(env.num_envs) if copies is None else {n: row for row, n in enumerate(copies)}
+    for n, info in by_copy.items():
+        infos = rows._add_info(infos, info, row_of[n])
+    return infos
 
 
 def unpack_infos(packed: bytes, copies: range) -> dict[int, Infos]:

@@ -17,7 +17,7 @@ from learner.members.events import Failed
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import TimedOut
-from protocol.errors import BadMessage
+from protocol.errors import BadMessage, EnvironmentFailed
 from protocol.messages import (
     Answer,
     Call,
@@ -81,11 +81,18 @@ class OrderCoordinator(Coordinator[Member]):
 
     # ---------------------------------------------------------------- the vector environment's side
 
-    def begin(self) -> None:
-        """Forget the answers to the last orders; the caller has taken them."""
-        self.answers.clear()
-        self.shared_orders.clear()
-        self.infos.clear()
+    def take_lost(self) -> dict[int, str]:
+        """Lanes whose env copies were lost since the last call, and why."""
+        lost, self.lost = self.lost, {}
+        return lost
+
+    def raise_failures(self) -> None:
+        """Raise `EnvironmentFailed` if an environment raised."""
+        if self.failures:
+            failure, self.failures = self.failures[0], []
+            error = EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
+            error.add_note(failure.traceback)
+            raise error
 
     def forget(self, lane: int) -> None:
         """Forget the answer to the last order of one lane; the caller has taken it."""

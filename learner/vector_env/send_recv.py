@@ -1,92 +1,69 @@
-"""Steps of lanes that do not wait for each other: `async_reset`, `send` and `recv` of a vector environment.
+"""What lanes are asked for, and what comes back: every step, reset and call of a vector environment goes this way.
 
-Rule: for the same seeds and actions, each lane gives the same rows as in lock-step, whatever the others do. A lost worker is
-reported by `recv`, as truncated copies or as an error, and costs no other lane its results.
+Rule: for the same seeds and actions, each lane gives the same rows, whether lanes are waited for together or not, and
+whichever way steps travel. A lost worker is reported once, as truncated copies or as an error, and costs no other lane its
+results.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
+from learner.vector_env.arguments import Options
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import packed, reset_order, step_order
 from learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
-from learner.vector_env.sent_lanes import AfterLoss, AskedReset, ReadyLane, Sent, SentLanes, WatchedTime, after_loss
+from learner.vector_env.order_coordinator import MakeOrder
+from learner.vector_env.sent_lanes import AfterLoss, Asked, AskedReset, ReadyLane, Sent, SentLanes, WatchedTime, after_loss
 from learner.vector_env.step_hub import StepHub
-from protocol.arrays import Array, Bools, Bytes
+from protocol.arrays import Array, Bools
 from protocol.errors import NoWorkers, UsageError, WorkerLost
-from protocol.messages import Answer, Stepped
-from protocol.wire.shared_memory import SharedMemory
+from protocol.messages import Answer, Returned
 
 log = logging.getLogger("millrace.learner")
 
 
 @dataclass(frozen=True)
 class VectorEnvParts:
-    """What a vector environment is made of, whichever way it is stepped."""
+    """What a vector environment is made of."""
 
     hub: StepHub
     layout: BatchLayout
     batch: BatchArrays
-    memory: SharedMemory | None
     lost_lanes: LostLanes
-    read_actions: Callable[[Any, int], tuple[list[Array], bool]]
-    """Takes actions and their number: arrays, and whether shared memory can hold them without rounding."""
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     seeds: list[int | None]
     """of each copy's last seeded reset"""
     ever_reset: Bools
     """[num_envs] whether the copy was ever reset"""
-
-    def ended_copies(self, copies: Sequence[int]) -> list[int]:
-        """Those of these copies that cannot step: they have ended, as the caller knows, and only the caller resets them."""
-        if self.autoreset != "Disabled":
-            return []
-        ended = self.batch.terminated | self.batch.truncated
-        for lane in self.lost_lanes.unreported:
-            ended[self.layout.rows[lane]] = False  # the caller learns it from the result of the next step
-        return [n for n in copies if ended[n]]
-
-    def check_reset(self, copies: Mapping[int, Sequence[int]]) -> None:
-        """Raise `UsageError` if a reset of these copies, by lane, leaves out copies of a lane that awaits a reset.
-
-        All copies of such a lane are new. With SameStep no step resets a copy before its first episode.
-        """
-        for lane in self.lost_lanes.awaiting_reset & copies.keys() if self.autoreset == "SameStep" else ():
-            if len(copies[lane]) < self.layout.size(lane):
-                of_lane = self.layout.copies(lane)
-                raise UsageError(
-                    f"reset of copies {[of_lane[n] for n in copies[lane]]}: expected all copies of lane {lane} "
-                    f"({of_lane[0]} to {of_lane[-1]}), which were lost with their worker; reset them together"
-                )
+    on_worker_loss: Literal["truncate", "raise"] = "truncate"
 
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
         """Seeds for the copies that replace those of a lost lane."""
-        return replacement_seeds(self.seeds[self.layout.rows[lane]], self.hub.incarnation(lane))
+        return replacement_seeds(self.seeds[self.layout.rows[lane]], self.hub.coordinator.lanes[lane].incarnation)
 
-
-@dataclass(frozen=True)
-class WaitSettings:
-    """How `recv` waits."""
-
-    min_envs: int
-    timeout_s: float
-    on_worker_loss: Literal["truncate", "raise"]
+    def reset_of_new_copies(self, lane: int) -> AskedReset:
+        """The reset of the copies that replace those of a lost lane."""
+        return AskedReset(tuple(range(self.layout.size(lane))), self.replacement_seeds(lane), packed(None))
 
 
 class SendRecv:
-    """The lanes that were sent an order, until `recv` has returned them."""
+    """The lanes that were asked for something, until it has come back."""
 
-    def __init__(self, parts: VectorEnvParts) -> None:
+    def __init__(self, parts: VectorEnvParts, timeout_s: float) -> None:
+        """`timeout_s`: how long a worker may take, if no other time is given."""
+        self.timeout_s, self.closed = timeout_s, False
         self._parts = parts
         self._sent = SentLanes()
+        self._all_were_reset = False
+        self._to_raise: dict[int, str] = {}  # lanes that were lost, and for which the caller gets an error
         self._watched = WatchedTime(parts.hub.now())
 
     def copies(self) -> list[int]:
@@ -95,161 +72,247 @@ class SendRecv:
 
     # ---------------------------------------------------------------- out
 
-    def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any] | None) -> None:
-        """Begin episodes in these copies, with a seed for each. Raises `TypeError` for options that are no plain data."""
+    def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Options) -> None:
+        """Begin episodes in these copies. `seeds`: of all copies; a list of `options` has those of all copies.
+
+        Raises `TypeError` for options that are no plain data, and `UsageError` for a part of a lane whose copies were lost,
+        with SameStep: no step resets them before their first episode.
+        """
         parts, layout, hub = self._parts, self._parts.layout, self._parts.hub
         layout.check(copies)
-        options_bytes = packed(options)
-        by_lane = layout.by_lane(copies)
+        by_lane = layout.by_lane(sorted(copies))
         self._check_back(by_lane)
-        parts.check_reset(by_lane)
-        seed_of = dict(zip(copies, seeds, strict=True))
+        self._check_whole(by_lane)
+        resets = {lane: self._asked_reset(lane, chosen, seeds, options) for lane, chosen in by_lane.items()}
         whole = [lane for lane, chosen in by_lane.items() if len(chosen) == layout.size(lane)]
+        for n in copies:
+            parts.seeds[n] = seeds[n] if seeds[n] is not None else parts.seeds[n]
         if len(whole) == len(layout.lanes):
             hub.rebalance()
-        parts.lost_lanes.add(hub.take_lost())
+        parts.lost_lanes.add(hub.coordinator.take_lost())
         parts.lost_lanes.forget(whole)
-        now = self._watched.look(parts.hub.now())
-        for lane, chosen in by_lane.items():
-            mine = sorted(chosen)
-            numbers = tuple(layout.copies(lane)[n] for n in mine)
-            for n in numbers:
-                parts.seeds[n] = seed_of[n] if seed_of[n] is not None else parts.seeds[n]
-            reset = AskedReset(tuple(mine), tuple(seed_of[n] for n in numbers), options_bytes)
-            self._sent.send(lane, Sent(numbers, now, reset))
+        now = self._watched.look(hub.now())
+        for lane, reset in resets.items():
+            self._sent.send(lane, Sent([layout.copies(lane)[n] for n in reset.copies], now, reset))
             self._send_reset(lane, reset)
 
-    def send(self, actions: Any, copies: Sequence[int], on_worker_loss: Literal["truncate", "raise"]) -> None:
-        """Step these copies, which are all copies of some lanes, with one action each, in the order of `copies`."""
-        parts, lost_lanes = self._parts, self._parts.lost_lanes
-        positions = parts.layout.positions(copies)
-        self._check_back(positions)
-        arrays, fit = parts.read_actions(actions, len(copies))
-        if never := [n for n in copies if not parts.ever_reset[n]]:
-            raise UsageError(f"send before reset of copies {never}: call reset(), or async_reset() and recv(), first")
-        lost_lanes.add(parts.hub.take_lost())
-        if ended := parts.ended_copies(copies):
-            raise UsageError(
-                f"copies {ended} have ended: autoreset_mode is Disabled, expected async_reset({ended}) before the next send"
-            )
-        awaiting_reset = [lane for lane in positions if lane in lost_lanes.awaiting_reset]
-        if awaiting_reset and on_worker_loss == "raise":
-            again = [n for lane in awaiting_reset for n in parts.layout.copies(lane)]
-            raise WorkerLost(f"lanes {awaiting_reset} were lost with their worker; call async_reset({again}) first")
-        now = self._watched.look(parts.hub.now())
-        for lane, at in positions.items():
-            self._sent.send(lane, Sent(tuple(parts.layout.copies(lane)), now))
-            if lane not in lost_lanes.unreported:  # else `recv` reports the loss
-                self._send_step(lane, [array[at] for array in arrays], fit)
+    def step(
+        self,
+        lanes: Sequence[int],
+        actions: tuple[list[Array], bool],
+        at: Mapping[int, Any] | Sequence[Any],
+        *,
+        together: bool,
+    ) -> None:
+        """Step these lanes. `actions`: arrays, whose rows `at[lane]` are those of the lane, and whether they fit into shared
+        memory without rounding. `together`: `recv_all` takes the results.
 
-    def _send_step(self, lane: int, actions: list[Array], fit: bool) -> None:
-        parts, hub, rows = self._parts, self._parts.hub, self._parts.layout.rows[lane]
-        if lane in parts.lost_lanes.awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
-            self._send_reset(lane, self._reset_of_new_copies(lane))
-        elif fit and parts.memory is not None and hub.uses_shared_memory(lane):
-            for array, values in zip(parts.memory.actions, actions, strict=True):
-                array[rows] = values
-            hub.begin_shared_step(lane)
-        else:
-            hub.send_order(lane, step_order(actions))
+        Raises `UsageError` for copies that must be reset first, and with `on_worker_loss="raise"` `WorkerLost` for copies
+        that were lost. Then nothing is sent.
+        """
+        parts, hub, lost_lanes = self._parts, self._parts.hub, self._parts.lost_lanes
+        self._check_back(lanes)
+        lost_lanes.add(hub.coordinator.take_lost())
+        self._check_steppable(lanes)
+        now, (arrays, fit), shared = self._watched.look(hub.now()), actions, []
+        unreported, awaiting_reset, asked = lost_lanes.unreported, lost_lanes.awaiting_reset, Asked.STEP
+        for lane in lanes:
+            self._sent.send(lane, Sent(parts.layout.copies(lane), now, asked))
+            if lane in unreported:
+                continue  # the loss is reported in its place
+            if lane in awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
+                self._send_reset(lane, parts.reset_of_new_copies(lane))
+            elif fit and hub.can_share(lane):
+                shared.append(lane)
+            else:
+                hub.send_order(lane, step_order([array[at[lane]] for array in arrays]))
+        if shared:
+            assert hub.shared is not None
+            for memory, values in zip(hub.shared.memory.actions, arrays, strict=True):
+                if at is parts.layout.rows and len(shared) == len(at):
+                    memory[:] = values
+                    continue
+                for lane in shared:
+                    memory[parts.layout.rows[lane]] = values[at[lane]]
+            hub.send_steps(shared, together=together)
 
-    def _send_reset(self, lane: int, reset: AskedReset) -> None:
-        self._parts.hub.send_order(lane, reset_order(reset.copies, reset.seeds, reset.options))
-
-    def _reset_of_new_copies(self, lane: int) -> AskedReset:
-        return AskedReset(tuple(range(self._parts.layout.size(lane))), self._parts.replacement_seeds(lane), NO_OPTIONS)
-
-    def _check_back(self, lanes: Iterable[int]) -> None:
-        if out := self._sent.among(lanes):
-            copies = [n for lane in out for n in self._parts.layout.copies(lane)]
-            raise AlreadyPendingCallError(
-                f"copies {copies} have not come back: expected recv() to return them first", "send"
-            )
+    def call(self, orders: Mapping[int, MakeOrder]) -> None:
+        """Send an order of its own to each of these lanes. The copies go on with their episodes."""
+        self._check_back(orders)
+        now = self._watched.look(self._parts.hub.now())
+        for lane, make in orders.items():
+            self._sent.send(lane, Sent((), now, Asked.CALL))
+            self._parts.hub.send_order(lane, make)
 
     # ---------------------------------------------------------------- in
 
-    def recv(self, wait: WaitSettings) -> Sequence[ReadyLane]:
-        """Wait until enough copies are ready, and take the lanes that are.
+    def recv(self, min_envs: int, timeout_s: float | None = None) -> Sequence[ReadyLane]:
+        """Wait until at least `min_envs` copies are ready, and take the lanes that are.
 
         Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`; then lanes that are ready stay so for the next call.
         """
         sent, hub = self._sent, self._parts.hub
         if not (out := sent.copies()):
             raise NoAsyncCallError("recv without send before it", "send")
-        if not 0 <= wait.min_envs <= len(out):
-            raise ValueError(f"min_envs: expected 0 to {len(out)}, the copies that have not come back; got {wait.min_envs}")
+        if not 0 <= min_envs <= len(out):
+            raise ValueError(f"min_envs: expected 0 to {len(out)}, the copies that have not come back; got {min_envs}")
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
         hub.listen_if_due()
         while True:
-            self._look(wait)
-            if sent.ready_copies >= wait.min_envs:
+            self.look(timeout_s)
+            self._raise_losses()
+            if sent.ready_copies >= min_envs:
                 return sent.take()
-            hub.wait_for_any(wait.timeout_s)
+            hub.wait(timeout_s, together=False)
 
-    def _look(self, wait: WaitSettings) -> None:
-        """Note what has happened to the lanes that are under way."""
-        parts, sent, hub = self._parts, self._sent, self._parts.hub
-        for lane in list(sent.under_way):
-            if (result := hub.take_result(lane)) is not None:
-                self._keep(lane, result)
-        hub.raise_failures()
-        now = self._watched.look(parts.hub.now())
-        for lane in sent.overdue(now, wait.timeout_s):
+    def recv_all(self, timeout_s: float | None = None) -> Sequence[ReadyLane]:
+        """Wait until every lane is ready, and take them. Raises as `recv`; then nothing is waited for any more."""
+        sent, hub = self._sent, self._parts.hub
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        try:
+            if self._parts.lost_lanes.unreported:
+                self.look(timeout_s)
+            while sent.under_way:
+                hub.wait(timeout_s, together=True)
+                self.look(timeout_s)
+            hub.listen_if_due()
+            hub.coordinator.raise_failures()
+            self._raise_losses()
+        except BaseException:
+            self.abandon()
+            raise
+        return sent.take()
+
+    def look(self, timeout_s: float) -> None:
+        """Note what has come of the lanes that are under way. Never waits. Raises `EnvironmentFailed` and `NoWorkers`."""
+        self._take_results()
+        self._parts.hub.coordinator.raise_failures()
+        if self._sent.under_way:
+            self._give_up_late(timeout_s)
+            self._handle_losses()
+
+    def abandon(self) -> None:
+        """Nothing is waited for any more. The caller knows of the lanes that were lost meanwhile."""
+        steps = [lane for lane, sent in self._sent.under_way.items() if sent.asked is Asked.STEP]
+        self._to_raise.clear()
+        self._parts.hub.forget(self._sent.clear())
+        lost_lanes = self._parts.lost_lanes
+        lost_lanes.add(self._parts.hub.coordinator.take_lost())
+        lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
+
+    # ---------------------------------------------------------------- inside
+
+    def _check_back(self, lanes: Iterable[int]) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("call after close()")
+        if out := self._sent.among(lanes):
+            copies = self._parts.layout.copies_of(out)
+            raise AlreadyPendingCallError(
+                f"copies {copies} have not come back: expected recv() to return them first", "send"
+            )
+
+    def _check_whole(self, copies: Mapping[int, Sequence[int]]) -> None:
+        layout = self._parts.layout
+        for lane in self._parts.lost_lanes.awaiting_reset & copies.keys() if self._parts.autoreset == "SameStep" else ():
+            if len(copies[lane]) < layout.size(lane):
+                of_lane = layout.copies(lane)
+                raise UsageError(
+                    f"reset of copies {[of_lane[n] for n in copies[lane]]}: expected all copies of lane {lane} "
+                    f"({of_lane[0]} to {of_lane[-1]}), which were lost with their worker; reset them together"
+                )
+
+    def _check_steppable(self, lanes: Sequence[int]) -> None:
+        parts, lost_lanes = self._parts, self._parts.lost_lanes
+        if not self._all_were_reset:
+            if never := [n for n in parts.layout.copies_of(lanes) if not parts.ever_reset[n]]:
+                raise UsageError(f"step before reset of copies {never}: call reset(), or async_reset() and recv(), first")
+            self._all_were_reset = bool(parts.ever_reset.all())
+        if parts.autoreset == "Disabled":
+            over = parts.batch.terminated | parts.batch.truncated
+            # Of a loss that is not reported, the caller learns by the result of this step.
+            if ended := [
+                n for n in parts.layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
+            ]:
+                raise UsageError(
+                    f"copies {ended} have ended: autoreset_mode is Disabled, expected async_reset({ended}) or "
+                    "reset(options={'reset_mask': ended}) before the next step"
+                )
+        awaiting = [lane for lane in lanes if lane in lost_lanes.awaiting_reset] if parts.on_worker_loss == "raise" else ()
+        if awaiting:
+            copies = parts.layout.copies_of(awaiting)
+            raise WorkerLost(f"lanes {awaiting} were lost with their worker; call reset() or async_reset({copies}) first")
+
+    def _asked_reset(self, lane: int, chosen: Sequence[int], seeds: Sequence[int | None], options: Options) -> AskedReset:
+        rows = self._parts.layout.rows[lane]
+        of_lane = [options[rows][n] for n in chosen] if isinstance(options, list) else options
+        return AskedReset(tuple(chosen), tuple(seeds[rows][n] for n in chosen), packed(of_lane))
+
+    def _send_reset(self, lane: int, reset: AskedReset) -> None:
+        self._parts.hub.send_order(lane, reset_order(reset.copies, reset.seeds, reset.options))
+
+    def _take_results(self) -> None:
+        """Note which lanes are done."""
+        for lane, result in self._parts.hub.take(self._sent.under_way).items():
+            self._sent.ready(lane, result if isinstance(result, bytes | Returned) else self._stored(lane, result))
+
+    def _stored(self, lane: int, answer: Answer) -> bytes:
+        """Write results that came as a message to the batch. Packed infos."""
+        parts, sent = self._parts, self._sent.under_way[lane]
+        assert not isinstance(answer, Returned)
+        parts.batch.store(lane, answer)
+        parts.lost_lanes.answered({lane})
+        if isinstance(sent.asked, AskedReset):
+            parts.ever_reset[list(sent.copies)] = True
+        return bytes(answer.infos.data)
+
+    def _give_up_late(self, timeout_s: float) -> None:
+        """Give up the workers that take too long. Raises `NoWorkers`."""
+        now = self._watched.look(self._parts.hub.now())
+        for lane in self._sent.overdue(now, timeout_s):
             try:
-                hub.give_up(lane, wait.timeout_s)
+                self._parts.hub.give_up(lane, timeout_s)
             except NoWorkers:
-                sent.start_again(now)
+                self._sent.start_again(now)
                 raise
-        parts.lost_lanes.add(hub.take_lost())
-        lost = {lane: why for lane, why in parts.lost_lanes.unreported.items() if lane in sent.under_way}
-        self._handle_losses({lane: why for lane, why in lost.items() if not hub.is_ordered(lane)}, wait, now)
 
-    def _keep(self, lane: int, result: Answer | bytes) -> None:
-        """Keep the results of a lane for `recv`."""
-        parts, reset = self._parts, self._sent.under_way[lane].reset
-        if not isinstance(result, bytes):
-            assert isinstance(result, Stepped)
-            parts.batch.store(lane, result)
-            result = bytes(result.infos.data)
-            parts.lost_lanes.answered({lane})
-        if reset is not None:
-            parts.ever_reset[list(self._sent.under_way[lane].copies)] = True
-        self._sent.ready(lane, result)
-
-    def _handle_losses(self, lost: dict[int, str], wait: WaitSettings, now: float) -> None:
-        """Lanes that are under way were lost, for these reasons. Raises `WorkerLost`."""
+    def _handle_losses(self) -> None:
+        """What becomes of the lanes that were lost while they were under way."""
         parts, sent = self._parts, self._sent
-        next_steps = {lane: after_loss(sent.under_way[lane], parts.autoreset, wait.on_worker_loss) for lane in lost}
+        parts.lost_lanes.add(parts.hub.coordinator.take_lost())
+        lost = [lane for lane in parts.lost_lanes.unreported if lane in sent.under_way and not parts.hub.is_ordered(lane)]
         for lane in lost:
-            copies, reset = parts.layout.copies(lane), sent.under_way[lane].reset
-            match next_steps[lane]:
+            copies, asked = parts.layout.copies(lane), sent.under_way[lane].asked
+            match after_loss(sent.under_way[lane], parts.autoreset, parts.on_worker_loss):
                 case AfterLoss.RAISE:
-                    pass
+                    self._to_raise[lane] = parts.lost_lanes.unreported[lane]
+                    if asked is not Asked.CALL or parts.on_worker_loss == "raise":
+                        parts.lost_lanes.report([lane])  # else the next step reports it too: the caller may go on
+                    sent.drop([lane])
                 case AfterLoss.RESET_AGAIN:
-                    assert reset is not None
-                    if len(reset.copies) == len(copies):
+                    assert isinstance(asked, AskedReset)
+                    if len(asked.copies) == len(copies):
                         parts.lost_lanes.forget([lane])  # else the next step reports the copies that were not reset
-                    sent.reset_instead(lane, reset, now, {})
-                    self._send_reset(lane, reset)
+                    sent.reset_instead(lane, asked, self._watched.look(parts.hub.now()), {})
+                    self._send_reset(lane, asked)
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])
-                    new = self._reset_of_new_copies(lane)
-                    sent.reset_instead(lane, new, now, {n: parts.batch.observation_of(n) for n in copies})
+                    new = parts.reset_of_new_copies(lane)
+                    last = {n: parts.batch.observation_of(n) for n in copies}
+                    sent.reset_instead(lane, new, self._watched.look(parts.hub.now()), last)
                     self._send_reset(lane, new)
                 case AfterLoss.COME_BACK:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])
                     parts.batch.truncate(lane)
                     sent.ready_as_lost(lane)
-        if raised := {lane: why for lane, why in lost.items() if next_steps[lane] is AfterLoss.RAISE}:
-            parts.lost_lanes.report(list(raised))
-            sent.drop(raised)
-            raise worker_lost(raised, parts.layout)
+
+    def _raise_losses(self) -> None:
+        if self._to_raise:
+            lost, self._to_raise = self._to_raise, {}
+            raise worker_lost(lost, self._parts.layout)
 
     def _warn(self, lane: int, why: str) -> None:
         copies = self._parts.layout.copies(lane)
         log.warning("%s; its lane %d comes back truncated (copies %d to %d)", why, lane, copies[0], copies[-1])
-
-
-NO_OPTIONS: Bytes = packed(None)
 
 
 def numbered(env_ids: Any, num_envs: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Bookkeeping of `send` and `recv`: the lanes that were sent an order and have not come back. Pure.
+"""Bookkeeping of lanes that were asked for something and have not come back. Pure.
 
 Rule: what was asked of a lane comes back exactly once: with its results, as lost, or in an error. Until then the lane takes
 no other order, so that nothing overwrites its results.
@@ -7,14 +7,16 @@ no other order, so that nothing overwrites its results.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal
 
-from learner.vector_env.infos import Infos
 from learner.vector_env.lost_lanes import RESET_ATTEMPTS
 from protocol.arrays import Bytes
+from protocol.messages import Returned
 
+Infos = dict[str, Any]
+"""What the environment tells beside a row of one copy."""
 LONGEST_GAP_S = 0.5  # a caller that looks less often was busy, or its process was stopped
 
 
@@ -28,31 +30,37 @@ class AskedReset:
     options: Bytes
 
 
-@dataclass(frozen=True)
+class Asked(Enum):
+    """What else a lane was asked for."""
+
+    STEP = 0
+    CALL = 1
+
+
+@dataclass(slots=True)
 class Sent:
     """What was asked of a lane."""
 
-    copies: tuple[int, ...]
+    copies: Sequence[int]
     """the copies that come back, numbered as in the whole batch"""
     since_s: float
-    reset: AskedReset | None = None
-    """None: a step"""
+    asked: AskedReset | Asked
     attempts: int = 1
-    """how often the reset was sent"""
-    last_observations: Mapping[int, Any] = field(default_factory=dict)
+    """how often a reset was sent"""
+    last_observations: Mapping[int, Any] | None = None
     """Of copies that were lost and whose episodes end with these observations, while their new copies are reset."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class ReadyLane:
     """A lane that comes back. Its observations, rewards and episode ends are in the batch."""
 
     lane: int
-    copies: tuple[int, ...]
+    copies: Sequence[int]
     """the copies that come back, numbered as in the whole batch"""
-    infos: bytes = b""
-    """packed"""
-    loss_infos: Mapping[int, Infos] = field(default_factory=dict)
+    result: bytes | Returned = b""
+    """packed infos, or what a call returned"""
+    loss_infos: Mapping[int, Infos] | None = None
     """of copies that come back truncated, because their worker was lost"""
 
 
@@ -73,9 +81,9 @@ def after_loss(
     sent: Sent, autoreset: Literal["NextStep", "SameStep", "Disabled"], on_worker_loss: Literal["truncate", "raise"]
 ) -> AfterLoss:
     """What to do about a lane that was sent this, and whose worker is lost."""
-    if on_worker_loss == "raise":
+    if on_worker_loss == "raise" or sent.asked is Asked.CALL:
         return AfterLoss.RAISE
-    if sent.reset is not None:
+    if sent.asked is not Asked.STEP:
         return AfterLoss.RESET_AGAIN if sent.attempts < RESET_ATTEMPTS else AfterLoss.RAISE
     return AfterLoss.RESET_NEW_COPIES if autoreset == "SameStep" else AfterLoss.COME_BACK
 
@@ -108,29 +116,32 @@ class SentLanes:
 
     def send(self, lane: int, sent: Sent) -> None:
         """The lane was sent an order. Raises `ValueError` if an earlier one has not come back."""
-        if self.among([lane]):
+        if lane in self._under_way or lane in self._ready:
             raise ValueError(f"lane {lane}: expected one that has come back, got one that has not")
         self._under_way[lane] = sent
 
     def reset_instead(self, lane: int, reset: AskedReset, now: float, last_observations: Mapping[int, Any]) -> None:
         """The lane was lost: its new copies are reset before it comes back."""
         sent = self._under_way[lane]
-        again = sent.attempts + 1 if sent.reset is not None else 1
+        again = 1 if sent.asked is Asked.STEP else sent.attempts + 1
         kept = last_observations or sent.last_observations
-        self._under_way[lane] = replace(sent, reset=reset, attempts=again, since_s=now, last_observations=kept)
+        self._under_way[lane] = replace(sent, asked=reset, attempts=again, since_s=now, last_observations=kept)
 
     def start_again(self, now: float) -> None:
         """From now on, every lane that is under way has its whole time again."""
         self._under_way = {lane: replace(sent, since_s=now) for lane, sent in self._under_way.items()}
 
-    def ready(self, lane: int, infos: bytes) -> None:
+    def ready(self, lane: int, result: bytes | Returned) -> None:
         """The lane has its results."""
         sent = self._under_way.pop(lane)
+        if not sent.last_observations:
+            self._ready[lane] = ReadyLane(lane, sent.copies, result)
+            return
         losses: dict[int, Infos] = {
             n: {"worker_lost": True, "final_obs": last, "final_info": {"worker_lost": True}}
             for n, last in sent.last_observations.items()
         }
-        self._ready[lane] = ReadyLane(lane, sent.copies, infos, losses)
+        self._ready[lane] = ReadyLane(lane, sent.copies, result, losses)
 
     def ready_as_lost(self, lane: int) -> None:
         """The lane comes back truncated, and is reset by the caller or by its next step."""
@@ -142,15 +153,21 @@ class SentLanes:
         for lane in lanes:
             self._under_way.pop(lane, None)
 
+    def clear(self) -> list[int]:
+        """Nothing is waited for any more. Returns the lanes that were under way."""
+        dropped = list(self._under_way)
+        self._under_way.clear()
+        self._ready.clear()
+        return dropped
+
     def overdue(self, now: float, timeout_s: float) -> list[int]:
         """Lanes that have been under way for longer than `timeout_s`."""
         return [lane for lane, sent in self._under_way.items() if now - sent.since_s > timeout_s]
 
     def take(self) -> Sequence[ReadyLane]:
         """The lanes that are ready, in the order of their copies. They have come back now."""
-        ready = [self._ready[lane] for lane in sorted(self._ready)]
-        self._ready.clear()
-        return ready
+        ready, self._ready = self._ready, {}
+        return [ready[lane] for lane in sorted(ready)]
 
 
 class WatchedTime:

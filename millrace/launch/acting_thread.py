@@ -6,14 +6,16 @@ a lane gets the same seeds and random numbers as in a worker that acts itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic
 
+from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.env import StepResult, ZmqVectorEnv
 from millrace.launch.endpoint import Endpoint
 from protocol.alive import WorkerExit
+from protocol.arrays import Array
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import ImagesDtype, PolicySpec, RunSpec
 from workers.collect.collector import Collector
@@ -49,9 +51,18 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
         lanes.raise_if_no_workers()
         return thread.poll()
 
-    processes = ProcessCallbacks(ended, thread.activities, lambda: env.workers, stepping=env.members, expected=expected)
-    env.call_on_death(processes.failed.append)
+    def stepping() -> list[Member]:
+        return list(env.hub.coordinator.members.values())
+
+    processes = ProcessCallbacks(ended, thread.activities, lambda: env.workers, stepping=stepping, expected=expected)
+    env.hub.on_death = processes.failed.append
     return processes
+
+
+def step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> StepResult:
+    """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
+    env.step_async(actions, lanes)
+    return env.step_wait()
 
 
 def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
@@ -79,9 +90,9 @@ class BeforeWaits:
     def __call__(self, pulse: Pulse) -> None:
         """A wait begins."""
         self._there_s = monotonic()
-        self._env.watch(partial(self._during, pulse))
+        self._env.hub.while_waiting = partial(self._during, pulse)
         if self._workers:
-            self._env.wait_for(self._workers, self._timeout_s)
+            self._env.hub.wait_for(self._workers, self._timeout_s)
             self._workers = 0
 
     def _during(self, pulse: Pulse) -> None:
@@ -90,4 +101,4 @@ class BeforeWaits:
         if self._env.workers:
             self._there_s = now
         elif now - self._there_s > self._timeout_s:
-            raise self._env.no_workers(self._timeout_s)
+            raise self._env.hub.no_workers(self._timeout_s)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from learner.callbacks.callbacks import Watch
@@ -24,7 +25,7 @@ from learner.rollout_service.service import describe_settings
 from learner.run import Run, RunSetup, known_environment, prometheus_observer, run_folder
 from learner.torch_setup import one_thread, torch_device
 from learner.vector_env.settings import VectorEnvSettings
-from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
+from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread, step_lanes
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import worker_flags
 from millrace.launch.vector import listen
@@ -65,7 +66,7 @@ def train(
         stack.callback(env.close)
         before_wait = BeforeWaits(env, workers, config.no_workers_timeout_s)
         lanes = SplitVectorEnv(
-            env, config.lanes, before_wait, env.step_lanes, config.fact_names(), masked=known.spaces.masked
+            env, config.lanes, before_wait, partial(step_lanes, env), config.fact_names(), masked=known.spaces.masked
         )
         thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(config.eval_copies), lambda: torch_device(config))
         interrupts = Interrupts(config.grace_s)
@@ -74,7 +75,9 @@ def train(
         processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
         with interrupts, one_thread():
             run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
-            env.answer_for(run.status)  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
+            env.hub.status_of_run = (
+                run.status
+            )  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
             run.announce(env.address, config.advertise, listening.endpoint.keyring)
             run.train(1)
         return folder.path

@@ -23,8 +23,9 @@ from learner.members.events import Failed
 from learner.members.failure_count import FailureCount
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
+from learner.vector_env.shared_steps import SharedSteps
 from learner.vector_env.spec import RequestedCopies, requested_copies
-from learner.vector_env.step_hub import SharedSteps, StepHub
+from learner.vector_env.step_hub import StepHub
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
@@ -155,10 +156,10 @@ def make_vec(
     try:
         started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
         made = started.vector_env(started.describe(describe))
-        made.call_on_death(died)
-        made.watch(deaths.check)
-        made.wait_for(local_workers or settings.lane_count, join_timeout_s)
-        made.make_copies()
+        made.hub.on_death = died
+        made.hub.while_waiting = deaths.check
+        made.hub.wait_for(local_workers or settings.lane_count, join_timeout_s)
+        made.calls.make((made.single_observation_space, made.single_action_space))
         return made
     except BaseException as error:
         resources.close()
@@ -172,13 +173,15 @@ class InheritedByWorkers:
     """Shared memory and wake pipes, which local workers inherit before the sizes of the arrays are known."""
 
     memory_fd: int
-    wake_pipes: Mapping[str, tuple[WakePipe, WakePipe]]
-    """Pipe that wakes the worker, and pipe by which it wakes us; by worker name."""
+    to_workers: Mapping[str, WakePipe]
+    """the pipe that wakes each worker, by its name"""
+    to_learner: WakePipe
+    """one for all workers: the last worker to finish a step writes to it"""
 
     def close(self) -> None:
         """Close all file descriptors. The memory is freed with its last view."""
         os.close(self.memory_fd)
-        for pipe in (pipe for pair in self.wake_pipes.values() for pipe in pair):
+        for pipe in (*self.to_workers.values(), self.to_learner):
             pipe.close()
 
 
@@ -203,8 +206,8 @@ class ListeningVectorEnv:
         """The file descriptors that this worker inherits."""
         if self.inherited is None:
             return None
-        to_worker, to_learner = self.inherited.wake_pipes[worker]
-        return InheritedDescriptors(self.inherited.memory_fd, to_worker.read_fd, to_learner.write_fd)
+        to_worker, to_learner = self.inherited.to_workers[worker].read_fd, self.inherited.to_learner.write_fd
+        return InheritedDescriptors(self.inherited.memory_fd, to_worker, to_learner)
 
 
 @dataclass(frozen=True)
@@ -236,7 +239,8 @@ class StartedVectorEnv:
         shared = None
         if inherited is not None:
             memory = SharedMemory(description.step, inherited.memory_fd, resize=True)
-            shared = SharedSteps(memory, inherited.wake_pipes)
+            spin_s = SPIN_S if settings.local_workers < usable_cores() else 0.0  # only if one core is free for the learner
+            shared = SharedSteps(memory, inherited.to_workers, inherited.to_learner, spin_s)
         hub = StepHub(
             listening.endpoint.link,
             description.step,
@@ -244,13 +248,11 @@ class StartedVectorEnv:
             local_workers=self.workers.supervisor,
             shared=shared,
             worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
-            spin_s=SPIN_S if settings.local_workers < usable_cores() else 0.0,  # only if one core is free for the learner
         )
         listening.resources.callback(hub.close, CLOSE_TIMEOUT_S)
         return ZmqVectorEnv(
             description,
             hub,
-            memory=None if shared is None else shared.memory,
             timeout_s=settings.timeout_s,
             on_worker_loss=settings.on_worker_loss,
             copy=settings.copy,
@@ -271,8 +273,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     endpoint = open_endpoint(where, transport, resources, code)
     inherited = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":
-        to_learner = WakePipe()  # one for all workers: the last worker to finish a step writes to it
-        inherited = InheritedByWorkers(new_memory(), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
+        inherited = InheritedByWorkers(new_memory(), {f"w{n}": WakePipe() for n in range(count)}, WakePipe())
         resources.callback(inherited.close)
     return ListeningVectorEnv(settings, requested, endpoint, inherited, resources)
 

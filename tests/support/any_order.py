@@ -13,8 +13,9 @@ from typing import cast
 
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
+from learner.vector_env.shared_steps import SharedSteps
 from learner.vector_env.spec import requested_copies
-from learner.vector_env.step_hub import SharedSteps, StepHub
+from learner.vector_env.step_hub import StepHub
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed
@@ -70,13 +71,13 @@ class AnyOrder(FakeLink):
         """Shared memory and pipes for these workers."""
         self.memory = memory = SharedMemory(spec, new_memory(), resize=True)
         to_learner = WakePipe()
-        pipes = {name: (WakePipe(), to_learner) for name in names}
-        for pipe in (to_learner, *(pipe for pipe, _ in pipes.values())):
+        to_workers = {name: WakePipe() for name in names}
+        for pipe in (to_learner, *to_workers.values()):
             resources.callback(pipe.close)
         resources.callback(memory.close)
-        for name, (to_worker, _) in pipes.items():
+        for name, to_worker in to_workers.items():
             self._descriptors[name] = InheritedDescriptors(memory.fd, to_worker.read_fd, to_learner.write_fd)
-        return SharedSteps(memory, pipes)
+        return SharedSteps(memory, to_workers, to_learner)
 
     def close_workers(self) -> None:
         """Close all env copies."""
@@ -177,13 +178,12 @@ def any_order(settings: VectorEnvSettings, workers: int, *, shared: bool) -> Ite
         env = ZmqVectorEnv(
             description,
             hub,
-            memory=None if steps is None else steps.memory,
             timeout_s=settings.timeout_s,
             on_worker_loss=settings.on_worker_loss,
         )
         for name in names:
             link.join(name)
-        env.wait_for(workers, 1.0)
+        env.hub.wait_for(workers, 1.0)
         yield env, link
 
 

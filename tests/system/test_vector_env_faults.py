@@ -225,7 +225,7 @@ def test_a_stopped_worker_is_lost_at_the_deadline() -> None:
     env.reset(seed=1)
     local_workers()[0].send_signal(signal.SIGSTOP)
     assert env.step(ZEROS)[3].tolist() == [True, True, False, False]
-    env.timeout_s = 20.0
+    env._send_recv.timeout_s = 20.0
     assert not env.step(ZEROS)[3].any()
     close_and_check(env)
 
@@ -358,7 +358,7 @@ def test_workers_elsewhere_join_by_tcp_and_come_back(elsewhere: Elsewhere) -> No
     elsewhere.start("a")
     elsewhere.start("b")
     with make(workers=0, lanes=2, bind=elsewhere.address, timeout=START_S) as env:
-        env.timeout_s = 3.0
+        env._send_recv.timeout_s = 3.0
         env.reset(seed=1)
         assert env.step(ZEROS)[1].tolist() == [1.0] * 4
         elsewhere.start("c")

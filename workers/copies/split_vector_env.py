@@ -58,7 +58,7 @@ class SplitVectorEnv:
         self._read = make_flatten(self.observation_space)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
-        self._calls: Any = env  # for `call_some` and `assign_some` of a `ZmqVectorEnv`
+        self._calls: Any = getattr(env, "calls", None)  # of a `ZmqVectorEnv`
         self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # by first copy and name: attributes that were set
         self._lost = False  # whether copies were lost, and the copies that replace them need the attributes
 
@@ -149,14 +149,14 @@ class SplitVectorEnv:
             if not there or name in METHODS:
                 what = "a method" if there else "none"
                 raise CopyFailed(None, line=f"expected an attribute of the environment that is called {name}, got {what}")
-            self._calls.assign_some(chosen, name, [unpack(packed)] * len(chosen))
+            self._calls.assign(chosen, name, [unpack(packed)] * len(chosen))
         except EnvironmentFailed as error:
             raise CopyFailed(None, f"set_env_attr {name}") from error
 
     def _have(self, copies: Sequence[int], name: str) -> bool:
         """Whether these copies have the attribute. Those of a client in another language have none."""
         try:
-            return all(self._calls.call_some(copies, "has_wrapper_attr", name))
+            return all(self._calls.call(copies, "has_wrapper_attr", (name,), {}))
         except AttributeError:
             return False
 

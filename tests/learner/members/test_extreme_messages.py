@@ -27,6 +27,7 @@ from protocol.errors import BadMessage
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
+    Answer,
     Collect,
     Failure,
     Goodbye,
@@ -220,13 +221,18 @@ def answers(turns: int, say: Say) -> list[bytes]:
     hub.wait_for(2, 5.0)
     for turn in range(turns):
         for number in (0, 1):
-            session = hub._coordinator.members[b"w%d" % number].session
-            link.inbox.append((b"w%d" % number, Heartbeat(session, 0, (), tuple(hub._coordinator.orders), 0, {}, 0)))
+            session = hub.coordinator.members[b"w%d" % number].session
+            link.inbox.append((b"w%d" % number, Heartbeat(session, 0, (), tuple(hub.coordinator.orders), 0, {}, 0)))
         if turn:
             say(link, turn)
-        hub.send_orders(dict.fromkeys((0, 1), step))
-        got = hub.wait_for_answers(30.0)
-        assert sorted(got) == [0, 1], hub.take_lost()
+        for lane in (0, 1):
+            hub.send_order(lane, step)
+        got: dict[int, Answer | bytes] = {}
+        deadline_s = link.now + 30.0
+        while len(got) < 2:
+            assert link.now < deadline_s, hub.coordinator.take_lost()
+            hub.wait(30.0, together=True)
+            got |= hub.take((0, 1))
         found += [answer.obs[0].tobytes() for _, answer in sorted(got.items()) if isinstance(answer, Stepped)]
     assert hub._server.unexpected_errors == 0
     return found

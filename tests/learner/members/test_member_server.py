@@ -84,10 +84,10 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
     link.now += 1000.0
     with pytest.raises(NoWorkers):
         hub.wait_for(2, TIMEOUT_S)
-    assert len(hub.members) == 1
+    assert len(hub.coordinator.members) == 1
     with pytest.raises(NoWorkers):
         hub.wait_for(2, POLL_S)
-    assert len(hub.members) == 0
+    assert len(hub.coordinator.members) == 0
 
 
 def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 import millrace
 from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.calls import described_copies
+from learner.vector_env.calls import _descriptions
 from learner.vector_env.infos import unpack_infos
 from learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds
 from learner.vector_env.settings import VectorEnvSettings
@@ -53,17 +53,17 @@ def frames(message: ToLearner) -> list[bytes]:
 
 def test_copies_are_what_their_worker_describes_or_unknown_where_it_cannot() -> None:
     env = gymnasium.make("CartPole-v1")
-    found = described_copies(returned(pack([frames(Described(1, describe_env(env)))] * 2)), 2)
+    found = _descriptions(returned(pack([frames(Described(1, describe_env(env)))] * 2)), 2)
     assert [copy and (copy.observation_space, copy.action_space) for copy in found] == [
         (env.observation_space, env.action_space)
     ] * 2
-    assert described_copies(returned(b"", "no attributes"), 2) == [None, None]
+    assert _descriptions(returned(b"", "no attributes"), 2) == [None, None]
 
 
 @pytest.mark.parametrize("sent", [7, "frames", [], [7], [b"\xc1"], frames(Goodbye(1, "left", ()))])
 def test_what_describes_no_copy_is_refused(sent: object) -> None:
     with pytest.raises(BadMessage):
-        described_copies(returned(pack([sent])), 1)
+        _descriptions(returned(pack([sent])), 1)
 
 
 def test_each_loss_is_reported_once_and_then_the_lane_awaits_a_reset() -> None:

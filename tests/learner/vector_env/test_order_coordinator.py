@@ -55,8 +55,8 @@ def order_coordinator(*peers: bytes) -> OrderCoordinator:
         assert made.place(lane, patient=False)
         ((peer, order),) = made.order(lane, step)
         assert made.receive(peer, stepped(order), 0.0) == []
+        made.forget(lane)
     made.membership.take_events()
-    made.begin()
     return made
 
 
@@ -85,7 +85,7 @@ def test_an_order_is_answered_once() -> None:
     made.receive(A, stepped(order), 0.0)
     assert list(made.answers) == [0]
     assert not made.orders
-    made.begin()
+    made.forget(0)
     assert made.receive(A, stepped(order), 0.0) == []
     assert made.answers == {}
 
@@ -137,7 +137,7 @@ def test_infos_that_nobody_waits_for_are_not_used() -> None:
     made.receive(A, in_memory(made, 0, 1), 0.0)
     assert (made.infos, made.answers) == ({}, {})
     made.shared_orders[0] = 1
-    made.begin()
+    made.forget(0)
     made.receive(A, in_memory(made, 0, 1), 0.0)
     assert (made.infos, made.answers) == ({}, {})
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.sent_lanes import LONGEST_GAP_S, Sent, SentLanes, WatchedTime
+from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, Sent, SentLanes, WatchedTime
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
 from protocol.messages import Reset, Step
@@ -154,7 +154,8 @@ def test_a_worker_wakes_the_learner_when_its_lane_is_done_although_others_are_no
         link.execute()
         assert link.memory is not None
         assert link.memory.unanswered_orders() == 2
-        assert env._hub._wake_ins[0].wait(0.0) is WakeReason.STEP
+        assert env.hub.shared is not None
+        assert env.hub.shared._to_learner.wait(0.0) is WakeReason.STEP
 
 
 def test_the_example_of_send_runs() -> None:
@@ -239,10 +240,10 @@ def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for
         env.reset(seed=1)
         link.frozen = {"w0", "w1", "w2"}
         env.step_async(zeros(range(3)))
-        env.watch(stop)
+        env.hub.while_waiting = stop
         with pytest.raises(InterruptedError):
             env.step_wait()
-        env.watch(lambda: None)
+        env.hub.while_waiting = lambda: None
         env.async_reset(seed=1)
         link.frozen = set()
         abandoned = [0, 0, 0]
@@ -297,7 +298,7 @@ def test_with_disabled_the_caller_resets_a_lost_copy() -> None:
         send(env, [1])
         link.leave("w1")
         assert received(env)[1].truncated
-        with pytest.raises(UsageError, match=r"copies \[1\] have ended: .* expected async_reset\(\[1\]\) before"):
+        with pytest.raises(UsageError, match=r"copies \[1\] have ended: .* expected async_reset\(\[1\]\) or reset"):
             send(env, [1])
         env.async_reset([1])
         assert received(env)[1].observation == 1.0
@@ -326,8 +327,8 @@ def test_copies_are_made_again_when_a_worker_is_lost_over_it() -> None:
             while leaving:
                 link.leave(leaving.pop())
 
-        env.watch(watch)
-        env.make_copies()
+        env.hub.while_waiting = watch
+        env.calls.make((env.single_observation_space, env.single_action_space))
         env.reset(seed=7)
         assert not env.step(np.zeros((3, 1), np.float32))[3].any(), "no episode had begun"
 
@@ -368,7 +369,7 @@ def test_also_a_reset_in_lock_step_of_some_copies_does_not_hide_that_the_others_
         env.reset(seed=1), env.step(zeros([0, 1]))
         link.frozen = {"w0"}
         gone = iter([lambda: link.leave("w0")])
-        env.watch(lambda: next(gone, lambda: None)())
+        env.hub.while_waiting = lambda: next(gone, lambda: None)()
         env.reset(options={"reset_mask": np.array([False, True])})
         _, reward, _, truncated, infos = env.step(zeros([0, 1]))
         assert (reward.tolist(), truncated.tolist()) == ([0.0, 0.0], [True, True])
@@ -382,7 +383,7 @@ def test_a_loss_that_was_noticed_before_a_reset_of_some_copies_is_not_hidden_eit
         link.leave("w0")
         link.join("w2")
         link.join("w3")
-        env.wait_for(3, 1.0)  # notices it
+        env.hub.wait_for(3, 1.0)  # notices it
         env.reset(options={"reset_mask": np.array([True, False])})
         _, reward, _, truncated, infos = env.step(zeros([0, 1]))
         assert (reward.tolist(), truncated.tolist()) == ([0.0, 0.0], [True, True])
@@ -412,7 +413,7 @@ def loses_w0_in_a_call(loss: str) -> Iterator[ZmqVectorEnv]:
         env.reset(seed=1), env.step(zeros([0, 1]))
         link.frozen = {"w0"}
         gone = iter([lambda: link.leave("w0")])
-        env.watch(lambda: next(gone, lambda: None)())
+        env.hub.while_waiting = lambda: next(gone, lambda: None)()
         with pytest.raises(WorkerLost, match=r"worker w0 \(host\) left: killed: lane 0 \(copies 0 to 0\) is lost"):
             env.call("render_mode")
         yield env
@@ -427,7 +428,7 @@ def test_a_loss_that_a_call_has_raised_is_over_when_its_copies_are_reset(loss: s
 
 
 def test_a_loss_that_a_call_has_raised_is_not_raised_anew_by_a_step() -> None:
-    again = r"^lanes \[0\] were lost with their worker; call reset\(\) first$"
+    again = r"^lanes \[0\] were lost with their worker; call reset\(\) or async_reset\(\[0\]\) first$"
     with loses_w0_in_a_call("raise") as env, pytest.raises(WorkerLost, match=again):
         env.step(zeros([0, 1]))
 
@@ -448,7 +449,9 @@ def test_with_raise_recv_names_the_lost_copies_once_and_the_others_can_be_receiv
             env.recv(3)
         assert env.outstanding == [0, 2]
         assert sorted(received(env, 2)) == [0, 2]
-        with pytest.raises(WorkerLost, match=r"lanes \[1\] were lost with their worker; call async_reset\(\[1\]\) first"):
+        with pytest.raises(
+            WorkerLost, match=r"lanes \[1\] were lost with their worker; call reset\(\) or async_reset\(\[1\]\) first"
+        ):
             send(env, [1])
         env.async_reset([1])
         assert received(env)[1].observation == 1.0
@@ -543,7 +546,7 @@ def test_wrong_arguments_are_refused_in_one_line_and_nothing_is_sent() -> None:
     with made(copies=4, lanes=2, workers=2) as (env, link):
         with pytest.raises(NoAsyncCallError, match="recv without send"):
             env.recv()
-        with pytest.raises(UsageError, match=r"send before reset of copies \[0, 1, 2, 3\]: call reset\(\), or async_reset"):
+        with pytest.raises(UsageError, match=r"step before reset of copies \[0, 1, 2, 3\]: call reset\(\), or async_reset"):
             env.send(zeros(range(4)))
         env.async_reset(seed=1)
         for many in (5, -1):
@@ -610,10 +613,10 @@ def test_what_a_watch_raises_ends_the_wait_and_loses_nothing() -> None:
         def stop() -> None:
             raise InterruptedError("stop")
 
-        env.watch(stop)
+        env.hub.while_waiting = stop
         with pytest.raises(InterruptedError):
             env.recv()
-        env.watch(lambda: None)
+        env.hub.while_waiting = lambda: None
         link.frozen = set()
         assert sorted(received(env, 3)) == [0, 1, 2]
 
@@ -630,10 +633,10 @@ def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> 
             if (error := next(calls)) is not None:
                 raise error
 
-        env.watch(stop)
+        env.hub.while_waiting = stop
         with pytest.raises(InterruptedError):
             env.reset()
-        env.watch(lambda: None)
+        env.hub.while_waiting = lambda: None
         link.frozen = set()
         for left in 0.8, 0.6:
             observation, reward, *_ = env.step([0])
@@ -645,18 +648,18 @@ def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> 
 
 def test_a_lane_comes_back_once_and_takes_no_other_order_before() -> None:
     lanes = SentLanes()
-    lanes.send(1, Sent((2, 3), 0.0))
-    lanes.send(0, Sent((0, 1), 5.0))
+    lanes.send(1, Sent((2, 3), 0.0, Asked.STEP))
+    lanes.send(0, Sent((0, 1), 5.0, Asked.STEP))
     assert lanes.copies() == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="lane 1: expected one that has come back"):
-        lanes.send(1, Sent((2, 3), 1.0))
+        lanes.send(1, Sent((2, 3), 1.0, Asked.STEP))
     assert lanes.overdue(4.0, 3.0) == [1]
     lanes.ready(1, b"infos")
     assert (lanes.ready_copies, lanes.overdue(9.0, 3.0), lanes.among([0, 1, 2])) == (2, [0], [0, 1])
     lanes.ready(0, b"")
-    assert [(one.lane, one.copies, one.infos) for one in lanes.take()] == [(0, (0, 1), b""), (1, (2, 3), b"infos")]
+    assert [(one.lane, one.copies, one.result) for one in lanes.take()] == [(0, (0, 1), b""), (1, (2, 3), b"infos")]
     assert (list(lanes.take()), lanes.copies()) == ([], [])
-    lanes.send(1, Sent((2, 3), 1.0))
+    lanes.send(1, Sent((2, 3), 1.0, Asked.STEP))
 
 
 def test_a_long_time_between_two_looks_counts_as_a_short_one() -> None:

@@ -128,7 +128,7 @@ def test_calls_and_attributes() -> None:
             env.set_attr("level", [1, 2, 3, 4, 5])
         assert bit_equal(ours.get_attr("level"), theirs.get_attr("level"))
         assert ours.call("shout", "hm", times=2) == theirs.call("shout", "hm", times=2)
-        assert ours.call_some([1, 4], "level") == (2, 5)
+        assert ours.calls.call([1, 4], "level", (), {}) == (2, 5)
         assert bit_equal(ours.np_random_seed, theirs.np_random_seed)
         with pytest.raises(AttributeError, match="no_such_thing"):
             ours.get_attr("no_such_thing")

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 from learner.members.membership import Member, Outgoing
 from learner.vector_env.order_coordinator import OrderCoordinator
+from learner.vector_env.sent_lanes import Asked, AskedReset, ReadyLane, Sent
 from protocol.messages import ToLearner, WorkerExit
 from tests.model.conversation import Content, Event
 from tests.model.message_content import hello, incarnation, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, name
 from tests.model.settings import TIMEOUT_S
 from tests.model.vector_env.caller import Caller
-from tests.model.vector_env.order_content import content_of, make_order, message_of, order_content, order_of
+from tests.model.vector_env.order_content import NOTHING, content_of, make_order, message_of, order_content, order_of
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping
@@ -131,18 +132,23 @@ def _member(member: Member, now: float) -> Content:
 
 
 def _caller(caller: Caller) -> Content:
-    waits = caller.deadline_s is not None
+    sent, lost_lanes = caller.send_recv._sent, caller.parts.lost_lanes
     return (
         caller.at,
-        None if caller.deadline_s is None else max(caller.deadline_s - caller.now, -1.0),
-        caller.attempt if waits else 0,
-        tuple(sorted(caller.unreset)) if waits else (),
-        tuple(sorted(caller.ordered.items())) if waits else (),
-        tuple(sorted(caller.hub._waiting_orders)) if waits else (),
+        None if not caller.waits else 0,
+        tuple(
+            (lane, *caller.kind(lane, each), each.asked is Asked.STEP, each.attempts, max(each.since_s - caller.now, -99.0))
+            for lane, each in sorted(sent._under_way.items())
+        ),
+        tuple((lane, bool(each.loss_infos)) for lane, each in sorted(sent._ready.items())),
+        tuple(sorted(caller.send_recv._to_raise)),
+        tuple(sorted(caller.hub._waiting_orders)),
+        tuple((lane, ticket(number)) for lane, number in sorted(caller.hub._newest_tickets.items())),
         tuple((lane, incarnation(lane, life), state) for lane, (life, state) in sorted(caller.copies.items())),
-        tuple(sorted(caller.lost_lanes.unreported)),
-        tuple(sorted(caller.lost_lanes.awaiting_reset)),
+        tuple(sorted(lost_lanes.unreported)),
+        tuple(sorted(lost_lanes.awaiting_reset)),
         tuple(sorted(caller.told)),
+        tuple(caller.parts.ever_reset.tolist()),
     )
 
 
@@ -179,11 +185,20 @@ def loaded(content: Content, settings: Stepping, now: float) -> Learner:
 
 
 def _load_caller(caller: Caller, content: Content) -> None:
-    at, deadline, attempt, unreset, ordered, waiting, copies, unreported, awaiting, told = content
-    caller.at, caller.deadline_s, caller.attempt = at, deadline, attempt
-    caller.unreset, caller.ordered, caller.told = set(unreset), dict(ordered), set(told)
-    caller.hub._waiting_orders = {lane: make_order(*caller.ordered[lane]) for lane in waiting}
-    caller.hub._waiting_since_s = dict.fromkeys(waiting, 0.0)
+    at, waits, under_way, ready, to_raise, waiting, newest, copies, unreported, awaiting, told, ever_reset = content
+    caller.at, caller.waits, caller.told = at, waits is not None, set(told)
+    sent, lost_lanes = caller.send_recv._sent, caller.parts.lost_lanes
+    lost_lanes.add(dict.fromkeys(unreported, "lost"))
+    lost_lanes.expect_reset(awaiting)
+    for lane, kind, seed, is_step, attempts, since_s in under_way:
+        asked = Asked.STEP if is_step else Asked.CALL if kind == "call" else AskedReset((0,), (seed,), NOTHING)
+        sent._under_way[lane] = Sent((lane,), since_s, asked, attempts)
+        if lane in waiting:
+            caller.hub._waiting_orders[lane] = make_order(kind, seed)
+            caller.hub._waiting_since_s[lane] = 0.0
+    for lane, lost in ready:
+        sent._ready[lane] = ReadyLane(lane, (lane,), loss_infos={lane: {}} if lost else {})
+    caller.send_recv._to_raise = dict.fromkeys(to_raise, "lost")
+    caller.hub._newest_tickets = {lane: number.value for lane, number in newest}
     caller.copies = {lane: (life.value, state) for lane, life, state in copies}
-    caller.lost_lanes.add(dict.fromkeys(unreported, "lost"))
-    caller.lost_lanes.expect_reset(awaiting)
+    caller.parts.ever_reset[:] = ever_reset

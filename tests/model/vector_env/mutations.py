@@ -20,6 +20,8 @@ COORDINATOR = "learner.vector_env.order_coordinator"
 MEMBERS = "learner.members.coordinator"
 HUB = "learner.vector_env.step_hub"
 LOST = "learner.vector_env.lost_lanes"
+SENT = "learner.vector_env.sent_lanes"
+SEND_RECV = "learner.vector_env.send_recv"
 
 OF_THE_LEARNER = {
     "a lost order is not sent again": Mutation(
@@ -28,7 +30,6 @@ OF_THE_LEARNER = {
     "heartbeats of a vector environment are answered alike": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
     "a lost lane is not reported": Mutation(COORDINATOR, "if self.lanes[lane].started:", "if False:"),
     "an order does not start its lane": Mutation(COORDINATOR, "record.started = True", "pass"),
-    "answers to the last orders are kept": Mutation(COORDINATOR, "self.answers.clear()", "pass"),
     "the orders of a lost worker are kept": Mutation(
         COORDINATOR, "            del self.orders[ticket]\n", "            pass\n"
     ),
@@ -36,6 +37,10 @@ OF_THE_LEARNER = {
         COORDINATOR, "del self.orders[message.ticket], member.tickets[message.ticket]", "pass"
     ),
     "an order that was sent waits on": Mutation(HUB, "del self._waiting_orders[lane]", "pass"),
+    "a lane is stepped before its loss is reported": Mutation(SEND_RECV, "if lane in unreported:", "if False:"),
+    "new copies are stepped before they are reset": Mutation(SEND_RECV, "if lane in awaiting_reset:", "if False:"),
+    "a reset that lost its worker is not sent again": Mutation(SEND_RECV, "self._send_reset(lane, asked)", "pass"),
+    "a lane that was sent nothing comes back": Mutation(SENT, "self._under_way[lane] = sent", 'self.ready(lane, b"")'),
     "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),
     "a lane whose loss was reported is not reset": Mutation(LOST, "self.expect_reset(reported)", "pass"),
 }
