@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,11 +20,10 @@ from learner.algorithms import Algorithm
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
-from learner.config.validation import unused_target, workers_to_wait_for
+from learner.config.validation import unused_target
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
-from learner.members.bound import listen
 from learner.members.describe import described_by_workers
 from learner.members.describe_coordinator import Accept
 from learner.members.process_callbacks import ProcessCallbacks
@@ -36,7 +35,7 @@ from learner.rollouts.hub import HubObserver
 from learner.run_folder.lease import Closed, Listens
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
-from learner.torch_setup import one_thread, threads, torch_device, updates_use_all_cores
+from learner.torch_setup import threads, torch_device, updates_use_all_cores
 from protocol.address import advertised_address, own_address
 from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
@@ -305,25 +304,6 @@ class Run:
     def _check_time(self) -> None:
         if self._interrupts.time_is_up(self.recorder.longest_save_s):
             raise Interrupted(self.folder.path)
-
-
-def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
-    """Train with workers that are started elsewhere and join at `config.bind`. Returns the run folder."""
-    if config.inference == "learner":
-        raise UsageError("--inference learner does not work with python -m learner; use millrace learner")
-    with ExitStack() as stack:
-        # The run is locked before the port is bound: of two learners of one run, the second is told so.
-        folder = None if resume is None else stack.enter_context(run_folder(config, resume))
-        bound = listen(config, stack)
-        observer = stack.enter_context(prometheus_observer(config))
-        bound.announce(config.advertise)
-        env, processes = named_environment(config), ProcessCallbacks()
-        known = known_environment(config, env, resume, describe_over(bound.link, config, processes))
-        folder = folder or stack.enter_context(run_folder(config, None))
-        with Interrupts(config.grace_s) as interrupts, one_thread():
-            setup = RunSetup(config, known, folder, resume is not None, interrupts)
-            Run(setup, bound.link, processes, watch, observer).train(workers_to_wait_for(config, None))
-        return folder.path
 
 
 def _why(error: BaseException) -> str:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from learner.run_folder.last_line import last_line
 from learner.run_folder.run_format import is_run_folder
@@ -140,33 +140,18 @@ def _print_usage(name: str, *more: str) -> None:
 # ---------------------------------------------------------------------------------------------------------- commands
 
 
-def _train(argv: list[str]) -> int:
+def _train(argv: list[str], command: Literal["train", "learner"] = "train") -> int:
     from learner.config.command_line import read_config
 
-    config, resume = read_config("train", argv)
+    config, resume = read_config(command, argv)
     from millrace.launch import local_run
 
-    return _run(argv, lambda watch: local_run.train(config, resume, watch), None if resume else config)
+    elsewhere, new = command == "learner", None if resume else config
+    return _run(argv, lambda watch: local_run.train(config, resume, watch, elsewhere=elsewhere), new)
 
 
 def _learner(argv: list[str]) -> int:
-    from learner.config.command_line import read_config
-
-    config, resume = read_config("learner", argv)
-    from learner.resumption import Resumption, unless_finished
-    from learner.run import named_environment, serve
-    from millrace.launch import learner_inference as inference
-
-    def train(checked: Resumption | None, watch: Watch) -> Path:
-        if config.inference == "learner":
-            return inference.train(config, checked, watch, named_environment(config), elsewhere=True)
-        return serve(config, checked, watch)
-
-    return _run(
-        argv,
-        lambda watch: unless_finished(config, resume, lambda checked: train(checked, watch)),
-        None if resume else config,
-    )
+    return _train(argv, "learner")
 
 
 def _run(argv: list[str], train: Callable[[Watch], Path], new: Config | None = None) -> int:

@@ -1,4 +1,4 @@
-"""A run on this machine: the learner in this process, and worker processes (over inproc: threads) that it starts.
+"""A run: the learner in this process, and workers that it starts on this machine or that join from elsewhere.
 
 Rule: whatever happens, no worker, socket file or temporary folder is left behind.
 """
@@ -26,7 +26,7 @@ from learner.run import (
 )
 from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
+from millrace.launch.local_worker_options import WorkerFlags, no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
 from workers.slots import LIMIT_VARIABLE, copies_per_machine
 from workers.supervise.supervisor import STOP_WITHIN_S
@@ -34,36 +34,45 @@ from workers.supervise.supervisor import STOP_WITHIN_S
 log = logging.getLogger("millrace.learner")
 
 
-def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None = None) -> Path:
+def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None = None, *, elsewhere: bool = False) -> Path:
     """Train. Returns the run folder. `env`: the environment, if the settings do not name one that workers find.
 
-    Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
+    `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
+    the user stopped the run.
     """
-    return unless_finished(config, resume, lambda checked: _train(config, checked, watch, env))
+    return unless_finished(config, resume, lambda checked: _train(config, checked, watch, env, elsewhere=elsewhere))
 
 
-def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
+def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None, *, elsewhere: bool) -> Path:
     env = env or named_environment(config)
-    check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all copies of the run are on this machine
+    if not elsewhere:
+        check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all copies of the run are on this machine
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 
-        return inference.train(config, resume, watch, env)
-    workers = workers_to_wait_for(config, config.workers)
-    if line := idle_workers(config):
+        return inference.train(config, resume, watch, env, elsewhere=elsewhere)
+    workers = workers_to_wait_for(config, None if elsewhere else config.workers)
+    if not elsewhere and (line := idle_workers(config)):
         log.warning("%s", line)
     with ExitStack() as stack:
-        where = BindSettings(keys=config.keys, insecure=config.insecure)
-        code = env.called_code or ("an encoder" if config.algorithm.encoder else "")
+        # A run to resume is locked before the address is bound: of two learners of one run, the second is told so.
+        folder = None if resume is None else stack.enter_context(run_folder(config, resume))
+        where = BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise)
+        # Workers elsewhere decide for themselves whether they take code.
+        code = "" if elsewhere else env.called_code or ("an encoder" if config.algorithm.encoder else "")
         endpoint = open_endpoint(where, config.transport, stack, code)
         observer = stack.enter_context(prometheus_observer(config))
-        folder = stack.enter_context(run_folder(config, resume))
-        flags = no_flags if config.transport == "inproc" else worker_flags(config, folder.path)
+        flags: WorkerFlags = no_flags
+        if not elsewhere:
+            folder = folder or stack.enter_context(run_folder(config, None))
+            if config.transport != "inproc":
+                flags = worker_flags(config, folder.path)
         supervisor, processes = stack.enter_context(endpoint.workers(config.workers, flags, config.call_timeouts()))
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
+        folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
             Run(setup, endpoint.link, processes, watch, observer).train(workers)

@@ -17,10 +17,9 @@ import ray
 from learner.callbacks.callbacks import Watch
 from learner.config.command_line import read_config
 from learner.members.endpoint import keyring_for
-from learner.resumption import unless_finished
-from learner.run import serve
 from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
+from millrace.launch.local_run import train
 from millrace.launch.ray_worker import WorkerHost
 from protocol.errors import UsageError, first_line
 from protocol.keys.key_folder import Keyring, read_token
@@ -35,6 +34,8 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
         bind = f"tcp://{f'[{host}]' if ':' in host else host}:{flags.port}"
         workers = flags.workers * flags.processes
         config, resume = read_config("learner", learner_flags(flags.env, rest, workers, bind=bind, runs="runs"))
+        if config.inference == "learner":
+            raise UsageError("launch ray does not take --inference learner; use millrace learner")
         token = _token_text(keyring_for(config, datetime.now(UTC).replace(microsecond=0)))
         actor = ray.remote(
             num_cpus=flags.processes, max_restarts=-1, max_task_retries=-1, scheduling_strategy="SPREAD"
@@ -42,7 +43,7 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
         actors = [actor.options(name=f"{flags.name}-{number}").remote() for number in range(flags.workers)]
         for each in actors:
             each.run.options(retry_exceptions=True).remote(config.bind, token, flags.processes)
-        return unless_finished(config, resume, lambda checked: serve(config, checked, watch))
+        return train(config, resume, watch, elsewhere=True)
 
 
 def _token_text(keyring: Keyring | None) -> str:

@@ -53,7 +53,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
     """Stands in for the run: what it was asked for. The current folder is an empty one."""
     calls: list[Any] = []
 
-    def train(config: Config, resume: Path | None, watch: Any, factory: Any = None) -> Path:
+    def train(config: Config, resume: Path | None, watch: Any, factory: Any = None, *, elsewhere: bool = False) -> Path:
         calls.append((config, resume, factory))
         Callbacks.of(watch).on_update(Progress(env_steps=5, total_steps=10))
         return Path("runs/a-run")
@@ -282,11 +282,10 @@ def test_the_python_face_takes_a_callable(asked: list[Any]) -> None:
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
-    def train(*_: Any) -> Path:
+    def train(*_: Any, **__: Any) -> Path:
         raise error
 
     monkeypatch.setattr("millrace.launch.local_run.train", train)
-    monkeypatch.setattr("learner.run.serve", train)
 
 
 def test_errors_of_ours_are_one_line_with_their_exit_code(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -517,7 +516,7 @@ def test_what_cannot_be_filmed_is_said(tmp_path: Path, capsys: Captured, monkeyp
 
 
 def test_what_a_worker_says_cannot_control_the_terminal(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
-    def train(*_: Any) -> Path:
+    def train(*_: Any, **__: Any) -> Path:
         raise EnvironmentFailed("got \x1b[31mred\u202e", "its\x1b[2Jtraceback")
 
     monkeypatch.setattr("millrace.launch.local_run.train", train)

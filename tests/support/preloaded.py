@@ -27,7 +27,7 @@ import psutil
 from workers.supervise.worker_process import NONCE_VARIABLE
 
 PROGRAM = Path(__file__).with_name("preloaded_parent.py")
-LEARNERS = (["learner"], ["millrace", "train"], ["millrace", "learner"], ["millrace", "evaluate"], ["millrace", "record"])
+LEARNERS = (["millrace", "train"], ["millrace", "learner"], ["millrace", "evaluate"], ["millrace", "record"])
 """Modules, and their first argument: what the parent with PyTorch forks."""
 WITHOUT_PYTORCH = (["workers"], ["millrace", "worker"], ["millrace", "status"], ["millrace", "keys"])
 WORKER = ["-P", "-m", "workers"]  # as a supervisor starts it

@@ -189,12 +189,23 @@ class Worker(Running):
         return sum(int(process.num_fds()) for process in self.processes())
 
 
+def _message(line: str) -> str:
+    """The message of an event of `--log-json`; another line, or the beginning of one, as it is."""
+    with suppress(json.JSONDecodeError):
+        return str(json.loads(line)["message"]) if line.startswith("{") else line
+    return line
+
+
 class Learner(Running):
-    """`python -m learner`, and the folder of its run."""
+    """`millrace learner`, or another program that trains, and the folder of its run."""
 
     def __init__(self, command: Sequence[str], said: Path, runs: Path) -> None:
         super().__init__(command, said)
         self._runs = runs
+
+    def said(self) -> str:
+        """Its output so far, as text for people: of each event of `--log-json`, the message."""
+        return "\n".join(map(_message, super().said().splitlines()))
 
     @property
     def folder(self) -> Path:
@@ -279,19 +290,20 @@ class Stage:
         before: Sequence[str] = (),
         resume: Path | None = None,
     ) -> Learner:
-        """Start `python -m learner` at this address. `settings` override SMALL. `before`: words before the command.
+        """Start `millrace learner` at this address. `settings` override SMALL. `before`: words before the command.
 
         `resume`: the run to go on with, in which only `settings` change.
         """
-        arguments = ["--resume", str(resume)]
+        arguments = ["--log-json", "--resume", str(resume)]  # its log is the only one that tells who joins and leaves
         if resume is None:
-            arguments = [env, "--bind", address, "--run-dir", str(self.runs)]
+            arguments = ["--log-json", env, "--bind", address, "--run-dir", str(self.runs)]
             settings = {**SMALL, **settings}
         for name, value in settings.items():
             if value != "":
                 arguments += [f"--{name}", *str(value).split()]
         said = self.tmp_path / f"learner-{next(self._numbers)}.log"
-        learner = Learner([*before, *self._recording, sys.executable, "-m", "learner", *arguments], said, self.runs)
+        command = [*before, *self._recording, sys.executable, "-m", "millrace", "learner", *arguments]
+        learner = Learner(command, said, self.runs)
         self.started.append(learner)
         return learner
 

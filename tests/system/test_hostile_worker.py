@@ -107,7 +107,7 @@ def learn(folder: Path, settings: Mapping[str, object], attack: Callable[[Hostil
             )
             stage.started.append(learner)
         else:
-            learner = Learner([sys.executable, "-m", "learner", *arguments], folder / "learner.log", stage.runs)
+            learner = Learner([sys.executable, "-m", "millrace", "learner", *arguments], folder / "learner.log", stage.runs)
             stage.started.append(learner)
         learner.hears("waiting for workers", START_S)
         for number in range(LANES):
@@ -137,7 +137,7 @@ def learn(folder: Path, settings: Mapping[str, object], attack: Callable[[Hostil
         if isinstance(learner, OnTerminal):
             seen.said = learner.all_said()
         else:
-            seen.log = learner.said()
+            seen.log = learner.said_in.read_text(errors="replace")
         write_page([learner.folder], learner.folder / "report.html")
         accounted(learner.summary(), lanes=LANES, rows=16)
         for file in learner.folder.rglob("*"):
@@ -203,7 +203,7 @@ def test_a_hostile_worker_changes_no_bit_of_the_weights(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("shown", ["terminal", "lines", "json"])
+@pytest.mark.parametrize("shown", ["terminal", "json"])
 def test_a_hostile_worker_that_says_everything_changes_no_bit_of_the_weights(tmp_path: Path, shown: str) -> None:
     def attack(hostile: Hostile) -> None:
         hostile.says(sayings())
@@ -212,8 +212,5 @@ def test_a_hostile_worker_that_says_everything_changes_no_bit_of_the_weights(tmp
 
     settings = {"steps": 40_000, "env-kwargs": "seconds 0.002"} | ({"log-json": ""} if shown == "json" else {})
     loud = compare(tmp_path, settings, attack, live=shown == "terminal")
-    for line in loud.log.splitlines():
-        if shown == "json":
-            assert json.loads(line)["event"] in EVENTS, line[:200]
-        else:
-            assert re.match(r"\d{4}-\d\d-\d\d |    ", line), f"a line that is not the learner's: {line[:200]!r}"
+    for line in loud.log.splitlines()[:-3]:  # the last three are the result, for people
+        assert json.loads(line)["event"] in EVENTS, line[:200]

@@ -362,7 +362,7 @@ def test_an_environment_may_be_a_callable_and_travels_to_local_workers_only(tmp_
 def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/learner"
     flags = ["CartPole-v1", "--bind", address, "--min-workers", "2", "--steps", "2000", "--eval-episodes", "2"]
-    command = [sys.executable, "-m", "learner", *flags, "--run-dir", str(tmp_path / "runs")]
+    command = [sys.executable, "-m", "millrace", "learner", *flags, "--run-dir", str(tmp_path / "runs")]
     learner = preloaded.start(command, stderr=subprocess.PIPE)
     workers = [preloaded.start([sys.executable, "-m", "workers", address], stderr=subprocess.PIPE) for _ in range(2)]
     _, said = learner.communicate(timeout=60)
@@ -372,7 +372,7 @@ def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None
         assert worker.returncode == 0, said
     (folder,) = (tmp_path / "runs").iterdir()
     assert summary(folder)["stop_reason"] == "all steps done"
-    again = preloaded.run([sys.executable, "-m", "learner", "--resume", str(folder)], timeout=60)
+    again = preloaded.run([sys.executable, "-m", "millrace", "learner", "--resume", str(folder)], timeout=60)
     assert again.returncode == 0, "a run that is done waits for workers"
 
 
@@ -564,7 +564,7 @@ def test_a_local_run_keeps_within_the_env_copies_of_its_machine(monkeypatch: pyt
     """Without room for an evaluation nothing starts. The limit is no setting of the run, which may resume elsewhere."""
     seen: list[int] = []
 
-    def starts(config: Config, *rest: object) -> Path:
+    def starts(config: Config, *rest: object, elsewhere: bool) -> Path:
         seen.append(config.max_env_copies)
         return Path()
 

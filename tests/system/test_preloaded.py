@@ -194,7 +194,7 @@ def test_workers_of_this_process_are_forked() -> None:
 
 
 def test_the_words_before_a_command_say_its_environment_and_its_network() -> None:
-    command = [sys.executable, "-m", "learner", "env", "A=1"]
+    command = [sys.executable, "-m", "millrace", "learner", "env", "A=1"]
     rest, environment, namespace = without_words_before(
         ["env", "-u", "LEFT_OUT", "A=1=2", "B=", *command], {"LEFT_OUT": "x", "C": "3"}
     )
@@ -220,7 +220,7 @@ def test_only_commands_of_ours_whose_environment_is_the_parents_are_forked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("TESTS_EXEC", raising=False)
-    learner = [sys.executable, "-m", "learner", "CartPole-v1"]
+    learner = [sys.executable, "-m", "millrace", "learner", "CartPole-v1"]
     changed = {name for name in {*os.environ, *ENVIRONMENT} if os.environ.get(name) != ENVIRONMENT.get(name)}
     assert may_be_forked(learner), changed
     assert may_be_forked([sys.executable, "-m", "workers", "x"])

@@ -30,8 +30,8 @@ def flock(file, operation):
     raise OSError(errno.ENOLCK, "No locks available")
 
 fcntl.flock = flock
-sys.argv[0] = "learner"
-runpy.run_module("learner", run_name="__main__", alter_sys=True)
+sys.argv = ["millrace", "learner", *sys.argv[1:]]
+runpy.run_module("millrace", run_name="__main__", alter_sys=True)
 """
 AS_MACHINE = 'mount --bind "$1" /proc/sys/kernel/random/boot_id; hostname "$2"; mount --bind "$3" "$4"; shift 4; exec "$@"'
 
@@ -114,8 +114,8 @@ def test_a_second_learner_is_refused_a_killed_one_replaced_and_a_replaced_one_en
     first.trains(2)
     lock = first.folder / LOCK_FILE
 
-    for command in (["learner"], ["millrace", "train"], ["millrace", "learner"]):
-        second = stage.start([sys.executable, "-m", *command, "--resume", str(first.folder)], "second")
+    for command in ("train", "learner"):
+        second = stage.start([sys.executable, "-m", "millrace", command, "--resume", str(first.folder)], "second")
         assert second.ends(START_S) == 2, second.said()
         (line,) = second.said().splitlines()
         assert f"run {first.folder}: process {first.pid} on " in line

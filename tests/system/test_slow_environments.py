@@ -48,7 +48,7 @@ def trained(stage: Stage, env: str, settings: Mapping[str, object]) -> Learner:
 
 
 def served(stage: Stage, env: str, settings: Mapping[str, object], *worker_flags: str) -> tuple[Learner, Running]:
-    """`python -m learner`, and one supervisor with a worker."""
+    """`millrace learner`, and one supervisor with a worker."""
     address = f"tcp://127.0.0.1:{free_port()}"
     learner = stage.learner(address, {**SMALL, **settings}, env=f"{ENVS}:{env}")
     return learner, stage.worker(address, "w0", *worker_flags)

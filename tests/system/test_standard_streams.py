@@ -179,7 +179,7 @@ def test_a_command_whose_output_is_its_result_says_that_it_was_not_written(tmp_p
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
 def test_a_learner_and_a_worker_elsewhere_with_a_full_disk(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/learner"
-    command = ["-m", "learner", "CartPole-v1", "--bind", address, "--run-dir", str(tmp_path / "runs"), *FLAGS]
+    command = ["-m", "millrace", "learner", "CartPole-v1", "--bind", address, "--run-dir", str(tmp_path / "runs"), *FLAGS]
     with FULL.open("wb") as full:
         both = [
             subprocess.Popen([sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=full, stderr=full)
