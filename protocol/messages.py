@@ -153,7 +153,7 @@ class Heartbeat(Message, frozen=True):
     """tickets that are held and not finished: those that wait, and those of the work in progress"""
     steps: Natural
     """env steps since the worker started, in all sessions: valid rows of rollouts, steps of evaluations, and with `StepSpec`
-    one for each copy and Step
+    those of each copy that a Step steps; a copy that it only resets may count too
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import msgspec
 
 from learner.members.membership import Member, Outgoing
-from learner.rollouts.row_checks import reason_to_reject
 from learner.run_folder.results import Evaluation, fact_means
 from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.random_streams import Purpose, env_seed
 from protocol.rollout import LARGEST_REWARD, Episode, wrong_facts
+from protocol.rows.played import reason_to_reject
 from protocol.specs import PolicySpec
 
 FIRST_TICKET = 1 << 52

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -38,6 +38,7 @@ from millrace.conformance.script import (
 from protocol.bounds import escaped
 from protocol.errors import UsageError
 from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring
+from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
 
 ADDRESS_VARIABLE = "MILLRACE_ADDRESS"
@@ -66,7 +67,8 @@ def conform(
     with ExitStack() as resources:
         port = resources.enter_context(_Port(client.with_keys or any(TOKEN_WORD in word for word in client.command)))
         process = resources.enter_context(_Process(client.command, port.address, port.token))
-        examiner = Examiner(checks, settings, time.monotonic(), limit_s)
+        token = None if port.token is None else Token.from_text(port.token.read_text().strip(), "the client's token")
+        examiner = Examiner(checks, replace(settings, token=token), time.monotonic(), limit_s)
         told = 0
 
         def perform(effects: list[Effect]) -> None:

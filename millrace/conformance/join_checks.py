@@ -32,6 +32,7 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.specs import DescribeSpec
+from protocol.wire.socket_options import routing_id
 
 MOST_LIMIT_STEPS = 2000  # of a time limit that a check walks to
 POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # balance the pole of a cart, so that its episodes reach the time limit
@@ -70,6 +71,11 @@ def time_limit(learner: Learner) -> Script[int]:
     return longest
 
 
+def is_gymnasium_pole(env: DescribedEnv) -> bool:
+    """Whether it is gymnasium's CartPole, of which attributes and options of `reset` are known."""
+    return env.spec is not None and str(env.spec.entry_point).endswith(":CartPoleEnv")
+
+
 def heartbeats(learner: Learner, number: int, rule: Rule = rules.HEARTBEAT) -> Script[Heartbeat]:
     """The last of so many Heartbeats that follow."""
     for _ in range(number):
@@ -90,9 +96,14 @@ def over_a_new_connection(learner: Learner, *others: type[Message | Rollout]) ->
 def says_hello(learner: Learner) -> Script[None]:
     """The first message."""
     hello = yield from learner.newly_started()
-    routing_id = learner.peer.partition(b"\0")[0]
-    if routing_id != hello.worker.encode():
-        raise Broken(rules.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{routing_id!r}")
+    token = learner.settings.token
+    found = (
+        learner.peer.rpartition(b"\0")[0] if token else learner.peer
+    )  # behind a routing id, the learner's socket puts the key
+    if found.partition(b"\0")[0] != hello.worker.encode():
+        raise Broken(rules.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{found!r}")
+    if found != (expected := routing_id(hello.worker, token)):
+        raise Broken(rules.ROUTING_ID, f"the routing id {expected!r}", f"{found!r}")
     if hello.attempt != hello.process_nonce + 1:
         raise Broken(rules.HELLO, f"attempt {hello.process_nonce + 1} (life + 1)", f"attempt {hello.attempt}")
 

@@ -6,10 +6,13 @@ actions under the weights that acted, by the numpy policy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from millrace.conformance import rules
 from millrace.conformance.script import Broken
+from protocol.arrays import Array, Floats
 from protocol.messages import Weights
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import make_policy
@@ -34,7 +37,7 @@ class LaneRows:
         """Check the next rollout, which keeps the row format. Raises `Broken`."""
         self._check_begin(rollout)
         self._check_episodes(rollout)
-        if self._run.policy.own is None and not self._run.policy.needs_torch:
+        if can_be_recomputed(self._run):
             self._check_log_prob(rollout, weights)
         self._last = rollout
 
@@ -82,14 +85,12 @@ class LaneRows:
                 raise Broken(
                     rules.EPISODES, f"length {length}, as the rows of sequence {rollout.sequence} say", f"{episode.length}"
                 )
-            if not _is_return(episode.reward, total):
+            if not is_return(episode.reward, total):
                 expected_return = f"return {total:g}, the sum of the rewards of its {length} steps"
                 raise Broken(rules.EPISODES, expected_return, f"{episode.reward:g}")
 
     def _check_log_prob(self, rollout: Rollout, weights: Weights) -> None:
-        policy = make_policy(self._run.policy)
-        policy.load(to_float32(weights.parameters), weights.buffers)
-        params = policy([leaf[:-1] for leaf in rollout.obs])
+        params = params_of(self._run, weights, [leaf[:-1] for leaf in rollout.obs])
         expected = distribution(self._run.policy).log_prob(params, rollout.action)
         apart = np.where(rollout.valid, np.abs(expected - rollout.log_prob), 0.0)
         if (apart > LOG_PROB_TOLERANCE * np.maximum(1.0, np.abs(expected))).any():
@@ -104,10 +105,23 @@ class LaneRows:
             )
 
 
-def _is_return(got: float, total: float) -> bool:
+def can_be_recomputed(run: RunSpec) -> bool:
+    """Whether the numpy policy acts as this run's policy does."""
+    return run.policy.own is None and not run.policy.needs_torch
+
+
+def params_of(run: RunSpec, weights: Weights, obs: Sequence[Array]) -> Floats:
+    """Distribution parameters [L, N, P] of these observations [L, N, *leaf], under these weights."""
+    policy = make_policy(run.policy)
+    policy.load(to_float32(weights.parameters), weights.buffers)
+    return policy(obs)
+
+
+def is_return(got: float, total: float) -> bool:
+    """Whether a return is this sum of rewards."""
     return abs(got - total) <= RETURN_TOLERANCE * max(1.0, abs(total))
 
 
 def _same(one: list[tuple[float, int]], other: list[tuple[float, int]]) -> bool:
     """Whether these episodes have the same returns and lengths, in this order."""
-    return all(a == b and _is_return(y, x) for (x, a), (y, b) in zip(one, other, strict=True))
+    return all(a == b and is_return(y, x) for (x, a), (y, b) in zip(one, other, strict=True))

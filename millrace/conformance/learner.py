@@ -23,6 +23,7 @@ from millrace.conformance.script import (
     Heard,
     Script,
     Send,
+    Skipped,
     StartClient,
     Wait,
     brief,
@@ -31,6 +32,7 @@ from millrace.conformance.watch import Watch
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import BadMessage
+from protocol.keys.keys import Token
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
@@ -64,6 +66,8 @@ class Settings:
     """how long the client may take from its start to its first Hello"""
     heartbeat_s: float = 0.25
     """what sessions ask for"""
+    token: Token | None = None
+    """the client's, if the connection is encrypted"""
 
 
 class Learner:
@@ -88,10 +92,8 @@ class Learner:
         """what the client has described, in this whole run of the test"""
         self.step_s = 0.0
         """how long a step takes that is long enough to act meanwhile; 0: it was not measured yet"""
-        self.has_had_a_session = False
-        """whether the process was in a session before the current one"""
         self._sessions = count(0x5EED_0001)
-        self._in_session = False  # whether the process was welcomed
+        self._had_a_session = False  # the process
         self._steps = 0  # env steps that the process has reported
         self._watch: Watch | None = None  # of the current session
 
@@ -123,8 +125,9 @@ class Learner:
         """Answer the newest Hello: a new session begins."""
         assert self.hello is not None
         self.answers_heartbeats = True
-        self.has_had_a_session, self._in_session = self._in_session, True
-        self._watch = Watch(Welcome(next(self._sessions), self.hello.attempt, run), self.now, self._steps)
+        welcome = Welcome(next(self._sessions), self.hello.attempt, run)
+        self._watch = Watch(welcome, self.now, self._steps, is_first=not self._had_a_session)
+        self._had_a_session = True
         self.send(self._watch.welcome)
 
     def do(self, *effects: Effect) -> None:
@@ -137,6 +140,7 @@ class Learner:
                 case EndClient():
                     self._forget_process()
                 case CutConnection() if self._watch is not None:
+                    self._watch.loses()
                     self._watch.heard_heartbeat_s = self.now + self.settings.patience_s
 
     # --------------------------------------------------------------------------------------------------------- hearing
@@ -163,7 +167,7 @@ class Learner:
 
     def _forget_process(self) -> None:
         self.runs, self.hello, self._watch = False, None, None
-        self.may_leave, self._in_session, self._steps = False, False, 0
+        self.may_leave, self._had_a_session, self._steps = False, False, 0
 
     def _take_hello(self, hello: Hello, is_wanted: bool) -> None:
         if self.hello is not None and hello.process_nonce != self.hello.process_nonce and not self.may_leave:
@@ -228,6 +232,15 @@ class Learner:
             raise Broken(rule, expected, f"none within {within_s:g} s" if found is None else f"{found}, without Goodbye")
         message: M = found.message  # type: ignore[assignment]
         return message
+
+    def takes_part(self, kind: type[M], rule: Rule, expected: str, *, within_s: float = 0.0) -> Script[M]:
+        """The next message of this kind. A client may decline instead: that skips the check."""
+        found = yield from self.expect((kind, Goodbye), rule, expected, within_s=within_s)
+        if isinstance(found, Goodbye):
+            yield from self.left(rules.DECLINED, "Goodbye", (2,))
+            raise Skipped(f"it declines: {found.reason}")
+        assert isinstance(found, kind)
+        return found
 
     def quiet(self, kind: type, rule: Rule, expected: str, *, for_s: float = QUIET_S) -> Script[None]:
         """Nothing of this kind arrives for so long. Or `Broken`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from millrace.conformance import collect_checks, join_checks, step_checks
 from millrace.conformance.examiner import Check
 
@@ -19,9 +21,12 @@ STEPPING = [
     Check("says nothing without an order", step_checks.says_nothing_without_an_order),
     Check("answers Reset and Step", step_checks.answers_reset_and_step),
     Check("ends episodes, and resets a copy in the step after", step_checks.ends_episodes),
+    Check("resets a copy in the same step, or declines", partial(step_checks.resets_otherwise, mode="SameStep")),
+    Check("resets no copy by itself, or declines", partial(step_checks.resets_otherwise, mode="Disabled")),
     Check("truncates an episode at the time limit", step_checks.truncates_at_the_limit),
     Check("begins the same episode for the same seed", step_checks.begins_the_same_episode_for_a_seed),
     Check("resets only the copies that a Reset lists", step_checks.resets_some_copies),
+    Check("resets with options", step_checks.resets_with_options),
     Check("gives each copy its own seed and actions", step_checks.keeps_copies_apart),
     Check("executes an order once: answers are lost, orders repeated", step_checks.executes_an_order_once),
     Check("ignores a late copy of an order", step_checks.ignores_an_old_order),
@@ -60,9 +65,11 @@ COLLECTING = [
     Check("acts under the version that an order names, not under a newer one", collect_checks.acts_under_the_named_version),
     Check("holds two versions at once", collect_checks.holds_two_versions),
     Check("collects the rollouts of a lane in their order", collect_checks.collects_in_order),
-    Check("lists the versions that it holds", collect_checks.lists_its_versions),
+    Check("lists the versions and tickets that it holds", collect_checks.lists_what_it_holds),
     Check("drops weights that no order names any more", collect_checks.drops_weights),
     Check("takes weights rounded to 16 bits", collect_checks.takes_rounded_weights),
+    Check("acts by relu, and by normalized observations, or declines", collect_checks.acts_as_its_policy_says),
+    Check("sets attributes of its environments", collect_checks.sets_attributes),
     Check("keeps the weights of a rollout in progress", collect_checks.keeps_its_weights),
     Check("sends a lost rollout again, the same", collect_checks.sends_again),
     Check("sends a rollout once", collect_checks.says_no_rollout_twice),
@@ -79,6 +86,7 @@ COLLECTING = [
     Check("evaluates", collect_checks.evaluates),
     Check("evaluates under the version that is asked for", collect_checks.evaluates_one_version),
     Check("evaluates with rows, or declines", collect_checks.evaluates_with_rows),
+    Check("evaluates under no other version, or declines rows", collect_checks.evaluates_under_no_other_version),
     Check("drains while it collects", collect_checks.drains_while_it_collects),
     Check("takes no work while it drains", collect_checks.takes_no_work_while_it_drains),
     Check("leaves when it is refused while it drains", collect_checks.leaves_when_refused_while_it_drains),

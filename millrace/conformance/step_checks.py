@@ -6,16 +6,24 @@ Each function is one check (`script.py`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import msgpack
 import numpy as np
 from msgspec.structs import replace
 
 from millrace.conformance import rules
-from millrace.conformance.join_checks import POLE_GAINS, described, heartbeats, over_a_new_connection, time_limit
+from millrace.conformance.join_checks import (
+    POLE_GAINS,
+    described,
+    heartbeats,
+    is_gymnasium_pole,
+    over_a_new_connection,
+    time_limit,
+)
 from millrace.conformance.learner import Learner
-from millrace.conformance.script import Broken, Script, Skipped, Wait, brief
+from millrace.conformance.rules import Rule
+from millrace.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
 from millrace.conformance.watch import resets_too_early
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE
@@ -24,6 +32,7 @@ from protocol.envs.spaces import leaves_with_own_dtype, make_flatten
 from protocol.messages import (
     Call,
     Drain,
+    Failure,
     Goodbye,
     LaneIncarnation,
     Release,
@@ -42,7 +51,10 @@ APART_STEPS = 8  # in which actions that copies do not share make a difference
 LANES = 2
 
 
-def step_spec(learner: Learner, env: DescribedEnv) -> StepSpec:
+Mode = Literal["NextStep", "SameStep", "Disabled"]
+
+
+def step_spec(learner: Learner, env: DescribedEnv, mode: Mode) -> StepSpec:
     """A session in which the client steps its copies on order."""
     N = learner.settings.copies
     return StepSpec(
@@ -51,6 +63,7 @@ def step_spec(learner: Learner, env: DescribedEnv) -> StepSpec:
         lanes=(N,) * LANES,
         observation=leaves_with_own_dtype(env.observation_space),
         action=leaves_with_own_dtype(env.action_space),
+        autoreset=mode,
         heartbeat_s=learner.settings.heartbeat_s,
         learner_timeout_s=30.0,
     )
@@ -59,18 +72,25 @@ def step_spec(learner: Learner, env: DescribedEnv) -> StepSpec:
 class Stepping:
     """A session of the environment profile, with the orders that checks need."""
 
-    def __init__(self, learner: Learner, env: DescribedEnv) -> None:
-        self.learner, self.env, self.spec = learner, env, step_spec(learner, env)
+    def __init__(self, learner: Learner, env: DescribedEnv, mode: Mode = "NextStep") -> None:
+        self.learner, self.env, self.spec = learner, env, step_spec(learner, env, mode)
         self.space: Any = env.action_space
         self.space.seed(1)
         self.flatten = make_flatten(env.action_space)
 
-    def reset(self, lane: int = 0, incarnation: int = 0, copies: Sequence[int] | None = None, seed: int | None = 7) -> Reset:
+    def reset(
+        self,
+        lane: int = 0,
+        incarnation: int = 0,
+        copies: Sequence[int] | None = None,
+        seed: int | None = 7,
+        options: object = None,
+    ) -> Reset:
         """A Reset of these copies (or all), seeded by `seed` and the copy's number."""
         copies = range(self.spec.lanes[lane]) if copies is None else copies
         seeds = tuple(None if seed is None else seed + copy for copy in copies)
-        options = np.frombuffer(pack(None), np.uint8)
-        return Reset(self.learner.session, next(self.learner.tickets), lane, incarnation, tuple(copies), seeds, options)
+        packed = np.frombuffer(pack(options), np.uint8)
+        return Reset(self.learner.session, next(self.learner.tickets), lane, incarnation, tuple(copies), seeds, packed)
 
     def step(self, lane: int = 0, incarnation: int = 0, actions: tuple[Array, ...] | None = None) -> Step:
         """A Step with these actions, or random ones."""
@@ -104,11 +124,11 @@ class Stepping:
         return (yield from self.learner.expect(Stepped, rules.ORDER_ANSWERED, text, ticket=order.ticket))
 
 
-def stepping(learner: Learner, *lanes: int) -> Script[Stepping]:
+def stepping(learner: Learner, *lanes: int, mode: Mode = "NextStep") -> Script[Stepping]:
     """A new session of the environment profile, in which these lanes were reset."""
     env = yield from described(learner)
     yield from learner.joining()
-    steps = Stepping(learner, env)
+    steps = Stepping(learner, env, mode)
     learner.welcome(steps.spec)
     for lane in lanes:
         yield from steps.do(steps.reset(lane))
@@ -165,6 +185,69 @@ def ends_episodes(learner: Learner) -> Script[None]:
             "the last observation of an episode in the step that ends it, and the first one of the next in the step after",
             f"the same observation in both, at each of {len(around)} ends",
         )
+
+
+def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
+    """The same seeds and actions with NextStep, and then with another autoreset mode, until an episode has ended.
+
+    So the last observation of an episode and the first one of the next are known.
+    """
+    steps = yield from stepping(learner)
+    row, actions = (yield from steps.do(steps.reset())), list[tuple[Array, ...]]()
+    while not (ended := row.terminated | row.truncated).any():
+        if len(actions) > WALK_STEPS:
+            raise Skipped(f"no episode ended in {WALK_STEPS} steps")
+        actions.append(steps.random_actions(steps.spec.lanes[0]))
+        row = yield from steps.do(steps.step(actions=actions[-1]))
+    n, last, first = int(np.argmax(ended)), row, (yield from steps.do(steps.step(actions=actions[-1])))
+    steps = yield from stepping(learner, mode=mode)
+    order = steps.reset()
+    learner.send(order)
+    yield from learner.takes_part(Stepped, rules.ORDER_ANSWERED, f"Stepped for ticket {order.ticket}")
+    *_, row = yield from steps.walk(actions)
+    rule, resets = (rules.SAME_STEP, True) if mode == "SameStep" else (rules.DISABLED, False)
+    if _numbers_of_copy(row, n) != _numbers_of_copy(last, n):
+        raise Broken(rule, f"the reward and flags of copy {n} at the end of its episode, as with NextStep", "others")
+    if _of_copy(row, n) != _of_copy(first if resets else last, n):
+        which = "first observation of the next" if resets else "last observation of its"
+        raise Broken(rule, f"the {which} episode in the step that ends that of copy {n}, as with NextStep", "another")
+    if resets:
+        info = dict(unpack(row.infos.tobytes()) if row.infos.size else ()).get(n, {})
+        leaves = make_flatten(steps.env.observation_space)(info["final_obs"]) if "final_obs" in info else ()
+        if b"".join(np.asarray(leaf).tobytes() for leaf in leaves) != _of_copy(last, n) or "final_info" not in info:
+            expected = f"final_obs, the last observation of the episode, and final_info in the info of copy {n}"
+            raise Broken(rule, expected, "another observation" if leaves else f"{sorted(info)}")
+        return
+    learner.send(steps.step(actions=actions[-1]))
+    found = yield from learner.expect((Stepped, Failure), rule, "Stepped for a Step after the end of an episode")
+    if isinstance(found, Failure):
+        yield from learner.left(rules.STAYS, "Failure", (1,))
+        raise Skipped("its environment cannot be stepped after an end")
+    assert isinstance(found, Stepped)
+    if _of_copy(found, n) == _of_copy(first, n) != _of_copy(last, n):
+        raise Broken(rule, f"copy {n}, whose episode has ended, to be stepped", "the first observation of another episode")
+
+
+def _numbers_of_copy(row: Stepped, n: int) -> tuple[float, bool, bool]:
+    return float(row.reward[n]), bool(row.terminated[n]), bool(row.truncated[n])
+
+
+def resets_with_options(learner: Learner) -> Script[None]:
+    """Bounds of the first state: the same for all copies, then those of each."""
+    env = yield from described(learner)
+    if not is_gymnasium_pole(env):
+        raise Skipped("the environment is not gymnasium's CartPole")
+    steps = yield from stepping(learner)
+    for options in (
+        {"low": 0.03, "high": 0.04},
+        [{"low": n / 50, "high": n / 50 + 0.01} for n in range(steps.spec.lanes[0])],
+    ):
+        row = yield from steps.do(steps.reset(options=options))
+        for n, state in enumerate(row.obs[0]):
+            bounds = options[n] if isinstance(options, list) else options
+            if not (bounds["low"] - 1e-6 <= state.min() and state.max() <= bounds["high"] + 1e-6):
+                expected = f"a first state of copy {n} between {bounds['low']:g} and {bounds['high']:g} (options)"
+                raise Broken(rules.OPTIONS, expected, f"{state.round(4).tolist()}")
 
 
 def _of_copy(row: Stepped, n: int) -> bytes:
@@ -397,6 +480,10 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     steps = yield from stepping(learner, 0, 1)
     learner.send(steps.step(0))  # it may be answered or not
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
+    learner.answers_heartbeats = False  # a reply would close the lane too
+    yield from _has_no_copies(steps, rules.RELEASE)
+    learner.answers_heartbeats = True
+    learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     yield Wait(0.3)
     found = yield from heartbeats(learner, 3)
     if found.tickets:
@@ -411,8 +498,20 @@ def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
     steps = yield from stepping(learner, 0, 1)
     learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
     yield from heartbeats(learner, 3)
+    yield from _has_no_copies(steps, rules.UNLISTED)
     yield from steps.do(steps.step(1))
     yield from steps.do(steps.reset(0, incarnation=1))
+
+
+def _has_no_copies(steps: Stepping, rule: Rule) -> Script[None]:
+    """Lane 0, whose copies had episodes, was closed: a Reset of one copy opens it again, with new ones, or is ignored."""
+    order = steps.reset(copies=(0,))
+    steps.learner.send(order)
+    yield Wait(0.5, lambda event: isinstance(event, Heard) and getattr(event.message, "ticket", 0) == order.ticket)
+    found = steps.learner.watch.answers.get(order.ticket)
+    if isinstance(found, Stepped) and any(leaf[1:].any() for leaf in found.obs):
+        expected = "new copies in a lane that was closed: zeros in the rows of those without an episode"
+        raise Broken(rule, expected, "observations of the copies before")
 
 
 def answers_after_a_reset_connection(learner: Learner) -> Script[None]:

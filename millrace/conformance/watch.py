@@ -13,6 +13,7 @@ import numpy as np
 
 from millrace.conformance import rules
 from millrace.conformance.lane_rows import LaneRows
+from millrace.conformance.played_rows import PlayedRows
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import Broken, brief
 from protocol.errors import BadRollout
@@ -64,10 +65,11 @@ class Dealt(NamedTuple):
 class Watch:
     """One session, as the learner sees it."""
 
-    def __init__(self, welcome: Welcome, now: float, steps: int = 0) -> None:
-        """`steps`: env steps that the process has reported in earlier sessions."""
+    def __init__(self, welcome: Welcome, now: float, steps: int = 0, *, is_first: bool = True) -> None:
+        """`steps`: env steps that the process has reported in earlier sessions. `is_first`: it had none."""
         self.welcome = welcome
         self.session, self.run = welcome.session, welcome.run
+        self._is_first_session = is_first
         self.heard_heartbeat_s = now
         self.heartbeat: Heartbeat | None = None
         """the newest"""
@@ -83,12 +85,17 @@ class Watch:
         """by ticket"""
         self.answers: dict[int, Answer | Rollout] = {}
         """the first answer to each order, and the first rollout of each permit, by ticket"""
+        self.played: dict[int, PlayedRows] = {}
+        """the newest answer to each Evaluate, by ticket"""
         self.said_goodbye = False
         self._refused = self._drains = False  # whether the learner has sent Refuse, or Drain
         self._description: Described | None = None
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
         self._lanes: dict[int, int] = {}  # the client's lanes, each in its highest incarnation
         self._asked, self._answered = Counter[int](), Counter[int]()
+        self._results: dict[int, Evaluated] = {}  # the first answer to each Evaluate
+        self._due: dict[int, int] = {}  # tickets that arrive before a later HeartbeatReply than this one
+        self._missing = set[int]()  # of these, those that the last Heartbeat should have listed, and did not
         self._next_sequence: dict[tuple[int, int], int] = {}
         self._rows: dict[tuple[int, int], LaneRows] = {}
         self.steps = steps
@@ -105,6 +112,7 @@ class Watch:
                 self._ignored[message.ticket] = OTHER_SESSION
             case Evaluate():
                 self.orders[message.ticket] = message
+                self._counts(message.ticket)
             case Reset() | Step() | Call():
                 self.orders[message.ticket] = message
                 self._asks(message)
@@ -124,8 +132,17 @@ class Watch:
             case Drain():
                 self._drains = True
 
+    def _counts(self, ticket: int) -> None:
+        self._asked[ticket] += 1
+        if not (self._drains or self._refused):
+            self._due[ticket] = self.replies
+
+    def loses(self) -> None:
+        """What was sent may be lost: the connection is cut."""
+        self._due.clear()
+
     def _asks(self, order: Order | Permit) -> None:
-        self._asked[order.ticket] += 1
+        self._counts(order.ticket)
         newest = self._lanes[order.lane] = max(order.incarnation, self._lanes.get(order.lane, 0))
         if order.incarnation < newest:
             why = f"it is of incarnation {order.incarnation}, its lane is in {newest}"
@@ -180,8 +197,10 @@ class Watch:
                 else:
                     self._see_answer(message)
             case Evaluated() | EpisodeRows():
-                if not isinstance(self.orders.get(message.ticket), Evaluate):
+                order = self.orders.get(message.ticket)
+                if not isinstance(order, Evaluate):
                     raise Broken(rules.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
+                self._see_played(message, order)
             case Goodbye() | Failure() if self._refused and not self._drains:  # else it may have been on its way
                 raise Broken(rules.AFTER_REFUSE, "no last words after Refuse", brief(message))
             case Goodbye():
@@ -209,6 +228,7 @@ class Watch:
             expected = f"version {max(before.versions)}, as before, or a newer one"
             raise Broken(rules.HOLDS_WEIGHTS, expected, f"{list(message.versions)}")
         self._see_tickets(message.tickets)
+        self._see_if_all_are_listed(message)
 
     def _see_tickets(self, tickets: Sequence[int]) -> None:
         known = self.orders.keys() | self.permits.keys()
@@ -222,6 +242,57 @@ class Watch:
             raise Broken(
                 rules.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
             )
+
+    def _see_if_all_are_listed(self, message: Heartbeat) -> None:
+        """A ticket that came before the last reply is listed until it is answered; by two threads perhaps one beat later."""
+        missing = {
+            ticket
+            for ticket, replies in self._due.items()
+            if replies < message.replies and ticket not in message.tickets and self._is_open(ticket)
+        }
+        if still := missing & self._missing:
+            expected = f"ticket {max(still)}, which came before HeartbeatReply {message.replies} and is not finished"
+            raise Broken(self.rule_of_missing(max(still), rules.HEARTBEAT_TICKETS), expected, f"{list(message.tickets)}")
+        self._missing = missing
+
+    def rule_of_missing(self, ticket: int, otherwise: Rule) -> Rule:
+        """The rule that is likely broken if a ticket leads to nothing: in a later session, a lane's first may seem old."""
+        is_old = not self._is_first_session and ticket in self.permits and not self.permits[ticket].permit.sequence
+        return rules.FORGETS if is_old else otherwise
+
+    def _is_open(self, ticket: int) -> bool:
+        """Whether the client must hold this ticket."""
+        if ticket in self.answers or ticket in self._results or ticket in self._ignored:
+            return False
+        order = self.orders.get(ticket) or self.permits[ticket].permit
+        if isinstance(order, Evaluate):
+            return max(self.versions, default=-1) <= order.version
+        of_lane = (
+            each.ticket for each in self.orders.values() if not isinstance(each, Evaluate) and each.lane == order.lane
+        )
+        return self._lanes.get(order.lane) == order.incarnation and max(of_lane, default=ticket) <= ticket
+
+    def _see_played(self, message: Evaluated | EpisodeRows, order: Evaluate) -> None:
+        assert isinstance(self.run, RunSpec)
+        ticket, is_answer = order.ticket, isinstance(message, Evaluated)
+        if self._answered[ticket] == self._asked[ticket]:
+            rule = rules.EVALUATE_ONCE if is_answer else rules.ROWS_FIRST
+            raise Broken(
+                rule, f"nothing of ticket {ticket} after its Evaluated, until the order comes again", brief(message)
+            )
+        if order.version not in self.versions:
+            expected = f"no {type(message).__name__} before the Weights of version {order.version}"
+            raise Broken(rules.EVALUATE_VERSION, expected, brief(message))
+        played = self.played.get(ticket)
+        if played is None or played.ended:
+            played = self.played[ticket] = PlayedRows(order, self.run, self.versions[order.version])
+        if isinstance(message, EpisodeRows):
+            return played.see_rows(message)
+        played.see_answer(message)
+        self._answered[ticket] += 1
+        if self._results.setdefault(ticket, message) != message and not order.send_rows:
+            raise Broken(rules.EVALUATE_ONCE, f"the same answer to ticket {ticket} again", "another")
+        return None
 
     def _see_answer(self, message: Answer) -> None:
         order = self.orders.get(message.ticket)

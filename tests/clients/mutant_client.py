@@ -18,29 +18,38 @@ import msgpack
 import msgspec
 import numpy as np
 
+from protocol.arrays import Floats
 from protocol.errors import BadMessage
 from protocol.messages import (
     Collect,
     Described,
     Drain,
+    EpisodeRows,
+    Evaluate,
+    Evaluated,
     Goodbye,
     Heartbeat,
     HeartbeatReply,
     Hello,
+    Received,
     Refuse,
     Rejoin,
     Release,
     Reset,
     Rollout,
+    Step,
     Stepped,
     ToLearner,
     ToWorker,
     Weights,
     Welcome,
 )
-from protocol.specs import StepSpec
+from protocol.policy.distributions import Categorical
+from protocol.specs import RunSpec, StepSpec
 from protocol.wire.codec import Buffer, decode_to_learner, encode
+from protocol.wire.plain_values import pack
 from protocol.wire.worker_link import WorkerLink
+from workers.collect import collected_lane
 from workers.conversation.session import Session
 from workers.worker import Worker, WorkerOptions, identity
 
@@ -59,6 +68,8 @@ class Mutant(WorkerLink):
         self.versions = set[int]()  # of the weights that came
         self.arrived = 0  # permits
         self.late_drain: Drain | None = None
+        self.kept: list[ToLearner] = []
+        self.drains, self.lost_session = False, 0
 
     # ---------------------------------------------------------------- what it says
 
@@ -124,6 +135,23 @@ class Mutant(WorkerLink):
             case "no new Hello in silence", Hello():
                 was_said, self.said_hello = self.said_hello, True
                 return [] if was_said else [message]
+            case "lists no tickets", Heartbeat():
+                return [replace(message, tickets=())]
+            case "no heartbeat while it drains", Heartbeat() if self.drains:
+                return []
+            case "episodes in another order", Rollout():
+                return [replace(message, episodes=message.episodes[::-1])]
+            case "rows after their Evaluated", EpisodeRows():
+                self.kept.append(message)
+                return []
+            case "rows after their Evaluated", Evaluated():
+                return [message, *self.kept]
+            case "rows in float32", EpisodeRows():
+                return [replace(message, reward=message.reward.astype(np.float32))]
+            case "rows without an end", EpisodeRows():
+                return [replace(message, truncated=np.zeros_like(message.truncated))]
+            case "cuts nothing", Evaluated():
+                return [replace(message, cut=(False,) * len(message.cut))]
             case "replies counted wrongly", Heartbeat():
                 return [replace(message, replies=message.replies + (message.replies > 0))]
         return [message]
@@ -148,6 +176,39 @@ class Mutant(WorkerLink):
                 self.say(Stepped(session, 1, 0, 0, obs, np.zeros(N), flags, flags, FLAT))
             case "any Welcome", Welcome():
                 return [replace(message, attempt=self.attempt)]
+            case "one autoreset mode", Welcome(_, _, StepSpec() as run):
+                return [replace(message, run=replace(run, autoreset="NextStep"))]
+            case "one activation", Welcome(_, _, RunSpec() as run):
+                return [replace(message, run=replace(run, policy=replace(run.policy, activation="tanh")))]
+            case "does not normalize", Weights(_, _, buffers) if buffers.size:
+                return [replace(message, buffers=np.repeat(np.array([0, 1], np.float32), buffers.size // 2))]
+            case "sets no attributes", Weights():
+                return [replace(message, env_attributes=None)]
+            case "reads bfloat16 as numbers", Weights(_, parameters) if parameters.dtype == np.uint16:
+                return [replace(message, parameters=parameters.astype(np.float32))]
+            case "evaluates the newest weights", Evaluate() if self.versions:
+                return [replace(message, version=max(self.versions))]
+            case "never greedy", Evaluate():
+                return [replace(message, greedy=False)]
+            case "always greedy", Evaluate():
+                return [replace(message, greedy=True)]
+            case "evaluates by other seeds", Evaluate(seeds=seeds):
+                return [replace(message, seeds=tuple(range(7, 7 + len(seeds))))]
+            case "resets without options", Reset():
+                return [replace(message, options=np.frombuffer(pack(None), np.uint8))]
+            case "answers no order again", Reset() | Step():
+                was_said, self.newest = message.ticket == self.newest, message.ticket
+                return [] if was_said else [message]
+            case "keeps what a session had", Welcome(session) if self.session:
+                self.lost_session = session
+            case "keeps what a session had", Collect(session) if session == self.lost_session:
+                return []
+            case "keeps unlisted lanes", HeartbeatReply():
+                return [replace(message, received=tuple(Received(lane, 0, 0) for lane in (0, 1)))]
+            case "last words after Refuse", Refuse(reason):
+                self.say(Goodbye(self.session, reason, ()))
+            case "no heartbeat while it drains", Drain():
+                self.drains = True
             case "no autoreset", Welcome(_, _, StepSpec() as run):
                 return [replace(message, run=replace(run, autoreset="SameStep"))]
             case "no drain", Drain():
@@ -192,8 +253,19 @@ class Mutant(WorkerLink):
         super().send(encode(message))
 
 
+def _one_for_all(self: Categorical, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+    return np.broadcast_to(_noise(self, generator, shape)[..., :1, :], (*shape, self.params_size)).copy()
+
+
+_noise = Categorical.noise
+
+
 def main(mutant: str, address: str) -> int:
     """Run the mutant until it leaves."""
+    if mutant == "one seed for all copies":
+        vars(collected_lane)["copy_seeds"] = lambda seed, lane, incarnation, copies: [1] * copies
+    if mutant == "one random number for all copies":
+        Categorical.noise = _one_for_all  # type: ignore[method-assign]
     signals: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: signals.append(number))
     link = Mutant(mutant, address)

@@ -11,11 +11,11 @@ import pytest
 
 from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_tickets import EvaluationPlan
-from learner.rollouts.row_checks import reason_to_reject
 from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye
 from protocol.rollout import Episode
+from protocol.rows.played import reason_to_reject
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of
 from tests.support.fake_ends import fake_rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +15,7 @@ import pytest
 
 from millrace.conformance import collect_checks, rules
 from millrace.conformance.examiner import CHECK_S, Check, Examiner
-from millrace.conformance.join_checks import describe_spec, leaves_when_refused_later
+from millrace.conformance.join_checks import describe_spec, leaves_when_refused_later, says_hello
 from millrace.conformance.learner import Learner, Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import as_data, explanation, line_of, summary
@@ -34,10 +35,13 @@ from millrace.conformance.script import (
 from millrace.conformance.watch import Watch, check_stepped
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
+from protocol.keys.keys import Key, Token
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     Described,
+    Drain,
+    Evaluate,
     Goodbye,
     Heartbeat,
     Hello,
@@ -48,6 +52,7 @@ from protocol.messages import (
     Rollout,
     Step,
     Stepped,
+    ToWorker,
     Weights,
     Welcome,
 )
@@ -61,6 +66,7 @@ STEPPED = StepSpec((EnvSpec("own"),), (0, 0), (2,), (Leaf("", "multibinary", (),
 STEPPED_ANSWER = Stepped(
     1, 7, 0, 0, (np.ones(2, np.int8),), np.zeros(2), np.zeros(2, bool), np.zeros(2, bool), np.zeros(0, np.uint8)
 )
+TAGGED = b"w\0" + hashlib.blake2b(b"w", key=b"k" * 32, digest_size=16).hexdigest().encode()
 HELLO = Hello(PROTOCOL_VERSION, "w", "host", 1, 70, "test", 71)
 
 
@@ -284,6 +290,55 @@ def test_a_lane_is_listed_with_what_has_arrived_until_it_is_released() -> None:
     assert len(watch.received()) == 2
     watch.sent(Release(1, (LaneIncarnation(0, 2),)))
     assert watch.received() == (Received(1, 0, 0),)
+
+
+@pytest.mark.parametrize("kind", ["order", "permit", "evaluation"])
+def test_a_ticket_is_listed_from_the_reply_after_it_until_it_is_answered(kind: str) -> None:
+    watch = Watch(Welcome(1, 71, STEPPED), 0.0) if kind == "order" else watch_of(3)
+    sent: dict[str, ToWorker] = {
+        "order": Step(1, 7, 0, 0, ()),
+        "permit": Collect(1, 3, (Permit(7, 0, 0, 1),), ()),
+        "evaluation": Evaluate(1, 7, 3, (1,), True, 9, False, False),
+    }
+    watch.sent(watch.reply(1))
+    watch.sent(sent[kind])
+    for replies, tickets in ((1, ()), (1, ()), (1, (7,))):  # the ticket may be on its way
+        watch.see(Heartbeat(1, replies, (), tickets, 0, {}, 0), 0.1)
+    watch.sent(watch.reply(2))
+    for tickets in ((), (7,), ()):  # two threads of the client may be late by one Heartbeat
+        watch.see(Heartbeat(1, 2, (), tickets, 0, {}, 0), 0.2)
+    with pytest.raises(Broken) as broken:
+        watch.see(Heartbeat(1, 2, (), (), 0, {}, 0), 0.3)
+    assert (broken.value.rule, broken.value.got) == (rules.HEARTBEAT_TICKETS, "[]")
+
+
+@pytest.mark.parametrize("why", ["answered", "lost", "drained", "superseded", "of a released lane"])
+def test_a_ticket_need_not_be_listed(why: str) -> None:
+    watch = Watch(Welcome(1, 71, STEPPED), 0.0)
+    if why == "drained":
+        watch.sent(Drain(""))
+    watch.sent(Step(1, 7, 0, 0, ()))
+    match why:
+        case "answered":
+            watch.see(STEPPED_ANSWER, 0.1)
+        case "lost":
+            watch.loses()
+        case "superseded":
+            watch.sent(Step(1, 8, 0, 0, ()))
+        case "of a released lane":
+            watch.sent(Release(1, (LaneIncarnation(0, 0),)))
+    watch.sent(watch.reply(1))
+    for _ in range(3):
+        watch.see(Heartbeat(1, 1, (), (8,) if why == "superseded" else (), 0, {}, 0), 0.2)
+
+
+def test_with_keys_a_routing_id_is_the_name_and_the_tag_of_the_client() -> None:
+    token = Token(b"s" * 32, Key(b"p" * 32, b"k" * 32))
+    for routing_id, rule in ((TAGGED, None), (b"w", rules.ROUTING_ID), (b"w\0" + b"0" * 32, rules.ROUTING_ID)):
+        test = Examiner([Check("", says_hello)], replace(SETTINGS, token=token), 0.0, 300.0)
+        test.tick(0.0)
+        test.handle(Heard(routing_id + b"\0" + b"its public key", HELLO), 0.1)
+        assert test.results[0].rule is rule
 
 
 def test_an_answer_that_is_sent_again_is_the_same() -> None:

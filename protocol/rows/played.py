@@ -1,4 +1,4 @@
-"""Checks of the rows of played episodes, which a worker sent. Pure."""
+"""The arrays of `EpisodeRows`: consecutive rows of a played episode. Pure."""
 
 from __future__ import annotations
 
