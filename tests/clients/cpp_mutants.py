@@ -251,7 +251,7 @@ MUTANTS = [
         "bfloat16 read as float16", "policy.hpp",
         "if (array.dtype == \"<u2\")",
         "if (false)",
-        "collector", "weights rounded to 16 bits", rules.LOG_PROB, "",
+        "collector", "weights rounded to 16 bits", rules.ROUNDED, "",
     ),
     Mutant(
         "repeated rollout", "rollouts.hpp",
@@ -341,7 +341,7 @@ MUTANTS = [
         "the same random numbers in every lane", "policy.hpp",
         "state_ = bits() ^ each;",
         "state_ = each & 0;",
-        "collector", "collects two lanes", rules.INDEPENDENT, "lane 1 as in lane 0",
+        "collector", "collects two lanes", rules.INDEPENDENT, "copy 0 of lane 0 in copy",
     ),
     Mutant(
         "forgets an end between two rollouts", "rollouts.hpp",
@@ -399,7 +399,7 @@ MUTANTS = [
         "evaluates without end", "worker.hpp",
         " && episode.length < evaluation.most_steps",
         "",
-        "collector", "evaluates", rules.EVALUATE, "steps",
+        "collector", "evaluates", rules.CUT, "steps",
     ),
     Mutant(
         "evaluates again", "rollouts.hpp",
