@@ -16,6 +16,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
 from learner.config.layers import config_of_run
 from learner.config.on_resume import Change, OnResume, changes, refusal
+from learner.config.run_rules import reason_to_stop
 from learner.env_spaces import EnvSpaces
 from learner.run_folder.run_folder import PolicyDescription, RunFolder
 from protocol.arrays import Floats
@@ -103,7 +104,8 @@ def _is_finished(config: Config, folder: RunFolder) -> bool:
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
         return False
-    reason = config.stop_rule().reason_to_stop(
+    reason = reason_to_stop(
+        config,
         env_steps_after_next_update=summary.env_steps + config.algorithm.rollout_steps * config.envs,
         evaluation_return=summary.evaluation.return_mean,
         training_return=summary.return_mean_100,

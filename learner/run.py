@@ -1,8 +1,8 @@
-"""Makes a learner of its parts: link, coordinator, hub, service, algorithm, recorder.
+"""Makes a learner of its parts: link, coordinator, hub, service, algorithm, and what a run does between two updates.
 
 The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let a worker describe the
-environment, while PyTorch is imported (`known_environment`); make the `Run`; train. This file does not know who the workers
-are, and the learner runs no code of the environment.
+environment, while PyTorch is imported (`known_environment`); open the `Run` (`open_run`); train. This file does not know who
+the workers are, and the learner runs no code of the environment.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import logging
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -30,7 +31,7 @@ from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.prior_dataset import PriorDataset
 from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
-from learner.rollout_service.service import describe_settings, rollout_service
+from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.lease import Closed, Listens
 from learner.run_folder.run_folder import Interrupted, RunFolder
@@ -43,10 +44,12 @@ from protocol.envs.description import DescribedEnv
 from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.keys.key_folder import Keyring
 from protocol.logs.notices import log_notice
-from protocol.messages import Status
 from protocol.rollout import Batch
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
+
+if TYPE_CHECKING:  # it imports PyTorch
+    from learner.between_updates.between_updates import BetweenUpdates
 
 log = logging.getLogger("millrace.learner")
 
@@ -85,6 +88,13 @@ class RunSetup:
         """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""
         if self.interrupts.received:
             raise stopped(self.folder.path if self.resumed else None)
+
+    def check_running(self) -> None:
+        """Raises `Interrupted` if the user has interrupted the run, and `RunTakenOver` if another process trains it."""
+        if self.interrupts.received:
+            raise Interrupted(self.folder.path)
+        if self.folder.lock is not None:
+            self.folder.lock.check()
 
 
 @contextmanager
@@ -166,89 +176,30 @@ def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks
     )
 
 
+@dataclass(frozen=True)
 class Run:
-    """A learner that listens to workers and has not begun to train."""
+    """A learner that listens to workers and has not begun to train. `open_run` makes it."""
 
-    def __init__(
-        self,
-        setup: RunSetup,
-        link: LearnerLink,
-        processes: ProcessCallbacks,
-        watch: Watch,
-        observer: HubObserver,
-    ) -> None:
-        """`watch`: the callbacks of the run, or a function to call after each update. Raises `MillraceError`.
-
-        `observer` is called each time the hub has listened. `processes` are the worker processes that this program started.
-        """
-        import torch
-
-        from learner.algorithms import algorithm_class
-        from learner.run_recorder import EpisodeSettings, RunRecorder
-        from learner.run_spec import run_spec
-        from learner.run_state import RunState, restore, start_from
-
-        config, self.folder = setup.config, setup.folder
-        made = Callbacks.of(watch).with_named(config.callback)
-        if line := unused_target(config):
-            log.warning("%s", line)
-        spec = run_spec(config, setup.known.env, setup.known.spaces)
-        if config.torch_threads is None:
-            # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
-            config = msgspec.structs.replace(config, torch_threads=threads(spec.policy, config.max_lag, processes.expected))
-        torch.set_num_threads(config.torch_threads or 1)
-        if updates_use_all_cores(config):
-            processes.lower_priority()
-        self.algorithm = algorithm_class(config.algo)(
-            config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
-        )
-        # A fresh algorithm gets its start here: from another run, then from prior data. A resumed one has its own state.
-        if config.start_from and not setup.resumed:
-            self.folder.started_from = start_from(config, spec.policy, self.algorithm)
-            log_notice(log, self.folder.started_from)
-        if config.prior:
-            if spec.masked and spec.policy.head == "q":
-                raise UsageError(
-                    f"prior {config.prior}: a dataset has no action masks, and this run uses them; take --action-masks none"
-                )
-            self._prior = _add_prior(self.algorithm, config.prior, spec.policy, setup.check_interrupt)
-        state = RunState()
-        if setup.resumed:
-            state = restore(self.folder, self.algorithm)
-        self._interrupts = setup.interrupts
-        # The last save gets half of what is left of the grace time, and the workers need time to leave.
-        self.folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
-        self._learns_from_prior, self._clones = bool(config.prior), bool(getattr(config.algorithm, "clone_epochs", 0))
-        past = (state.ledger, state.incarnations)
-        self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
-        episodes = EpisodeSettings(_training_recorder(config, self.folder, setup.known, spec), setup.known.evaluation_limit)
-        setup.check_interrupt()
-        self.folder.remove_temporary()
-        # Nothing of a resumed run is written before everything fits.
-        self.folder.write_config(config, workers_elsewhere=not processes.expected)
-        self.folder.remove_summary()
-        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
-        if setup.resumed:
-            log_notice(log, self.recorder.continues())
-        self.folder.keep()
-        self.announce(link.address, config.advertise, link.keyring)
+    setup: RunSetup
+    algorithm: Algorithm
+    service: RolloutService
+    between: BetweenUpdates
+    prior: PriorDataset | None
+    """The data that the run learns from besides its own, if there are any."""
 
     def announce(self, address: str, advertise: str, keyring: Keyring | None) -> None:
         """Say in the lock of the run folder that `millrace status` may ask at this address; or why it cannot."""
-        if self.folder.lock is None:
+        lock = self.setup.folder.lock
+        if lock is None:
             return
         if address.startswith("inproc://"):
-            self.folder.lock.announce(Closed.INPROC)
+            lock.announce(Closed.INPROC)
         elif keyring is not None and keyring.folder is None:
-            self.folder.lock.announce(Closed.KEYS_OF_THE_RUN)
+            lock.announce(Closed.KEYS_OF_THE_RUN)
         else:
             keys = "" if keyring is None or keyring.folder is None else str(keyring.folder.path.absolute())
             others = advertised_address(address, advertise, socket.gethostname())
-            self.folder.lock.announce(Listens(others, own_address(address), keys))
-
-    def status(self, now: float) -> Status:
-        """The answer to `millrace status`. `now`: seconds of the monotonic clock."""
-        return self.service.status(now)
+            lock.announce(Listens(others, own_address(address), keys))
 
     def train(self, workers: int) -> None:
         """Wait for this number of `workers`, then train to the end.
@@ -258,52 +209,127 @@ class Run:
         """
         from learner.train import train
 
+        files, audience = self.between.files, self.between.audience
         try:
-            if self._learns_from_prior and self.recorder.version == 0:
-                self._learn_from_prior()
-            train(self.algorithm, self.service, self.recorder, workers, self._check_time)
+            if self.prior is not None and self.between.tally.state.version == 0:
+                self._learn_from_prior(self.prior)
+            train(self.algorithm, self.service, self.between, workers, self._check_time)
         except RunTakenOver as error:
             self.service.drain(str(error), timeout_s=DRAIN_S)
             raise
         except BaseException as error:
-            if line := self.recorder.saved():
+            if line := files.saved():
                 error.add_note(line)
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
-            self.service.drain(reason, timeout_s=self._interrupts.at_most(DRAIN_S))
+            self.service.drain(reason, timeout_s=self.setup.interrupts.at_most(DRAIN_S))
             try:
-                self.recorder.finish(reason, cut_short=True)
+                audience.finish(reason, cut_short=True)
             except Exception as later:  # a callback may raise again, and the error of the run is what counts
                 log.warning("%s", _why(later))
             raise
         finally:
-            self.recorder.close()
+            files.close()
+            audience.close()
 
-    def _learn_from_prior(self) -> None:
+    def _learn_from_prior(self, prior: PriorDataset) -> None:
         """Make the gradient steps before the first rollouts, with checkpoints when it is time, and at an interrupt."""
+        tally, files, audience, _ = self.between
 
         def pulse() -> None:
             self.service.pulse()
-            self.recorder.save_if_time()
-            self._check_interrupt()
+            files.save_if_due()
+            self.setup.check_running()
 
         try:
-            if self._clones:
-                self.recorder.cloned(self.algorithm.clone(self._prior.batches(), pulse))
+            if getattr(self.setup.config.algorithm, "clone_epochs", 0):
+                audience.cloned(self.algorithm.clone(prior.batches(), pulse))
+                tally.state.next_evaluation = 0  # one is due, if the run makes any
             self.algorithm.learn_from_prior(pulse)
         except Interrupted:
-            self.recorder.save()
-            self.recorder.confirm_saved()
+            files.save()
+            files.confirm_saved()
             raise
 
-    def _check_interrupt(self) -> None:
-        if self._interrupts.received:
-            raise Interrupted(self.folder.path)
-        if self.folder.lock is not None:
-            self.folder.lock.check()
-
     def _check_time(self) -> None:
-        if self._interrupts.time_is_up(self.recorder.longest_save_s):
-            raise Interrupted(self.folder.path)
+        if self.setup.interrupts.time_is_up(self.between.files.longest_save_s):
+            raise Interrupted(self.setup.folder.path)
+
+
+def open_run(setup: RunSetup, link: LearnerLink, processes: ProcessCallbacks, watch: Watch, observer: HubObserver) -> Run:
+    """The run of this setup, whose folder is ready. Raises `MillraceError`.
+
+    `watch`: the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
+    listened. `processes` are the worker processes that this program started. Nothing of a resumed run is written before
+    everything fits.
+    """
+    from learner.between_updates.between_updates import open_files
+    from learner.between_updates.run_parts import RunParts
+    from learner.between_updates.tally import Tally
+    from learner.run_spec import run_spec
+    from learner.run_state import RunState, restore
+
+    callbacks = Callbacks.of(watch).with_named(setup.config.callback)
+    if line := unused_target(setup.config):
+        log.warning("%s", line)
+    spec = run_spec(setup.config, setup.known.env, setup.known.spaces)
+    setup = _use_threads(setup, spec.policy, processes)
+    config, folder = setup.config, setup.folder
+    algorithm, prior = _new_algorithm(setup, spec)
+    state = restore(folder, algorithm) if setup.resumed else RunState()
+    # The last save gets half of what is left of the grace time, and the workers need time to leave.
+    folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
+    past = (state.ledger, state.incarnations)
+    service = rollout_service(config, spec, link, processes, setup.check_running, observer, past)
+    dataset = _training_recorder(config, folder, setup.known, spec)
+    setup.check_interrupt()
+    folder.remove_temporary()
+    folder.write_config(config, workers_elsewhere=not processes.expected)
+    folder.remove_summary()
+    tally = Tally(config, spec, state, lambda: callbacks.stop_reason)
+    parts = RunParts(config, spec, folder, algorithm, service, tally)
+    between = open_files(parts, callbacks, dataset, setup.known.evaluation_limit)
+    run = Run(setup, algorithm, service, between, prior)
+    service.report(between.audience.progress())
+    if setup.resumed:
+        log_notice(log, between.files.continues())
+    folder.keep()
+    run.announce(link.address, config.advertise, link.keyring)
+    return run
+
+
+def _use_threads(setup: RunSetup, policy: PolicySpec, processes: ProcessCallbacks) -> RunSetup:
+    """Let PyTorch use the run's number of threads. Returns the setup with that number."""
+    import torch
+
+    config = setup.config
+    if config.torch_threads is None:
+        # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
+        config = msgspec.structs.replace(config, torch_threads=threads(policy, config.max_lag, processes.expected))
+    torch.set_num_threads(config.torch_threads or 1)
+    if updates_use_all_cores(config):
+        processes.lower_priority()
+    return replace(setup, config=config)
+
+
+def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorDataset | None]:
+    """An algorithm that starts from another run, if it is to, and has its prior data. A resumed one has its own start."""
+    from learner.algorithms import algorithm_class
+    from learner.run_state import start_from
+
+    config, folder, policy = setup.config, setup.folder, spec.policy
+    algorithm = algorithm_class(config.algo)(
+        config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
+    )
+    if config.start_from and not setup.resumed:
+        folder.started_from = start_from(config, policy, algorithm)
+        log_notice(log, folder.started_from)
+    if not config.prior:
+        return algorithm, None
+    if spec.masked and policy.head == "q":
+        raise UsageError(
+            f"prior {config.prior}: a dataset has no action masks, and this run uses them; take --action-masks none"
+        )
+    return algorithm, _add_prior(algorithm, config.prior, policy, setup.check_interrupt)
 
 
 def _why(error: BaseException) -> str:

@@ -18,9 +18,9 @@ from contextlib import contextmanager
 
 from learner.algorithms import Algorithm
 from learner.algorithms.algorithm import numbers
+from learner.between_updates.between_updates import BetweenUpdates
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.lanes import AcceptedRollout
-from learner.run_recorder import RunRecorder
 from protocol.arrays import Floats
 from protocol.errors import RunError
 from protocol.rollout import stack_rollouts
@@ -31,56 +31,70 @@ ADVICE = "try a lower learning_rate, or normalize_observations"
 def train(
     algorithm: Algorithm,
     service: RolloutService,
-    recorder: RunRecorder,
+    between: BetweenUpdates,
     workers: int,
     check_time: Callable[[], None] = lambda: None,
 ) -> str:
-    """Train until `recorder` gives a reason to stop. Returns that reason.
+    """Train until the tally gives a reason to stop. Returns that reason.
 
     `workers`: number of workers to wait for before the first rollout. If the run cannot go on (no worker is left, the
     environment raised too often, the user interrupted the run, a loss is not finite, the user's code raised), the state
     after the last whole update is saved. Then the error is raised. `check_time` is called between gradient steps: what it
     raises takes the update back.
     """
+    tally, files, audience, evaluations = between
 
     def pulse() -> None:
         service.pulse()
         check_time()
 
     def publish(weights: tuple[Floats, Floats]) -> None:
-        attributes = recorder.env_attributes()
-        service.publish(recorder.version, *weights, deal=recorder.training_goes_on(), env_attributes=attributes)
+        attributes = audience.env_attributes()
+        service.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
 
-    recorder.save()
+    def evaluate() -> None:
+        audience.evaluated(evaluations.evaluate_newest(audience.show_now))
+        files.save()
+
+    files.save()
     try:
         service.wait_for_workers(workers)
-        recorder.start()
-        publish(recorder.weights())
-        recorder.evaluate_if_due()
-        while (reason := recorder.stop_reason()) is None:
-            arrived = service.gather(recorder.show_now)
+        audience.start()
+        publish(files.weights())
+        if tally.evaluation_is_due():  # the run was interrupted before it
+            evaluate()
+        while (reason := tally.stop_reason()) is None:
+            arrived = service.gather(audience.show_now)
             began_s = time.monotonic()
             with _whole_update(algorithm, service, arrived):
-                if not recorder.gathered(arrived):
+                if not audience.gathered(arrived):
                     service.not_used(arrived)
                     continue
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
                 metrics = numbers(algorithm.update(batch, pulse), type(algorithm).__name__)
-                weights = recorder.weights()
+                weights = files.weights()
                 if not algorithm.is_finite():
-                    raise RunError(f"learner: update {recorder.version}: the weights are not finite after it; {ADVICE}")
-            recorder.count(batch)
+                    raise RunError(f"learner: update {tally.state.version}: the weights are not finite after it; {ADVICE}")
+            tally.count(batch)
+            files.write_images(batch)
             publish(weights)
-            recorder.updated(metrics, time.monotonic() - began_s)
-        recorder.save()
-        recorder.conclude()
-        recorder.save_unless_saved()  # the final policy may be the best
+            with tally.after_update(time.monotonic() - began_s):
+                audience.updated(metrics)
+                if tally.evaluation_is_due():
+                    files.save()  # an evaluation may take long
+                    evaluate()
+                else:
+                    files.save_if_due()
+        files.save()
+        if evaluations.conclude(audience.show_now):
+            audience.evaluated()
+        files.save_unless_saved()  # the final policy may be the best
     except BaseException as error:
-        recorder.save_after_error(error)
+        files.save_after_error(error)
         raise
     service.drain(reason)
-    recorder.confirm_saved()  # before the summary: with one, a run counts as finished
-    recorder.finish(reason)
+    files.confirm_saved()  # before the summary: with one, a run counts as finished
+    audience.finish(reason)
     return reason
 
 

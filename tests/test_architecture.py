@@ -26,6 +26,16 @@ FORBIDDEN = {
 LEARNER = {  # what each folder of the learner may import of the learner; train.py, run.py and the like may import all
     "config": {"run_folder"},
     "algorithms": {"config"},
+    "between_updates": {
+        "algorithms",
+        "callbacks",
+        "config",
+        "recording",
+        "rollout_service",
+        "rollouts",
+        "run_folder",
+        "run_state",
+    },
     "callbacks": {"config", "run_folder"},
     "algorithm_check": {"algorithms", "config", "torch_setup"},
     "members": set[str](),

@@ -17,7 +17,6 @@ from tyro.conf import UseAppendAction, arg
 from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
 from learner.config.on_resume import Fixed, Free
 from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds, SecondsOrNever
-from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
 from protocol.bounds import MAX_SEEDS
 
 TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
@@ -116,29 +115,6 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it, which
     prior_share sets.
     """
-
-    def stop_rule(self) -> StopRule:
-        """When training ends."""
-        return StopRule(steps=self.steps, target_return=self.target_return, target_mean_return=self.target_mean_return)
-
-    def checkpoint_policy(self) -> CheckpointPolicy:
-        """When checkpoints are written, and how many are kept."""
-        return CheckpointPolicy(
-            every_s=self.checkpoint_every_s,
-            every_episodes=self.checkpoint_every_episodes,
-            every_updates=self.checkpoint_every_updates,
-            keep=self.keep_checkpoints,
-        )
-
-    def evaluation_settings(self) -> EvaluationSettings:
-        """How often the policy is evaluated, and on which episodes."""
-        return EvaluationSettings(
-            episodes=self.eval_episodes,
-            every_env_steps=self.eval_every,
-            copies=self.eval_copies,
-            max_steps=self.eval_max_steps,
-            seed=self.seed,
-        )
 
     def to_toml(self) -> str:
         """All settings as TOML, in the order of the fields. A setting that is None is written as "none"."""

@@ -13,6 +13,7 @@ from learner.config.algorithm_names import settings_record
 from learner.config.config import TABLES, Config
 from learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
 from learner.config.rollout_config import RolloutConfig
+from learner.config.run_rules import evaluation_size
 from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name
@@ -71,7 +72,7 @@ def validate(config: Config, where: str = "") -> Config:
 
 def check_copies(config: Config, limit: str, most: int) -> None:
     """Raise `UsageError` if `most` env copies (0: any number) are too few for the run. `limit`: what sets this number."""
-    evaluate = min(config.eval_copies, config.evaluation_settings().size().episodes)  # on one worker
+    evaluate = min(config.eval_copies, evaluation_size(config).episodes)  # on one worker
     if 0 < most < config.envs + evaluate:
         raise UsageError(
             f"{limit} {most}: expected at least {config.envs + evaluate}, for {config.envs} env copies and {evaluate} "

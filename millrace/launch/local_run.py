@@ -16,11 +16,11 @@ from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.resumption import Resumption, unless_finished
 from learner.run import (
-    Run,
     RunSetup,
     describe_over,
     known_environment,
     named_environment,
+    open_run,
     prometheus_observer,
     run_folder,
 )
@@ -75,5 +75,5 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
-            Run(setup, endpoint.link, processes, watch, observer).train(workers)
+            open_run(setup, endpoint.link, processes, watch, observer).train(workers)
         return folder.path

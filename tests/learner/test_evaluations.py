@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from learner.algorithms import Algorithm
+from learner.between_updates.evaluations import Evaluations
+from learner.between_updates.run_parts import RunParts
+from learner.between_updates.tally import Tally
 from learner.config.config import Config
-from learner.evaluations import Evaluations
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.atomic_write import Writes
@@ -49,19 +51,21 @@ class Fakes:
     def write_policy(self, policy: Any, env: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
 
-    def evaluations(self, every: int, state: RunState, seed: int = 1) -> Evaluations:
-        settings = Config(eval_every=every, eval_episodes=10, seed=seed).evaluation_settings()
-        parts = cast(RunFolder, self), run_spec(), cast(Algorithm, self), cast(RolloutService, self)
-        return Evaluations(settings, *parts, state, lambda: None)
+    def evaluations(self, every: int, state: RunState, seed: int = 1) -> tuple[Tally, Evaluations]:
+        config = Config(eval_every=every, eval_episodes=10, seed=seed)
+        folder, algorithm, service = cast(RunFolder, self), cast(Algorithm, self), cast(RolloutService, self)
+        tally = Tally(config, run_spec(), state)
+        return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, service, tally), None)
 
 
-def due(evaluations: Evaluations, *env_steps: int) -> list[int]:
+def due(parts: tuple[Tally, Evaluations], *env_steps: int) -> list[int]:
     """Those of these numbers of env steps after which an evaluation is due. They are made."""
     made = []
-    for version, steps in enumerate(env_steps, 1):
-        if evaluations.is_due(steps):
-            evaluations.evaluate_newest(version, steps)
-            made.append(steps)
+    tally, evaluations = parts
+    for tally.state.version, tally.state.env_steps in enumerate(env_steps, 1):
+        if tally.evaluation_is_due():
+            evaluations.evaluate_newest(lambda: None)
+            made.append(tally.state.env_steps)
     return made
 
 
@@ -84,7 +88,10 @@ def test_evaluations_do_not_come_in_bursts_after_a_resume_with_another_eval_ever
 def test_the_final_policy_can_be_the_best_after_a_resume_without_evaluations() -> None:
     fakes = Fakes(7.0, 7.5)
     policy = np.array([-1], np.float32), np.zeros(0, np.float32)
-    best = fakes.evaluations(0, RunState(best=[5.0, 100.0], best_policy=policy)).conclude(9, 4_000, 10.0, None)
+    state = RunState(version=9, env_steps=4_000, best=[5.0, 100.0], best_policy=policy)
+    _, evaluations = fakes.evaluations(0, state)
+    assert evaluations.conclude(lambda: None)
+    best = evaluations.confirmed
     assert best is not None
     assert (best.chosen_by, best.env_steps, best.evaluation.return_mean) == (7.0, 4_000, 7.5)
     assert fakes.written == [-1.0, 1.0]
@@ -95,7 +102,9 @@ def test_no_policy_is_chosen_by_the_episodes_that_evaluate_plays(seed: int) -> N
     fakes = Fakes(1.0, 2.0, 3.0)
     evaluations = fakes.evaluations(100, RunState(), seed)
     assert due(evaluations, 100) == [100]
-    evaluations.conclude(2, 200, 10.0, None)
+    tally, concluded = evaluations
+    tally.state.version, tally.state.env_steps = 2, 200
+    concluded.conclude(lambda: None)
     chosen, final, confirmed = fakes.seeds
     assert chosen == final
     by_command = EvaluationPlan.of(10, EvaluateFlags(run=Path()).seed, 4, 1000).seeds

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from learner.algorithms.ppo import PPO
+from learner.between_updates.between_updates import BetweenUpdates
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
@@ -102,8 +103,8 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         is_finite=lambda: True,
     )
     service = MagicMock(gather=lambda show: arrived)
-    recorder = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
-    train(algorithm, service, recorder, 1)  # type: ignore[arg-type]
+    tally = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
+    train(algorithm, service, BetweenUpdates(tally, MagicMock(), MagicMock(), MagicMock()), 1)  # type: ignore[arg-type]
     (batch,) = batches
     assert batch.lane.tolist() == [0, 1, 2]
     assert batch.fresh.tolist() == [True, False, True]

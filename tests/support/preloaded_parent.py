@@ -37,7 +37,6 @@ LEARNER = (
     "learner.config.command_line",
     "learner.imports_ahead",
     "learner.run",
-    "learner.run_recorder",
     "learner.run_spec",
     "threadpoolctl",
     "learner.train",

@@ -172,7 +172,7 @@ def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
 
 def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is interrupted while its best policy is evaluated again, after its last checkpoint."""
-    monkeypatch.setattr("learner.run_recorder.SHOW_EVERY_S", 0.0)
+    monkeypatch.setattr("learner.between_updates.audience.SHOW_EVERY_S", 0.0)
     settings = {**VARIANTS["ppo"], "target_return": 1.0}
     whole = run(tmp_path / "whole", **settings)
     assert summary(whole)["stop_reason"] == "target return 1 reached"

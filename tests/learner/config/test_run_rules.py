@@ -1,31 +1,31 @@
-"""The small settings records: what they take from the configuration, and what they decide."""
+"""What a run decides by its settings and by numbers."""
 
 from typing import Any
 
 import pytest
 
 from learner.config.config import Config
-from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
+from learner.config.run_rules import checkpoint_is_due, evaluation_size, final_evaluation_size, reason_to_stop
 
 
-def reason(rule: StopRule, **numbers: Any) -> str | None:
+def reason(config: Config, **numbers: Any) -> str | None:
     none = {"env_steps_after_next_update": 0, "evaluation_return": None, "training_return": None}
-    return rule.reason_to_stop(**{**none, **numbers})
+    return reason_to_stop(config, **{**none, **numbers})
 
 
 def test_a_run_ends_when_one_more_update_would_pass_its_steps() -> None:
-    rule = Config(steps=100).stop_rule()
-    assert reason(rule, env_steps_after_next_update=100) is None
-    assert reason(rule, env_steps_after_next_update=101) == "all steps done"
+    config = Config(steps=100)
+    assert reason(config, env_steps_after_next_update=100) is None
+    assert reason(config, env_steps_after_next_update=101) == "all steps done"
 
 
 def test_a_run_ends_when_a_target_is_reached() -> None:
-    rule = Config(target_return=475.0, target_mean_return=300.0).stop_rule()
-    assert reason(rule) is None
-    assert reason(rule, evaluation_return=474.9, training_return=299.9) is None
-    assert reason(rule, evaluation_return=475.0) == "target return 475 reached"
-    assert reason(rule, training_return=300.0) == "mean return 300 of the last episodes reached"
-    assert reason(Config().stop_rule(), evaluation_return=1e9, training_return=1e9) is None
+    config = Config(target_return=475.0, target_mean_return=300.0)
+    assert reason(config) is None
+    assert reason(config, evaluation_return=474.9, training_return=299.9) is None
+    assert reason(config, evaluation_return=475.0) == "target return 475 reached"
+    assert reason(config, training_return=300.0) == "mean return 300 of the last episodes reached"
+    assert reason(Config(), evaluation_return=1e9, training_return=1e9) is None
 
 
 @pytest.mark.parametrize(
@@ -38,6 +38,7 @@ def test_a_run_ends_when_a_target_is_reached() -> None:
         ({"checkpoint_every_episodes": 10}, {"episodes_since_last": 10}, True),
         ({"checkpoint_every_updates": 3}, {"updates": 8}, False),
         ({"checkpoint_every_updates": 3}, {"updates": 9}, True),
+        ({"checkpoint_every_updates": 3}, {"updates": 0}, False),
         ({}, {"updates": 1}, True),
     ],
 )
@@ -45,15 +46,7 @@ def test_a_checkpoint_is_due_after_the_first_update_and_by_time_episodes_or_upda
     settings: dict[str, Any], numbers: dict[str, Any], due: bool
 ) -> None:
     none: dict[str, Any] = {"since_last_s": 0.0, "episodes_since_last": 0, "updates": 2}
-    assert Config(**settings).checkpoint_policy().is_due(**{**none, **numbers}) is due
-
-
-def test_records_take_their_settings_from_the_configuration() -> None:
-    config = Config(keep_checkpoints=7, eval_episodes=5, eval_every=1000, seed=3)
-    assert config.checkpoint_policy() == CheckpointPolicy(every_s=60.0, every_episodes=0, every_updates=0, keep=7)
-    assert config.evaluation_settings() == EvaluationSettings(
-        episodes=5, every_env_steps=1000, copies=4, max_steps=1_000_000, seed=3
-    )
+    assert checkpoint_is_due(Config(**settings), **{**none, **numbers}) is due
 
 
 @pytest.mark.parametrize(
@@ -84,9 +77,9 @@ def test_the_evaluation_after_training_takes_three_quarters_of_its_env_steps_or_
     time_limit: int | None,
     size: tuple[int, int],
 ) -> None:
-    assert Config(**settings).evaluation_settings().final_size(env_steps, episode_length, time_limit) == size
+    assert final_evaluation_size(Config(**settings), env_steps, episode_length, time_limit) == size
 
 
 def test_during_training_evaluations_have_a_hundred_episodes_or_as_many_as_are_set() -> None:
-    assert Config().evaluation_settings().size() == (100, 1_000_000)
-    assert Config(eval_episodes=7, eval_max_steps=50).evaluation_settings().size() == (7, 50)
+    assert evaluation_size(Config()) == (100, 1_000_000)
+    assert evaluation_size(Config(eval_episodes=7, eval_max_steps=50)) == (7, 50)

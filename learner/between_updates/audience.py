@@ -1,0 +1,190 @@
+"""Tells how far a run is: its callbacks (the terminal is one of them), `millrace status`, Prometheus, a dataset of episodes.
+
+Rule: what is told was counted before, and stands in a row of the metrics. What callbacks log is added to the row of the
+newest update, also if one of them raises. `on_checkpoint` follows a checkpoint, so what it asks for may not be in it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from learner.between_updates.run_files import RunFiles
+from learner.between_updates.run_parts import RunParts
+from learner.callbacks.callbacks import Callbacks
+from learner.recording.training_recorder import TrainingRecorder
+from learner.rollouts.hub import HubSnapshot
+from learner.rollouts.lanes import AcceptedRollout
+from learner.run_folder.progress import Progress, Row, named, steps_per_second
+from learner.run_folder.requests import Requests
+from protocol.arrays import Array
+from protocol.logs.notices import log_notice
+
+log = logging.getLogger("millrace.learner")
+
+SHOW_EVERY_S = 0.2  # progress between two updates
+
+
+class Audience:
+    """All that watch one run."""
+
+    def __init__(
+        self,
+        run: RunParts,
+        callbacks: Callbacks,
+        files: RunFiles,
+        requests: Requests,
+        dataset: TrainingRecorder | None,
+    ) -> None:
+        """`requests`: what callbacks ask for. `dataset` gets the episodes of training. It is closed with the audience."""
+        self._config, self._service, self._tally, self._state = run.config, run.service, run.tally, run.tally.state
+        self._callbacks, self._files, self._requests, self._dataset = callbacks, files, requests, dataset
+        self._settings = msgspec.to_builtins(run.config)
+        self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
+        self._workers_alive = 0
+        self._shown_s = 0.0
+        self._said_missing = False  # whether facts were looked for in the first episodes
+        self._finished = False
+        files.on_saved = self.checkpoint_written
+
+    def start(self) -> None:
+        """The run begins, or goes on, and workers have joined."""
+        self._callbacks.on_start(self.progress())
+
+    def cloned(self, metrics: Mapping[str, float]) -> None:
+        """The policy was cloned, with these metrics."""
+        found = ", ".join(f"{name.rpartition('/')[2].replace('_', ' ')} {number:.3g}" for name, number in metrics.items())
+        epochs: int = getattr(self._config.algorithm, "clone_epochs", 0)
+        log_notice(log, f"cloned {self._config.prior} in {epochs} epochs: {found}")
+        self._files.write_row(self.progress(), metrics)
+
+    def show_now(self) -> None:
+        """Show how far an evaluation is, or what a long wait is for, now and then."""
+        now = time.monotonic()
+        if now - self._shown_s >= SHOW_EVERY_S:
+            self._shown_s = now
+            self._callbacks.meanwhile(self.progress())
+
+    def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
+        """These rollouts have come. True if an update is to be made of them: no callback ends the run.
+
+        Their episodes are recorded, if the run records episodes.
+        """
+        began_s = time.monotonic()
+        if self._callbacks.wants("on_rollouts"):
+            progress = msgspec.structs.replace(self.progress(), rollouts=tuple(one.rollout for one in rollouts))
+            self._callbacks.on_rollouts(progress)
+            if self._callbacks.stop_reason is not None:
+                return False
+        if self._dataset is not None:
+            self._dataset.add(rollouts)
+        self._tally.gathered_s = time.monotonic() - began_s
+        return True
+
+    def updated(self, metrics: Mapping[str, float]) -> None:
+        """The update that was counted last was published."""
+        self._say_missing_facts()
+        self._workers_alive = self._service.workers_alive()
+        snapshot = self._service.snapshot()
+        self._update = {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
+        progress = self._progress(snapshot)
+        self._write_row(progress, metrics)
+        try:
+            self._callbacks.on_update(progress)
+        finally:
+            self._write_logged()
+
+    def evaluated(self, metrics: Row | None = None) -> None:
+        """The newest policy was evaluated. Without `metrics`, its update's row gets only what callbacks log."""
+        progress = self.progress()
+        if metrics is not None:
+            self._write_row(progress, metrics)
+        try:
+            self._callbacks.on_evaluation(progress)
+        finally:
+            self._write_logged()
+
+    def checkpoint_written(self) -> None:
+        """A checkpoint was written."""
+        if self._callbacks.wants("on_checkpoint"):
+            self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"
+            try:
+                self._callbacks.on_checkpoint(self.progress())
+            finally:
+                self._requests.closed = ""
+
+    def finish(self, reason: str, *, cut_short: bool = False) -> None:
+        """The run has ended, and its summary is written. Does nothing if that was done.
+
+        `cut_short`: an error or an interrupt ended the run. Otherwise raises `RunError` if the summary cannot be written.
+        """
+        if not self._finished:
+            self._files.write_summary(reason, cut_short=cut_short)
+            self._finished = True
+            self._requests.closed = "the run has ended"
+            self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
+
+    def close(self) -> None:
+        """Close the dataset if episodes were recorded. Also for a run that was cut short."""
+        if self._dataset is not None:
+            log.warning("%s", self._dataset.close())
+
+    def env_attributes(self) -> Array | None:
+        """The attributes of env copies that callbacks have set, for the weights of this version."""
+        return self._requests.attributes.table(self._state.version)
+
+    def progress(self) -> Progress:
+        """The progress of the run."""
+        return self._progress(self._service.snapshot())
+
+    # ---------------------------------------------------------------- inside
+
+    def _progress(self, snapshot: HubSnapshot) -> Progress:
+        state, tally, wall_s, lags = self._state, self._tally, self._tally.wall_s(snapshot), snapshot.lags or [0]
+        return Progress(
+            run=self._files.path,
+            env_steps=state.env_steps,
+            total_steps=self._config.steps,
+            updates=state.version,
+            wall_s=wall_s,
+            steps_per_s=steps_per_second(state.env_steps - tally.steps_before, wall_s - tally.wall_before_s),
+            return_mean=tally.window.return_mean,
+            length_mean=tally.window.length_mean,
+            facts=tally.window.facts,
+            lag_mean=sum(lags) / len(lags),
+            lag_max=max(lags),
+            workers_alive=self._workers_alive,
+            workers_expected=self._service.workers_expected,
+            ledger=snapshot.ledger.counts(),
+            stages=tally.stages(snapshot),
+            note=tally.note,
+            waiting=snapshot.waiting,
+            settings=self._settings,
+            episodes=tally.new_episodes,
+            evaluation=state.newest_evaluation,
+            checkpoint=self._files.checkpoint,
+            requests=self._requests,
+            **self._update,
+        )
+
+    def _write_row(self, progress: Progress, metrics: Row) -> None:
+        self._files.write_row(progress, metrics)
+        self._service.report(progress)
+
+    def _write_logged(self) -> None:
+        """Add what callbacks logged to the row of this update, if there was one."""
+        if (logged := self._requests.take_logged()) and self._state.version:
+            self._files.write_row(self.progress(), logged)
+
+    def _say_missing_facts(self) -> None:
+        """Say once which facts no episode had: perhaps they are called otherwise."""
+        window = self._tally.window
+        if window.full and not self._said_missing:
+            self._said_missing = True
+            if names := [name for name, fact in window.facts.items() if fact.mean is None]:
+                last = "none of the last 100 episodes had it in the info of its last step"
+                log.warning("info_keys %s: %s; is it called so?", ", ".join(names), last)

@@ -1,0 +1,122 @@
+"""Evaluations of one run: each version at most once, the best policy kept, and that one evaluated again at the end.
+
+The highest of several evaluations is biased upwards. So the summary reports the best policy by a
+second evaluation, on other episodes.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from learner.between_updates.run_parts import RunParts
+from learner.config.run_rules import EvaluationSize, evaluation_size, final_evaluation_size
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.run_folder.results import Best, Evaluation
+from protocol.errors import UsageError
+from protocol.logs.notices import log_notice
+from protocol.random_streams import Purpose
+
+log = logging.getLogger("millrace.learner")
+
+
+class Evaluations:
+    """Greedy evaluations of the newest policy, and the best policy so far."""
+
+    def __init__(self, run: RunParts, time_limit: int | None) -> None:
+        """`time_limit`: env steps after which an episode of an evaluation is truncated, if any."""
+        self.confirmed: Best | None = None
+        """The best policy and its second evaluation, once the run was concluded."""
+        self._run, self._config, self._time_limit = run, run.config, time_limit
+        self._tally, self._state = run.tally, run.tally.state
+        self.write_best()  # the folder may have that of a later version, which was lost
+
+    def evaluate_newest(self, watch: Callable[[], None]) -> dict[str, float | None]:
+        """Make the evaluation that is due, of the newest policy. Returns its metrics.
+
+        `watch` is called several times a second during an evaluation.
+        """
+        found = self._evaluate_newest(evaluation_size(self._config), watch)
+        self._keep_if_best(found)
+        self._tally.evaluated()
+        return found.metrics()
+
+    def conclude(self, watch: Callable[[], None]) -> bool:
+        """Evaluate the final policy. If the run kept a best policy, evaluate that one too, on other episodes: `confirmed`.
+
+        Returns whether the final policy had no such evaluation before.
+        """
+        state, before = self._state, self.of_newest()
+        size = final_evaluation_size(self._config, state.env_steps, self._tally.window.length_mean, self._time_limit)
+        if size != (usual := evaluation_size(self._config)):
+            log_notice(log, _smaller(size, usual))
+        found = self._evaluate_newest(size, watch)
+        if self._config.eval_every or state.best is not None:  # best: of a run that was resumed with eval_every 0
+            self._keep_if_best(found)
+        self.confirmed = self._confirm(size, watch)
+        return found is not before
+
+    def write_best(self) -> None:
+        """Write the best policy into the run folder, if it is known."""
+        if self._state.best_policy is None:
+            return
+        (parameters, buffers), spec, folder = self._state.best_policy, self._run.spec, self._run.folder
+        folder.writes.write(
+            "best policy",
+            lambda: folder.write_policy(spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked),
+        )
+
+    def of_newest(self) -> Evaluation | None:
+        """The evaluation of the newest policy, if there is one."""
+        state = self._state
+        return state.newest_evaluation if state.evaluated_version == state.version else None
+
+    def _confirm(self, size: EvaluationSize, watch: Callable[[], None]) -> Best | None:
+        """Evaluate the best policy again, if the run kept one."""
+        state = self._state
+        if state.best is None:
+            return None
+        if state.best_policy is None:
+            try:
+                _, parameters, buffers = self._run.folder.read_policy("best")
+            except UsageError as error:
+                log.warning("%s", error)
+                return None
+            state.best_policy = parameters, buffers
+        chosen_by, at_env_steps = state.best
+        self._run.service.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
+        confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
+        return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
+
+    def _evaluate_newest(self, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
+        """Evaluate the newest policy; the same version is not evaluated twice."""
+        state, found = self._state, self.of_newest()
+        if found is None or found.episodes != size.episodes:
+            state.newest_evaluation = found = self._evaluate(Purpose.EVALUATION, size, watch)
+            state.evaluated_version = state.version
+            self._tally.note = f"{state.env_steps:,} env steps: greedy {found}"
+        return found
+
+    def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
+        """Evaluate the weights that were published last."""
+        config, began_s = self._config, time.monotonic()
+        plan = EvaluationPlan.of(size.episodes, config.seed, config.eval_copies, size.max_steps, purpose)
+        found = self._run.service.evaluate(plan, lambda played, env_steps: watch())
+        self._tally.evaluate_s += time.monotonic() - began_s
+        return found
+
+    def _keep_if_best(self, found: Evaluation) -> None:
+        """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""
+        state = self._state
+        if state.best is None or found.return_mean > state.best[0]:
+            state.best = [found.return_mean, state.env_steps]
+            state.best_policy = self._run.algorithm.weights()
+            self.write_best()
+
+
+def _smaller(size: EvaluationSize, usual: EvaluationSize) -> str:
+    """Says that an evaluation is smaller than usual."""
+    steps = f" and at most {size.max_steps:,} env steps" if size.max_steps < usual.max_steps else ""
+    why = "because the training was short; --eval-episodes sets another number"
+    return f"the evaluation has {size.episodes} episodes{steps}, {why}"

@@ -1,0 +1,217 @@
+"""Writes the files of a run: rows of metrics, checkpoints, policies, the summary. It makes them again if they were deleted.
+
+Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
+If the disk is full, the run logs a warning and goes on; at its end, it fails if the disk does not take its last state.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import shlex
+import time
+from collections.abc import Callable
+
+import msgspec
+
+from learner.algorithms.algorithm import check_weights
+from learner.between_updates.evaluations import Evaluations
+from learner.between_updates.run_parts import RunParts
+from learner.recording.image_sample import image_samples
+from learner.run_folder import checkpoint
+from learner.run_folder.env_attributes import EnvAttributes
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.progress import Progress, Row, steps_per_second
+from learner.run_folder.results import Summary
+from learner.run_folder.run_format import versions
+from protocol.arrays import Floats
+from protocol.bounds import one_line
+from protocol.errors import RunError, first_line
+from protocol.rollout import Batch
+
+log = logging.getLogger("millrace.learner")
+
+
+class RunFiles:
+    """The files of one run."""
+
+    def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
+        """Removes the rows of updates that the checkpoint of a resumed run knows nothing of. Raises `RunError`."""
+        self._config, self._spec, self._folder, self._algorithm, self._service, self._tally = run
+        self._state, self._evaluations, self._attributes = run.tally.state, evaluations, attributes
+        self.path = one_line(str(run.folder.path))
+        self.checkpoint = ""
+        """Path of the newest checkpoint that this process has written."""
+        self.longest_save_s = 0.0
+        """How long the longest checkpoint took to write, in this process."""
+        self.on_saved: Callable[[], None] = lambda: None
+        """Called after a checkpoint was written."""
+        self._metrics = MetricsLog(run.folder.path, self._state.env_steps)
+        self._saved: tuple[int, int, list[float] | None, int] | None = None  # what `_position` was in the newest checkpoint
+        self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
+
+    def weights(self) -> tuple[Floats, Floats]:
+        """The parameters and buffers of the algorithm. Raises `UsageError` if no worker could act with them."""
+        weights = self._algorithm.weights()
+        check_weights(weights, self._spec.policy, type(self._algorithm).__name__)
+        return weights
+
+    def write_row(self, progress: Progress, metrics: Row) -> None:
+        """Write a row of metrics, or add these metrics to the newest row if that is of the same update."""
+        writes = self._folder.writes
+        if self._metrics.gone:
+            writes.write("folder", self._make_folder_again)
+        self._metrics.write(progress, metrics)
+        writes.write("metrics", self._metrics.flush)
+
+    def write_images(self, batch: Batch) -> None:
+        """Write what the policy sees in the batch of the first update."""
+        if self._state.version == 1:
+            images = image_samples(batch.obs, self._spec.policy.observation)
+            self._folder.writes.write("images", lambda: self._folder.write_images(images))
+
+    def save(self) -> None:
+        """Write a checkpoint and the policy. Raises `RunTakenOver` if another process trains this run now."""
+        self._confirm_lock()
+        began_s = time.monotonic()
+        self._folder.writes.write("state", self._write_state)
+        self._tally.saved(began_s)
+        took_s, grace_s = time.monotonic() - began_s, self._config.grace_s
+        if grace_s and self.longest_save_s <= grace_s < took_s:  # said once
+            log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", took_s, grace_s)
+        self.longest_save_s = max(self.longest_save_s, took_s)
+        if self._saved == self._position():
+            self.on_saved()
+
+    def save_if_due(self) -> None:
+        """Write a checkpoint and the policy if one is due."""
+        if self._tally.checkpoint_is_due():
+            self.save()
+
+    def save_unless_saved(self) -> None:
+        """Write a checkpoint and the policy, unless the newest checkpoint already has this state."""
+        if self._saved != self._position():
+            self.save()
+
+    def save_after_error(self, error: BaseException) -> None:
+        """As `save_unless_saved` and `confirm_saved`. What a callback raises is logged: `error` ended the run, and counts.
+
+        Raises `RunError` if the disk refuses the state and `error` says no failure, as Ctrl-C.
+        """
+        try:
+            self.save_unless_saved()
+        except Exception as raised:
+            if self._saved != self._position():
+                raise
+            log.warning("%s: %s", type(raised).__name__, first_line(raised))
+        try:
+            self.confirm_saved()
+        except RunError as refused:
+            if not isinstance(error, Exception):
+                raise
+            log.warning("%s", refused)
+
+    def confirm_saved(self) -> None:
+        """The last save: what the disk has refused is tried again for a while. Raises `RunError` if it stays refused.
+
+        Raises `RunTakenOver`, as `save` does.
+        """
+        self._confirm_lock()
+        before = self._saved
+        self._folder.writes.confirm()
+        if self._saved != before:
+            self.on_saved()
+
+    def write_summary(self, reason: str, *, cut_short: bool) -> None:
+        """Write why the run ended, and its results. Raises `RunError` if the disk refuses that and it is not `cut_short`."""
+        self._folder.writes.write("summary", lambda: self._folder.write_summary(self._summary(reason, cut_short)))
+        if not cut_short:
+            self._folder.writes.confirm()
+
+    def continues(self) -> str:
+        """One line that says where a resumed run continues, and which updates are lost."""
+        state, lost = self._state, self._metrics.removed
+        line = f"run {self._folder.path} continues at {state.env_steps:,} env steps, after update {state.version:,}"
+        if lost:
+            line += f"; {lost:,} later update{'s were' if lost > 1 else ' was'} not saved, and must be made again"
+        return line
+
+    def saved(self) -> str:
+        """One line that says what can be resumed, and where; empty if nothing was learned yet."""
+        if not self._state.version:
+            return ""
+        where = shlex.quote(str(self._folder.path))
+        if self._saved_env_steps is None:
+            return f"no checkpoint could be written to {where}"
+        newest = f"{self._saved_env_steps:,} env steps are saved"
+        if self._policy_env_steps not in (None, self._saved_env_steps):
+            newest += f", and the policy of {self._policy_env_steps:,}"
+        return f"{newest}; go on with: --resume {where}"
+
+    def close(self) -> None:
+        """Close the metrics. Also for a run that was cut short."""
+        self._metrics.close()
+
+    # ---------------------------------------------------------------- inside
+
+    def _make_folder_again(self) -> None:
+        """Make the run folder again if it was deleted or renamed. Raises `RunError` if that is not possible."""
+        if self._folder.is_gone():
+            self._saved = self._saved_env_steps = self._policy_env_steps = None
+            self._tally.saved(-math.inf)  # so that one is due now
+            log.warning("%s", self._folder.make_again(self._config))
+            self._evaluations.write_best()
+
+    def _write_state(self) -> None:
+        """Write the policy and a checkpoint. Raises `RunError` if the disk refuses one of them; the other one is written."""
+        self._make_folder_again()
+        spec, env_steps, snapshot = self._spec, self._state.env_steps, self._service.snapshot()
+        state = msgspec.structs.replace(
+            self._state,
+            wall_s=self._tally.wall_s(snapshot),
+            ledger=snapshot.ledger,
+            incarnations=snapshot.incarnations,
+            episodes=self._tally.window.state(),
+            facts=list(spec.facts),
+            env_attributes=self._attributes.state(self._state.version),
+        ).checkpoint_content(self._algorithm)
+        try:
+            self._folder.write_policy(spec.policy, spec.env, *self.weights(), facts=spec.facts, masked=spec.masked)
+            self._policy_env_steps = env_steps
+        finally:
+            path = checkpoint.save(self._folder.path, state, env_steps, self._config.keep_checkpoints)
+            self.checkpoint = one_line(str(path))
+            self._saved, self._saved_env_steps = self._position(), env_steps
+
+    def _confirm_lock(self) -> None:
+        if self._folder.lock is not None:
+            self._folder.lock.confirm()
+
+    def _position(self) -> tuple[int, int, list[float] | None, int]:
+        """What of the state changes when the run goes on: version, next evaluation, best policy, set attributes."""
+        state = self._state
+        return state.version, state.next_evaluation, state.best, self._attributes.changes
+
+    def _summary(self, reason: str, cut_short: bool) -> Summary:
+        config, state, tally, snapshot = self._config, self._state, self._tally, self._service.snapshot()
+        wall_s = tally.wall_s(snapshot)
+        return Summary(
+            env=config.env,
+            algo=config.algo,
+            seed=config.seed,
+            env_steps=state.env_steps,
+            updates=state.version,
+            wall_s=wall_s,
+            env_steps_per_s=steps_per_second(state.env_steps, wall_s),
+            stop_reason=reason,
+            cut_short=cut_short,
+            return_mean_100=tally.window.return_mean,
+            facts_100=tally.window.facts,
+            evaluation=self._evaluations.of_newest(),
+            best=self._evaluations.confirmed,
+            ledger=snapshot.ledger.counts(),
+            lags=self._service.lag_histogram(),
+            first_use_s=self._service.first_use_s(),
+            stages=tally.stages(snapshot),
+            versions=versions(),
+        )

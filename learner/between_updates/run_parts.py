@@ -1,0 +1,23 @@
+"""What every object between two updates works on. `learner.run` makes it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from learner.algorithms import Algorithm
+from learner.between_updates.tally import Tally
+from learner.config.config import Config
+from learner.rollout_service.service import RolloutService
+from learner.run_folder.run_folder import RunFolder
+from protocol.specs import RunSpec
+
+
+class RunParts(NamedTuple):
+    """The parts of one run."""
+
+    config: Config
+    spec: RunSpec
+    folder: RunFolder
+    algorithm: Algorithm
+    service: RolloutService
+    tally: Tally

@@ -1,0 +1,119 @@
+"""Counts what one run has made, and decides by the counts when it ends, and when an evaluation or a checkpoint is due.
+
+Rule: no files and no sockets. A decision depends on counts alone, so that every run of these settings makes the same ones;
+only a checkpoint may also be due by time. The seconds of evaluations are a stage of their own and do not count as training.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from learner.config.config import Config
+from learner.config.run_rules import checkpoint_is_due, reason_to_stop
+from learner.rollouts.hub import HubSnapshot
+from learner.run_folder.episode_window import EpisodeWindow
+from learner.run_state import RunState
+from protocol.rollout import Batch, Episode
+from protocol.specs import RunSpec
+
+
+class Tally:
+    """What one run has made so far."""
+
+    def __init__(
+        self,
+        config: Config,
+        spec: RunSpec,
+        state: RunState,
+        ended_by: Callable[[], str | None] = lambda: None,
+    ) -> None:
+        """`state`: where the run stands. `ended_by`: why a callback has ended the run, or None."""
+        self.state = state
+        """Also the evaluations change it. A checkpoint adds what others hold."""
+        self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
+        self.new_episodes: tuple[Episode, ...] = ()
+        """Those that ended in the rollouts of the last update."""
+        due_at = state.env_steps + config.eval_every
+        state.next_evaluation = min(state.next_evaluation or due_at, due_at)
+        self.note = ""
+        """The newest evaluation as one line of text for the user."""
+        self.gathered_s = 0.0
+        """Seconds that callbacks and the dataset took for the rollouts of the next update."""
+        self.evaluate_s = 0.0
+        """Seconds of the evaluations that this process has made."""
+        self._ended_by = ended_by
+        self._config, self._steps_per_update = config, spec.rollout_steps * config.envs
+        self._stages_s = {"update": 0.0, "other": 0.0}
+        self.wall_before_s, self.steps_before = state.wall_s, state.env_steps
+        self._started_s = self._saved_s = time.monotonic()
+        self._episodes_since_save = 0
+
+    def count(self, batch: Batch) -> None:
+        """An update was made of this batch."""
+        self.state.version += 1
+        self.state.env_steps += batch.env_steps
+        self.window.extend(batch.episodes)
+        self.new_episodes = batch.episodes
+        self._episodes_since_save += len(batch.episodes)
+
+    def stop_reason(self) -> str | None:
+        """Why the run should end now, or None."""
+        state, newest = self.state, self.state.newest_evaluation
+        return self._ended_by() or reason_to_stop(
+            self._config,
+            env_steps_after_next_update=state.env_steps + self._steps_per_update if state.version else 0,
+            evaluation_return=None if newest is None else newest.return_mean,
+            training_return=self.window.return_mean if self.window.full else None,
+        )
+
+    def training_goes_on(self) -> bool:
+        """Whether the next rollouts may be collected now: no evaluation is due, and the run does not end."""
+        return not self.evaluation_is_due() and self.stop_reason() is None
+
+    # ---------------------------------------------------------------- evaluations and checkpoints
+
+    def evaluation_is_due(self) -> bool:
+        """Whether an evaluation is due. None is, once a callback has ended the run."""
+        due = self._config.eval_every and self.state.env_steps >= self.state.next_evaluation
+        return bool(due) and self._ended_by() is None
+
+    def evaluated(self) -> None:
+        """The evaluation that was due is made. The next one is due at the next multiple that is not reached yet."""
+        every, state = self._config.eval_every, self.state
+        state.next_evaluation += every * (1 + (state.env_steps - state.next_evaluation) // every)
+
+    def checkpoint_is_due(self) -> bool:
+        """Whether a checkpoint is due now. Before the first update, the time alone asks for one."""
+        since_s, episodes = time.monotonic() - self._saved_s, self._episodes_since_save
+        updates = self.state.version
+        return checkpoint_is_due(self._config, since_last_s=since_s, episodes_since_last=episodes, updates=updates)
+
+    def saved(self, began_s: float) -> None:
+        """A checkpoint was begun at this time, and is written, or refused by the disk. -inf: all are gone, so one is due."""
+        self._saved_s, self._episodes_since_save = began_s, 0
+
+    # ---------------------------------------------------------------- seconds
+
+    @contextmanager
+    def after_update(self, update_s: float) -> Iterator[None]:
+        """Count the seconds of an update and of the body, which follows it. `update_s`: seconds since its rollouts had come.
+
+        Those that callbacks and the dataset took for the rollouts are among them, and do not count as the update's own.
+        """
+        self._stages_s["update"] += update_s - self.gathered_s
+        self._stages_s["other"] += self.gathered_s
+        began_s, evaluate_s = time.monotonic(), self.evaluate_s
+        yield
+        self._stages_s["other"] += time.monotonic() - began_s - (self.evaluate_s - evaluate_s)
+
+    def stages(self, snapshot: HubSnapshot) -> dict[str, float]:
+        """Seconds in each stage: of the learner, and of all workers together, from their last heartbeats."""
+        stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self._stages_s.items()}
+        stages |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}
+        return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
+
+    def wall_s(self, snapshot: HubSnapshot) -> float:
+        """Seconds of training."""
+        return self.wall_before_s + time.monotonic() - self._started_s - snapshot.evaluate_s
