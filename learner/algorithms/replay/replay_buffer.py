@@ -130,7 +130,7 @@ class ReplayBuffer:
         """
         self._content = observation, size, alpha is not None, action
         self.size = size  # slots
-        self._check_memory()
+        check_fits_memory(*self._content)
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
         self._n_step, self._gamma, self._alpha, self._seed = n_step, gamma, alpha, seed
@@ -183,11 +183,15 @@ class ReplayBuffer:
         slot = written % self.size
         if batch.mask is not None:
             obs.append(batch.mask[:, columns])
-        self._keep(slot[needed], self._per_observation())
+        new = slot[needed]
+        self._keep(new, self._per_observation())
         self._keep(slot[0][continues], ())
-        self._clear(slot[needed])
+        self._rows -= int(np.count_nonzero(self._is_row[new]))
+        self._is_row[new] = False
+        if self._tree is not None:
+            self._tree.set(new, 0.0)
         for kept, leaf in zip(self._per_observation(), obs, strict=True):
-            kept[slot[needed]] = leaf[needed]
+            kept[new] = leaf[needed]
         rows = slot[:-1][valid]
         self._action[rows] = batch.action[:, columns][valid]
         self._reward[rows] = batch.reward[:, columns][valid]
@@ -200,12 +204,9 @@ class ReplayBuffer:
         ended = terminated[-1] | batch.truncated[-1, columns] | ~valid[-1]
         self._newest[lane] = np.where(ended, NO_SLOT, written[-1])
 
-    def _check_memory(self, choices: int = 0) -> None:
-        check_fits_memory(*self._content, choices)
-
     def _make_mask(self, choices: int) -> None:
         if self._mask is None:
-            self._check_memory(choices)
+            check_fits_memory(*self._content, choices)
             self.bytes = memory_bytes(*self._content, choices)
             self._mask = np.ones((self.size, choices), bool)
 
@@ -226,12 +227,6 @@ class ReplayBuffer:
             same = kept[newest % self.size] == leaf
             continues &= same.reshape(len(leaf), -1).all(1)
         return continues, newest
-
-    def _clear(self, slots: Ints) -> None:
-        self._rows -= int(np.count_nonzero(self._is_row[slots]))
-        self._is_row[slots] = False
-        if self._tree is not None:
-            self._tree.set(slots, 0.0)
 
     # ---------------------------------------------------------------- reading
 
