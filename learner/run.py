@@ -30,7 +30,7 @@ from learner.members.describe_coordinator import Accept
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.prior_dataset import PriorDataset
 from learner.recording.training_recorder import TrainingRecorder
-from learner.resumption import Resumption, check_spaces
+from learner.resume_checks import Resumption, check_spaces
 from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.lease import Closed, Listens

@@ -15,7 +15,7 @@ import msgspec
 from learner.algorithms import Algorithm
 from learner.algorithms.algorithm import Start
 from learner.config.config import Config
-from learner.resumption import first_difference, policy_to_start_from
+from learner.resume_checks import first_difference, policy_to_start_from
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import AttributesState, EnvAttributes

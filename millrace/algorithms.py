@@ -88,7 +88,7 @@ from learner.config.hyperparameters import (
     SACConfig,
     TD3Config,
 )
-from learner.config.on_resume import Adaptable, Fixed, Free
+from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.errors import UsageError
 from protocol.policy.features import features, normalize
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, trainable

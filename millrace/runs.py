@@ -18,9 +18,9 @@ from learner.config.config import Config
 from learner.config.layers import config_of_run, resolve
 from learner.recording.record import RecordedDataset
 from learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
+from learner.run_folder.newest_run import AUTO, newest_run
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, Progress
 from learner.run_folder.results import Evaluation, Summary
-from learner.run_folder.resume import AUTO, newest_run
 from learner.run_folder.run_folder import RunFolder
 from millrace.arguments import checked
 from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record

@@ -15,7 +15,7 @@ from learner.config.command_line import RunFlags
 from learner.config.config import Config
 from learner.config.flag_help import BASIC, GROUPS, field_texts
 from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.on_resume import OnResume, declared
+from learner.config.resume_rules import OnResume, declared
 from website.tables import anchored
 
 HEAD = """# Settings

@@ -17,7 +17,7 @@ import tomli_w
 
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
-from learner.config.on_resume import declared
+from learner.config.resume_rules import declared
 from protocol.bounds import one_line
 from protocol.envs.found_names import attribute, importable, last_part
 from protocol.errors import UsageError, did_you_mean, first_line

@@ -12,7 +12,7 @@ from learner.config.flag_parser import parse_flags
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, PPOConfig, algorithms_with
 from learner.config.layers import lower_layers, override
 from learner.config.validation import validate
-from learner.run_folder.resume import AUTO, newest_run
+from learner.run_folder.newest_run import AUTO, newest_run
 from protocol.errors import UsageError
 
 

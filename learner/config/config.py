@@ -15,7 +15,7 @@ from msgspec import Meta
 from tyro.conf import UseAppendAction, arg
 
 from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
-from learner.config.on_resume import Fixed, Free
+from learner.config.resume_rules import Fixed, Free
 from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds, SecondsOrNever
 from protocol.bounds import MAX_SEEDS
 

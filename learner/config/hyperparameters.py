@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from learner.config.on_resume import Fixed, Free
+from learner.config.resume_rules import Fixed, Free
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -24,7 +24,7 @@ class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Settings that every algorithm has. The record of each algorithm derives from this one.
 
     Every field has a default. Its type says which values are allowed, and what becomes of another value when a run is
-    resumed: `Free[...]`, `Adaptable[...]` or `Fixed[...]` (learner/config/on_resume.py).
+    resumed: `Free[...]`, `Adaptable[...]` or `Fixed[...]` (learner/config/resume_rules.py).
     """
 
     rollout_steps: Free[Count] = 128

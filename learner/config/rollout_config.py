@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 from tyro.conf import Positional, UseAppendAction
 
-from learner.config.on_resume import Adaptable, Fixed, Free
+from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
 from protocol.specs import ImagesDtype, Vector
 from protocol.wire.weight_dtypes import WeightsDtype

@@ -20,7 +20,7 @@ from learner.config.validation import workers_to_wait_for
 from learner.interrupts import Interrupts
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
-from learner.resumption import Resumption
+from learner.resume_checks import Resumption
 from learner.rollout_service.service import describe_settings
 from learner.run import RunSetup, known_environment, open_run, prometheus_observer, run_folder
 from learner.torch_setup import one_thread, torch_device

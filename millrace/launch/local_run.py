@@ -14,7 +14,7 @@ from learner.config.config import Config
 from learner.config.validation import check_copies, idle_workers, workers_to_wait_for
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
-from learner.resumption import Resumption, unless_finished
+from learner.resume_checks import Resumption, unless_finished
 from learner.run import (
     RunSetup,
     describe_over,

@@ -15,7 +15,7 @@ from learner.between_updates.between_updates import BetweenUpdates
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
-from learner.resumption import unless_finished
+from learner.resume_checks import unless_finished
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint

@@ -15,7 +15,7 @@ from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.replay.continuous import Continuous
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.resumption import unless_finished
+from learner.resume_checks import unless_finished
 from learner.run_folder import checkpoint
 from learner.run_folder.run_folder import RunFolder, Which
 from learner.run_state import RunState, start_from

@@ -22,7 +22,7 @@ from protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescri
 from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack
 from protocol.wire.worker_link import WorkerLink
-from tests.learner.config.test_on_resume import content
+from tests.learner.config.test_resume_rules import content
 from tests.support import preloaded
 from tests.system.processes import ROOT, START_S, Stage, crowding, free_port, wait_for
 from tests.system.runs import finish

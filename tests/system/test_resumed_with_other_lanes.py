@@ -16,7 +16,7 @@ from learner.run_folder.metrics_log import read_rows
 from millrace.launch.local_run import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
-from tests.learner.config.test_on_resume import content
+from tests.learner.config.test_resume_rules import content
 from tests.system.run_folders import summary
 from tests.system.test_local_run import assert_balanced
 

@@ -20,7 +20,7 @@ from learner.config.layers import resolve
 from learner.run_folder.lease import Owner
 from learner.run_folder.run_lock import LOCK_FILE
 from millrace.launch.local_run import train
-from tests.learner.config.test_on_resume import content
+from tests.learner.config.test_resume_rules import content
 from tests.system.processes import SMALL, START_S, TOY, Learner, Stage, free_port
 
 WITHOUT_FLOCK = """

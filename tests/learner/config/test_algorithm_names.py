@@ -19,10 +19,10 @@ from learner.config.command_line import RunFlags, read_config
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.layers import config_from_toml, config_of_run, resolve
-from learner.config.on_resume import Free, OnResume, declared
+from learner.config.resume_rules import Free, OnResume, declared
 from learner.report.curve import algorithm_label
-from learner.resumption import check_settings
-from learner.run_folder.resume import newest_run
+from learner.resume_checks import check_settings
+from learner.run_folder.newest_run import newest_run
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import UsageError
 
@@ -32,7 +32,7 @@ from typing import Literal
 
 from learner.algorithms import Algorithm
 from learner.config.hyperparameters import AlgorithmConfig
-from learner.config.on_resume import Free
+from learner.config.resume_rules import Free
 
 
 class Base(Algorithm):

@@ -37,10 +37,10 @@ from learner.config.layers import resolve
 from learner.env_spaces import EnvSpaces
 from learner.report.learning_curves import read_curve
 from learner.report.page import page
-from learner.resumption import unless_finished
+from learner.resume_checks import unless_finished
 from learner.run_folder.lease import Owner
 from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.resume import newest_run
+from learner.run_folder.newest_run import newest_run
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.run_format import END, HEAD
 from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_of_run

@@ -11,9 +11,9 @@ import pytest
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.layers import resolve
-from learner.config.on_resume import Free, OnResume, declared
+from learner.config.resume_rules import Free, OnResume, declared
 from learner.env_spaces import EnvSpaces
-from learner.resumption import Resumption, check_settings, check_spaces, unless_finished
+from learner.resume_checks import Resumption, check_settings, check_spaces, unless_finished
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError

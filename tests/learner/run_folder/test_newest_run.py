@@ -10,7 +10,7 @@ import millrace
 from learner.config.command_line import read_config
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.run_folder.resume import newest_run
+from learner.run_folder.newest_run import newest_run
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch import local_run
 from protocol.errors import UsageError
