@@ -12,8 +12,10 @@ from functools import cache
 from pathlib import Path
 
 from learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.cli.commands import COMMANDS, GROUPS
 from millrace.cli.keys import SUBCOMMANDS
-from millrace.cli.main import COMMANDS, GROUPS, LAUNCHERS, main
+from millrace.cli.launch import LAUNCHERS
+from millrace.cli.main import main
 
 HEAD = """# Commands
 

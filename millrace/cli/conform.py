@@ -24,7 +24,12 @@ ABOUT = (
 )
 
 
-def run(argv: list[str], write: Callable[[str], None]) -> int:
+def run(argv: list[str]) -> int:
+    """Check the client and print the report. Returns the exit code."""
+    return check(argv, lambda line: print(line, flush=True))
+
+
+def check(argv: list[str], write: Callable[[str], None]) -> int:
     """Check the client. `write` takes the lines of the report. Returns the exit code."""
     flags, command = _split(argv)
     arguments = Arguments("conform", ABOUT)

@@ -24,6 +24,12 @@ class Subcommand(NamedTuple):
     about: str
 
 
+def run(argv: list[str]) -> int:
+    """Run a subcommand and print its lines. Returns the exit code."""
+    print(*keys(argv), sep="\n")
+    return 0
+
+
 def keys(argv: list[str]) -> list[str]:
     """Run a subcommand. Returns the lines to print. Raises `UsageError`."""
     name, *rest = argv or [""]

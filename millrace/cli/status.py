@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +38,12 @@ DROPS = {
 }
 """Text for each kind of dropped data, by its name in the ledger."""
 LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are right-aligned
+
+
+def run(argv: list[str]) -> int:
+    """Print it. Returns the exit code."""
+    status(argv, sys.stdout)
+    return 0
 
 
 def status(argv: list[str], out: TextIO) -> None:

@@ -18,7 +18,7 @@ from learner.config.flag_parser import parse_flags
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from millrace.cli import conform, flags, keys, status
 from millrace.cli.arguments import Arguments
-from millrace.cli.main import COMMANDS
+from millrace.cli.commands import COMMANDS
 from protocol.errors import UsageError
 from tests.docs.pages import Block
 from website.commands_page import help_of, lines_of
@@ -131,7 +131,7 @@ def _parse(name: str, argv: list[str]) -> None:
                 (keys.keys if name == "keys" else _status)(argv)
         case "conform":
             with mock.patch.object(Arguments, "parse", _parse_only):
-                conform.run(argv, lambda line: None)
+                conform.check(argv, lambda line: None)
         case "launch":
             launcher, *rest = argv or [""]
             if launcher not in LAUNCHERS:

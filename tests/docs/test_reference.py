@@ -16,7 +16,7 @@ from learner.config.command_line import RunFlags
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.metric_names import METRICS
 from learner.run_folder import run_folder
-from millrace.cli.main import COMMANDS
+from millrace.cli.commands import COMMANDS
 from protocol import errors
 from protocol.errors import UserFacingError
 from tests.learner.algorithms.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made

@@ -24,8 +24,9 @@ from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.cli.commands import COMMANDS
 from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
-from millrace.cli.main import COMMANDS, main
+from millrace.cli.main import main
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, NoWorkers

@@ -1,0 +1,65 @@
+"""The commands of `millrace`: their groups, and the function of this folder that runs each.
+
+Rule: a command's module is imported when the command runs, so that `--help` answers at once, and a machine that has only a
+worker's packages can run the commands that need no others.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import NamedTuple
+
+HELP_FLAGS = ("-h", "--help")
+
+
+class Command(NamedTuple):
+    """A command of `millrace`."""
+
+    runs: str
+    """module of this folder, and its function, which takes the arguments and returns the exit code"""
+    arguments: str
+    about: str
+
+
+GROUPS = {
+    "Train": {
+        "train": Command("train:train", "ENV [flags]", "train on this machine: a learner and its worker processes"),
+        "presets": Command("presets:run", "", "list settings that are known to work"),
+    },
+    "Train with workers on other machines": {
+        "learner": Command(
+            "train:learner", "ENV --bind ADDRESS [flags]", "start a learner alone; workers join it from elsewhere"
+        ),
+        "worker": Command("worker:run", "ADDRESS [--token FILE] [flags]", "start workers that join a learner"),
+        "keys": Command("keys:run", "new|show|allow|revoke [NAME]", "say who may join the learners of this machine"),
+        "status": Command("status:run", "ADDRESS|RUN [--watch]", "show a run's workers, their speed, and what was dropped"),
+        "launch": Command("launch:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
+    },
+    "Look at runs": {
+        "evaluate": Command("play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
+        "record": Command("play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
+        "plot": Command("compare:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),
+        "report": Command("compare:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
+    },
+    "Write a client in another language": {
+        "conform": Command("conform:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),
+    },
+    "Measure millrace itself": {
+        "bench": Command("bench:run", "[NAME [flags]]", "run the benchmarks (in a clone of the repository)"),
+    },
+}
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+
+
+def run_command(name: str, argv: list[str]) -> int:
+    """Run a command with these arguments. Returns the exit code."""
+    module, function = COMMANDS[name].runs.split(":")
+    code: int = getattr(import_module(f"millrace.cli.{module}"), function)(argv)
+    return code
+
+
+def usage(name: str, *more: str) -> str:
+    """How to use a command that has no flags of its own, and `more` lines."""
+    command = COMMANDS[name]
+    about = f"{command.about[0].upper()}{command.about[1:]}."
+    return "\n".join([f"usage: millrace {name} {command.arguments}".rstrip(), "", about, *more])

@@ -1,0 +1,26 @@
+"""`millrace train` and `millrace learner`: a learner, with its worker processes on this machine or without any."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from learner.config.command_line import read_config
+from millrace.cli.shown_run import show_run
+
+
+def train(argv: list[str]) -> int:
+    """Train with worker processes on this machine. Returns the exit code."""
+    return _train(argv, "train")
+
+
+def learner(argv: list[str]) -> int:
+    """Train with workers that join from elsewhere. Returns the exit code."""
+    return _train(argv, "learner")
+
+
+def _train(argv: list[str], command: Literal["train", "learner"]) -> int:
+    config, resume = read_config(command, argv)
+    from millrace.launch import local_run  # takes 0.2 s to import: not before the flags are known to be right
+
+    elsewhere, new = command == "learner", None if resume else config
+    return show_run(argv, lambda watch: local_run.train(config, resume, watch, elsewhere=elsewhere), new)
