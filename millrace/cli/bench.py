@@ -7,14 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+from millrace import import_conflict
 from millrace.cli.commands import HELP_FLAGS, usage
-from millrace.import_conflict import INSTALLED_IN
 from protocol.errors import UsageError
 
 
 def run(argv: list[str]) -> int:
     """Run them. Returns the exit code."""
-    clone = next((folder for folder in (INSTALLED_IN, Path.cwd()) if (folder / "benchmarks" / "program.py").is_file()), None)
+    folders = import_conflict.INSTALLED_IN, Path.cwd()
+    clone = next((folder for folder in folders if (folder / "benchmarks" / "program.py").is_file()), None)
     if clone is None and argv and argv[0] in HELP_FLAGS:
         print(usage("bench"))
         return 0

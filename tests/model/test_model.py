@@ -71,6 +71,7 @@ def test_a_worker_holds_the_versions_that_its_tickets_name(searched: Search) -> 
         Training(workers=2, lanes=2, updates=1, faults=1),
         Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1),
         Training(workers=1, lanes=1, updates=2, faults=3),
+        Training(workers=1, lanes=1, updates=3, faults=1),
         Training(workers=1, lanes=1, updates=3, faults=2, max_lag=1),
         Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
         Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("drop up", "drop down")),

@@ -471,13 +471,13 @@ def test_weights_that_only_a_released_lane_names_are_dropped(message: ToWorker) 
     assert versions_held(session) == (1,)
 
 
-def test_weights_that_come_before_their_order_are_kept_until_work_ends() -> None:
-    """The order was lost, and is sent again after a heartbeat; the weights would not be."""
+def test_weights_that_no_ticket_names_are_dropped_unless_they_are_the_newest() -> None:
+    """If their order was lost, the learner sends both again."""
     session = ready(weights(1), weights(0), version=None)
-    session.handle(HeartbeatReply(SESSION, 1, ()), 0.1)
-    session.handle(Release(SESSION, (LaneIncarnation(7, 0),)), 0.1)
-    assert versions_held(session) == (0, 1)
+    assert versions_held(session) == (1,)
     session.handle(collect((0, 0), version=0), 0.2)
+    session.handle(weights(0), 0.2)
+    assert versions_held(session) == (0, 1)
     collected(session)
     assert versions_held(session) == (1,)
 
@@ -498,7 +498,8 @@ def test_new_weights_are_worth_no_heartbeat_of_their_own() -> None:
 
 
 def test_a_heartbeat_lists_the_versions_of_the_weights_held_in_ascending_order() -> None:
-    session = ready(weights(7), weights(2), weights(5), version=None)
+    tickets = collect((0, 0), version=2), collect((1, 1), version=5)
+    session = ready(*tickets, weights(7), weights(2), weights(5), version=None)
     assert versions_held(session) == (2, 5, 7)
 
 

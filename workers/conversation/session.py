@@ -256,6 +256,7 @@ class Session:
         match message:
             case Weights(version):
                 current.weights.setdefault(version, message)
+                current.drop_weights()  # a late copy of old weights, too
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]

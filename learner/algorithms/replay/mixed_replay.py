@@ -6,33 +6,39 @@ they are and are drawn uniformly. They are no part of a saved state: whoever loa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from learner.algorithms.replay.available_memory import GIB, available_bytes
-from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
+from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
 from protocol.arrays import Floats, Ints
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose
 from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf
 
 PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
+
+
+def check_dataset_fits_memory(
+    observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
+) -> None:
+    """Raise `UsageError` if a dataset of this size does not fit the free memory. It takes its own size, once."""
+    needed, free = memory_bytes(observation, size, prioritized, action, choices), available_bytes()
+    if free is not None and needed > free:
+        raise UsageError(
+            f"prior: {size} observations of the dataset take {needed / GIB:.1f} GiB, "
+            f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
+        )
 
 
 class PriorTransitions(ReplayBuffer):
     """The transitions of a dataset, which no checkpoint copies."""
 
     _purpose = Purpose.PRIOR
-
-    def _check_memory(self, choices: int = 0) -> None:
-        needed, free = memory_bytes(*self._content, choices), available_bytes()
-        if free is not None and needed > free:
-            raise UsageError(
-                f"prior: {self.size} observations of the dataset take {needed / GIB:.1f} GiB, "
-                f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
-            )
+    _check_memory = staticmethod(check_dataset_fits_memory)
 
 
 class MixedReplay(ReplayBuffer):

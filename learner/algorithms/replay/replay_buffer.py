@@ -112,6 +112,7 @@ class ReplayBuffer:
     """The newest transitions of all lanes, drawn uniformly or by priority."""
 
     _purpose = Purpose.REPLAY
+    _check_memory = staticmethod(check_fits_memory)
 
     def __init__(
         self,
@@ -130,7 +131,7 @@ class ReplayBuffer:
         """
         self._content = observation, size, alpha is not None, action
         self.size = size  # slots
-        check_fits_memory(*self._content)
+        self._check_memory(*self._content)
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
         self._n_step, self._gamma, self._alpha, self._seed = n_step, gamma, alpha, seed
@@ -206,7 +207,7 @@ class ReplayBuffer:
 
     def _make_mask(self, choices: int) -> None:
         if self._mask is None:
-            check_fits_memory(*self._content, choices)
+            self._check_memory(*self._content, choices)
             self.bytes = memory_bytes(*self._content, choices)
             self._mask = np.ones((self.size, choices), bool)
 
