@@ -79,7 +79,7 @@ def _player(
 ) -> PolicyPlayer:
     """A player whose workers act."""
     endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
-    started = endpoint.workers(which.workers, _own_logs(stack), which.settings.call_timeouts(), 2.0)
+    started = endpoint.workers(which.workers, _own_logs(which, stack), which.settings.call_timeouts(), 2.0)
     _, processes = stack.enter_context(started)
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
 
@@ -106,7 +106,7 @@ def _acting_player(
         copy=False,
         evaluates=True,
     )
-    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(stack), settings.call_timeouts())
+    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(which, stack), settings.call_timeouts())
     described = started.describe(describe_settings(settings), check_interrupt)
     env = started.vector_env(described)
     stack.callback(env.close)
@@ -118,7 +118,9 @@ def _acting_player(
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, settings, described)
 
 
-def _own_logs(stack: ExitStack) -> WorkerFlags:
-    """No flags, and for each worker a log in a folder that is removed at the end."""
+def _own_logs(which: PlayingWorkers, stack: ExitStack) -> WorkerFlags:
+    """No flags, and for each worker that is started here a log in a folder that is removed at the end."""
+    if which.bind:
+        return lambda name: ([], None)
     logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))
     return lambda name: ([], logs / f"{name}.log")
