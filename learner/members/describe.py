@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
-from learner.members.events import Event
 from learner.members.failure_count import FailureCount
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -63,12 +62,12 @@ def described_by_workers(
         accept=accept,
     )
     failures = FailureCount(settings.max_env_failures, began_s=clock())
-
-    def count(event: Event) -> None:
-        failures.count(event, clock())
-
     members = coordinator.membership.members
-    callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), count)
+    callbacks = ServerCallbacks(
+        coordinator.receive,
+        lambda now: coordinator.status(settings.steps, now),
+        lambda event: failures.count(event, clock()),
+    )
     server_settings = ServerSettings(log_joins=False)
     server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)
     began_s = logged_s = clock()

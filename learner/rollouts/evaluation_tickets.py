@@ -161,7 +161,7 @@ class EvaluationTickets:
 
         With a limit of copies, the first to join play, because a worker keeps its copies.
         """
-        plan, members, dealt = self._plan, active, list[tuple[Member, int]]()
+        plan, members, out = self._plan, active, list[Outgoing]()
         assert plan is not None
         if self.most_copies is not None:
             members = active[: max(1, self.most_copies // min(plan.copies, len(plan.seeds)))]
@@ -173,8 +173,8 @@ class EvaluationTickets:
                     number = self._first + heapq.heappop(self._undealt)
                     self.held[number] = member
                     holds[member.peer] += 1
-                    dealt.append((member, number))
-        return [order for member, number in dealt for order in self.send(member, [number])]
+                    out += self.send(member, [number])
+        return out
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
         """The orders for these tickets, those of an evaluation among them."""

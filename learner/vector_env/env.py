@@ -80,9 +80,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             hub, self._layout, self._batch, LostLanes(), step.autoreset, seeds, ever_reset, on_worker_loss
         )
         self._send_recv = SendRecv(parts, timeout_s)
-        known = {"spec": self.spec, "observation_space": self.single_observation_space}
-        known["action_space"] = self.single_action_space
-        self.calls = CopyCalls(self._send_recv, parts, known)
+        spaces = {"observation_space": self.single_observation_space, "action_space": self.single_action_space}
+        self.calls = CopyCalls(self._send_recv, parts, {"spec": self.spec, **spaces})
         """calls of some copies"""
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 

@@ -18,7 +18,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from learner.vector_env.arguments import Options
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.lane_orders import packed, reset_order, step_order
+from learner.vector_env.lane_orders import packed, step_order
 from learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
 from learner.vector_env.order_coordinator import MakeOrder
 from learner.vector_env.sent_lanes import AfterLoss, Asked, AskedReset, ReadyLane, Sent, SentLanes, WatchedTime, after_loss
@@ -94,7 +94,7 @@ class SendRecv:
         now = self._watched.look(hub.now())
         for lane, reset in resets.items():
             self._sent.send(lane, Sent([layout.copies(lane)[n] for n in reset.copies], now, reset))
-            self._send_reset(lane, reset)
+            hub.send_order(lane, reset.order())
 
     def step(
         self,
@@ -121,7 +121,7 @@ class SendRecv:
             if lane in unreported:
                 continue  # the loss is reported in its place
             if lane in awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
-                self._send_reset(lane, parts.reset_of_new_copies(lane))
+                hub.send_order(lane, parts.reset_of_new_copies(lane).order())
             elif fit and hub.can_share(lane):
                 shared.append(lane)
             else:
@@ -247,8 +247,10 @@ class SendRecv:
         of_lane = [options[rows][n] for n in chosen] if isinstance(options, list) else options
         return AskedReset(tuple(chosen), tuple(seeds[rows][n] for n in chosen), packed(of_lane))
 
-    def _send_reset(self, lane: int, reset: AskedReset) -> None:
-        self._parts.hub.send_order(lane, reset_order(reset.copies, reset.seeds, reset.options))
+    def _reset_instead(self, lane: int, reset: AskedReset, last_observations: Mapping[int, Any]) -> None:
+        """The lane was lost: its new copies are reset before it comes back."""
+        self._sent.reset_instead(lane, reset, self._watched.look(self._parts.hub.now()), last_observations)
+        self._parts.hub.send_order(lane, reset.order())
 
     def _take_results(self) -> None:
         """Note which lanes are done."""
@@ -292,14 +294,11 @@ class SendRecv:
                     assert isinstance(asked, AskedReset)
                     if len(asked.copies) == len(copies):
                         parts.lost_lanes.forget([lane])  # else the next step reports the copies that were not reset
-                    sent.reset_instead(lane, asked, self._watched.look(parts.hub.now()), {})
-                    self._send_reset(lane, asked)
+                    self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])
-                    new = parts.reset_of_new_copies(lane)
                     last = {n: parts.batch.observation_of(n) for n in copies}
-                    sent.reset_instead(lane, new, self._watched.look(parts.hub.now()), last)
-                    self._send_reset(lane, new)
+                    self._reset_instead(lane, parts.reset_of_new_copies(lane), last)
                 case AfterLoss.COME_BACK:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])
                     parts.batch.truncate(lane)

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal
 
+from learner.vector_env.lane_orders import reset_order
 from learner.vector_env.lost_lanes import RESET_ATTEMPTS
+from learner.vector_env.order_coordinator import MakeOrder
 from protocol.arrays import Bytes
 from protocol.messages import Returned
 
@@ -28,6 +30,10 @@ class AskedReset:
     """numbered in the lane"""
     seeds: tuple[int | None, ...]
     options: Bytes
+
+    def order(self) -> MakeOrder:
+        """Makes the order for it."""
+        return reset_order(self.copies, self.seeds, self.options)
 
 
 class Asked(Enum):

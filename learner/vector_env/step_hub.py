@@ -58,30 +58,6 @@ class LocalWorkers(Protocol):
         ...
 
 
-class NoLocalWorkers:
-    """No local processes: all workers are started elsewhere."""
-
-    def poll(self) -> Iterable[WorkerExit]:
-        """No process has ended."""
-        return ()
-
-    def activities(self) -> Iterable[WorkerActivity]:
-        """Nothing: no worker runs here."""
-        return ()
-
-    def kill(self, name: str) -> bool:
-        """No process to kill."""
-        return False
-
-    @property
-    def count(self) -> int:
-        """Zero processes."""
-        return 0
-
-    def stop(self, timeout_s: float) -> None:
-        """Nothing to do."""
-
-
 class StepHub:
     """What a vector environment has to do with workers: it asks lanes, and looks what has come of that."""
 
@@ -91,7 +67,7 @@ class StepHub:
         spec: StepSpec,
         *,
         first_session: int,
-        local_workers: LocalWorkers | None = None,
+        local_workers: LocalWorkers,
         shared: SharedSteps | None = None,
         worker_timeout_s: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
@@ -110,7 +86,7 @@ class StepHub:
         """the status of the run that acts on these copies: `millrace status` gets its figures, and the workers here"""
         self._link = link
         self.coordinator = OrderCoordinator(spec, first_session, worker_timeout_s)
-        self._local_workers: LocalWorkers = local_workers or NoLocalWorkers()
+        self._local_workers = local_workers
         self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
         self._waiting_since_s: dict[int, float] = {}  # of these lanes
         self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
@@ -174,7 +150,7 @@ class StepHub:
                 answer = coordinator.answers.get(lane)
                 if answer is not None and answer.ticket == self._newest_tickets.get(lane):  # else it is of an earlier order
                     found[lane] = answer
-            elif shared is not None and shared.memory.answered(lane) == under_way[lane]:
+            elif shared is not None and shared.is_done(lane):
                 infos = shared.memory.infos(lane)
                 if infos is None:
                     infos = self._long_infos(lane)

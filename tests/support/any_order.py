@@ -27,6 +27,7 @@ from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_
 from protocol.wire.wake_up import WakePipe
 from tests.support.described import described
 from tests.support.fake_link import FakeLink
+from tests.support.local_workers import NO_LOCAL_WORKERS
 from workers.vector_env.stepper import Stepper
 
 Choose = Callable[[int], int]
@@ -174,7 +175,14 @@ def any_order(settings: VectorEnvSettings, workers: int, *, shared: bool) -> Ite
     with ExitStack() as resources:
         steps = link.share(description.step, names, resources) if shared else None
         resources.callback(link.close_workers)
-        hub = StepHub(cast(LearnerLink, link), description.step, first_session=1, shared=steps, clock=lambda: link.now)
+        hub = StepHub(
+            cast(LearnerLink, link),
+            description.step,
+            first_session=1,
+            local_workers=NO_LOCAL_WORKERS,
+            shared=steps,
+            clock=lambda: link.now,
+        )
         env = ZmqVectorEnv(
             description,
             hub,

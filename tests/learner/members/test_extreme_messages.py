@@ -54,6 +54,7 @@ from tests.support.extreme_messages import MARK, SESSION, extremes, of_session
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.fake_link import FakeLink
 from tests.support.hostile_messages import hostile, real
+from tests.support.local_workers import NO_LOCAL_WORKERS
 
 HOSTILE = "spare"
 SECRET_NONCE = 0x5EC2E7_5EC2E7  # of honest workers: nobody but a worker's supervisor and the learner knows it
@@ -199,7 +200,14 @@ def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
 def answers(turns: int, say: Say) -> list[bytes]:
     """The observations that a vector environment of two lanes got, in order."""
     link = Conversation()
-    hub = StepHub(cast(LearnerLink, link), SPEC, first_session=1, worker_timeout_s=3.0, clock=lambda: link.now)
+    hub = StepHub(
+        cast(LearnerLink, link),
+        SPEC,
+        first_session=1,
+        local_workers=NO_LOCAL_WORKERS,
+        worker_timeout_s=3.0,
+        clock=lambda: link.now,
+    )
     orders: list[tuple[bytes, Order]] = []
     found: list[bytes] = []
     wait = link.poll

@@ -17,6 +17,7 @@ from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.fake_link import FakeLink
+from tests.support.local_workers import NO_LOCAL_WORKERS
 
 TIMEOUT_S, POLL_S = 5.0, 0.1
 
@@ -78,7 +79,14 @@ def test_a_learner_that_was_stopped_while_it_waited_was_away_too() -> None:
 
 def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> None:
     link = FakeLink()
-    hub = StepHub(cast(LearnerLink, link), SPEC, first_session=1, worker_timeout_s=TIMEOUT_S, clock=lambda: link.now)
+    hub = StepHub(
+        cast(LearnerLink, link),
+        SPEC,
+        first_session=1,
+        local_workers=NO_LOCAL_WORKERS,
+        worker_timeout_s=TIMEOUT_S,
+        clock=lambda: link.now,
+    )
     link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
     hub.wait_for(1, TIMEOUT_S)
     link.now += 1000.0

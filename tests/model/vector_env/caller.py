@@ -11,7 +11,7 @@ heard answers in time.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import gymnasium
 import numpy as np
@@ -26,9 +26,11 @@ from learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from learner.vector_env.step_hub import StepHub
 from protocol.errors import NoWorkers, WorkerLost
 from protocol.messages import Answer, LaneIncarnation
+from protocol.wire.learner_link import LearnerLink
 from tests.model.settings import TICK_S
 from tests.model.vector_env.order_content import NEW, Copy, executed, make_order, state_in
 from tests.support.fake_link import FakeLink
+from tests.support.local_workers import NO_LOCAL_WORKERS
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping
@@ -76,7 +78,8 @@ class Caller:
         self.timeout_s = settings.call_timeout_s
         self.oldest = settings.most_ticks
         self.coordinator, self.server = coordinator, Server()
-        self.hub = StepHub(FakeLink(), coordinator.spec, first_session=0, clock=lambda: self.now)  # type: ignore[arg-type]
+        link, clock = cast(LearnerLink, FakeLink()), lambda: self.now
+        self.hub = StepHub(link, coordinator.spec, first_session=0, local_workers=NO_LOCAL_WORKERS, clock=clock)
         self.hub.coordinator = coordinator
         self.hub._server = self.server  # type: ignore[assignment]
         self.hub._listen_due_s = float("inf")

@@ -39,7 +39,9 @@ OF_THE_LEARNER = {
     "an order that was sent waits on": Mutation(HUB, "del self._waiting_orders[lane]", "pass"),
     "a lane is stepped before its loss is reported": Mutation(SEND_RECV, "if lane in unreported:", "if False:"),
     "new copies are stepped before they are reset": Mutation(SEND_RECV, "if lane in awaiting_reset:", "if False:"),
-    "a reset that lost its worker is not sent again": Mutation(SEND_RECV, "self._send_reset(lane, asked)", "pass"),
+    "a reset that lost its worker is not sent again": Mutation(
+        SEND_RECV, "self._parts.hub.send_order(lane, reset.order())", "pass"
+    ),
     "a lane that was sent nothing comes back": Mutation(SENT, "self._under_way[lane] = sent", 'self.ready(lane, b"")'),
     "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),
     "a lane whose loss was reported is not reset": Mutation(LOST, "self.expect_reset(reported)", "pass"),
