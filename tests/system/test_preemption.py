@@ -22,6 +22,8 @@ import learner.interrupts
 from learner.algorithms.ppo import PPO
 from learner.config.layers import resolve
 from learner.interrupts import Interrupts
+from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
+from learner.rollouts.hub import Hub
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
@@ -172,17 +174,20 @@ def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
 
 def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is interrupted while its best policy is evaluated again, after its last checkpoint."""
-    monkeypatch.setattr("learner.between_updates.audience.SHOW_EVERY_S", 0.0)
     settings = {**VARIANTS["ppo"], "target_return": 1.0}
     whole = run(tmp_path / "whole", **settings)
     assert summary(whole)["stop_reason"] == "target return 1 reached"
+    evaluate = Hub.evaluate
 
-    def watch(progress: Progress) -> None:
-        if "the best policy" in progress.waiting:
+    def interrupted(hub: Hub, plan: EvaluationPlan, *watch: Any) -> list[PlayedEpisode]:
+        played = evaluate(hub, plan, *watch)
+        if plan.of_best:
             raise KeyboardInterrupt
+        return played
 
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "resumed", watch, **settings)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Hub, "evaluate", interrupted)
+        run(tmp_path / "resumed", **settings)
     folder = folder_of(tmp_path / "resumed")
     assert run(tmp_path / "resumed", resume=folder, **settings) == folder
     assert_equal(whole, folder)

@@ -222,10 +222,11 @@ class DrainsAfterTwo(FakeLink):
 def test_each_rollout_of_a_worker_acts_under_the_weights_that_its_order_names() -> None:
     """Both versions are held before the first rollout starts."""
     received = (Received(0, 0, 0), Received(1, 0, 0))
-    orders = (Collect(1, version, (Permit(version, version, 0, 0),), received) for version in (0, 1))
     parameters = PARAMETERS, -PARAMETERS
-    weights = (Weights(version, each, BUFFERS) for version, each in enumerate(parameters))
-    link = DrainsAfterTwo([Welcome(1, 1, RUN), *weights, *orders])
+    link = DrainsAfterTwo([Welcome(1, 1, RUN)])
+    for version, each in enumerate(parameters):
+        order = Collect(1, version, (Permit(version, version, 0, 0),), received)
+        link.messages += [Weights(version, each, BUFFERS), order]
     assert work(link).exit_code == 0
     rollouts = [message for message in link.heard() if isinstance(message, Rollout)]
     assert [(rollout.lane, rollout.version) for rollout in rollouts] == [(0, 0), (1, 1)]
