@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from learner.algorithms import ALGORITHMS
 
-MODULES = ("threadpoolctl", "torch", "learner.run_spec", "learner.train")
+MODULES = ("torch", "learner.run")
 POLL_S = 0.05
 THREAD = "imports"
 

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from threading import Lock
 
+from threadpoolctl import threadpool_limits
+
 from learner.config.config import Config
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
@@ -32,8 +34,6 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
 
     PyTorch is imported only if it `uses_torch`. Threads of the program may leave in another order than they entered.
     """
-    from threadpoolctl import threadpool_limits
-
     own = [ExitStack()]
     with _lock:
         own[0].enter_context(threadpool_limits(1, "blas"))

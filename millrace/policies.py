@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 
 from millrace.arguments import checked
@@ -134,10 +135,8 @@ class Recurrent(MLP):
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces."""
-        from msgspec.structs import replace
-
         check_at_least("policy: core_size", self.core_size, 1)
-        return replace(super().spec(observation, action), core=self.core, core_size=self.core_size)
+        return msgspec.structs.replace(super().spec(observation, action), core=self.core, core_size=self.core_size)
 
 
 class Piece(NamedTuple):

@@ -82,6 +82,22 @@ HAS_RANDOM_NUMBERS_OF_ITS_OWN = (  # from constants, not from a run's seed
     "workers/envs/toy.py",
 )
 SLOW_TO_IMPORT = {"torch", "matplotlib", "tensorboard"}
+OPTIONAL = {  # packages of an extra or of notebooks
+    *("IPython", "ale_py", "envpool", "h5py", "minari", "moviepy", "ray", "stable_baselines3", "zstandard"),
+}
+IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `learner.rollouts.hub` on one machine
+    "cloudpickle": "5 ms, for callables only",
+    "importlib.metadata": "the version, which few ask for",
+    "learner.imports_ahead": "only if it was imported before",
+    "learner.prometheus": "26 ms, for --metrics-bind only",
+    "learner.recording.video": "27 ms, for --video only",
+    "learner.report.learning_curves": "21 ms, for plots only",
+    "millrace.cli.main": "a signal waits until it is imported",
+    "millrace.launch.learner_inference": "it is for --inference learner only",
+    "millrace.launch.local_run": "120 ms, after the flags are known to be right",
+    "millrace.playing": "160 ms, after the flags are known to be right",
+    "workers.program": "98 ms, after the flags are known to be right",
+}
 MOST_FILES = 16  # in a folder
 MOST_PARAMETERS = 8  # of a function; self and cls do not count
 MAY_TAKE_MORE = {"millrace/launch/vector.py:make_vec"}  # gymnasium's users expect keyword arguments
@@ -113,6 +129,34 @@ def modules_imported(source: str) -> frozenset[str]:
             case ast.ImportFrom():
                 raise AssertionError(f"{source}:{node.lineno} imports relatively")
     return frozenset(found)
+
+
+def imports_in_functions(source: str) -> set[str]:
+    """Modules that a file imports in a function."""
+    found = set()
+    for function in ast.walk(tree(source)):
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            for node in ast.walk(function):
+                match node:
+                    case ast.Import(names=names):
+                        found |= {alias.name for alias in names}
+                    case ast.ImportFrom(module=str(name), names=names):
+                        submodules = {f"{name}.{alias.name}" for alias in names} & {
+                            module(file) for file in sources(*PACKAGES)
+                        }
+                        found |= submodules or ({"importlib.metadata"} if name == "importlib" else {name})
+    return found
+
+
+@cache
+def is_slow(name: str) -> bool:
+    """Whether a module is slow to import or optional, or imports one that is."""
+    source = name.replace(".", "/") + ".py"
+    if not (ROOT / source).exists():
+        return name.partition(".")[0] in SLOW_TO_IMPORT | OPTIONAL
+    at_the_top = [node for node in tree(source).body if isinstance(node, ast.Import | ast.ImportFrom)]
+    named = {node.module or "" if isinstance(node, ast.ImportFrom) else node.names[0].name for node in at_the_top}
+    return any(map(is_slow, named))
 
 
 def imported(source: str) -> set[str]:
@@ -201,6 +245,11 @@ def test_a_room_imports_only_what_it_may(package: str, place: str) -> None:
 @pytest.mark.parametrize("package", ROOMS)
 def test_no_room_is_without_a_rule(package: str) -> None:
     assert {path.parent.name for path in (ROOT / package).glob("*/__init__.py")} <= set(ROOMS[package])
+
+
+def test_what_a_file_needs_is_imported_at_its_top_unless_it_is_slow_or_optional() -> None:
+    late = {name for source in sources(*PACKAGES) for name in imports_in_functions(source)}
+    assert {name for name in late if not is_slow(name)} == IMPORTED_LATE.keys()
 
 
 def test_the_checks_of_a_client_are_pure() -> None:

@@ -1,4 +1,4 @@
-"""What every object between two updates works on. `learner.run` makes it."""
+"""What every object between two updates works on. `open_run` makes it."""
 
 from __future__ import annotations
 

@@ -35,6 +35,8 @@ from typing import Annotated, Any, Literal, Protocol
 import msgspec
 import numpy as np
 from msgspec import Meta
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from learner.run_folder.atomic_write import TEMPORARY, Writes, write_file
 from learner.run_folder.regular_files import MOST_BYTES, read, reason
@@ -266,8 +268,6 @@ class RunFolder:
         `parameters` [P] begins with the acting part; the rest (the critic) is not written. `facts`: names of the numbers
         that the run logs of each episode. `masked`: whether the run uses action masks.
         """
-        from safetensors.numpy import save
-
         acting, _ = parameter_layout(spec)
         arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
         description = PolicyDescription(
@@ -292,9 +292,6 @@ class RunFolder:
 
         Raises `UsageError`, with a one-line message, if they cannot be read.
         """
-        from safetensors import SafetensorError
-        from safetensors.numpy import load
-
         if not (self.path / POLICY_JSON).is_file():
             raise UsageError(f"run {self.path}: expected a {POLICY_JSON}, got none; has the run saved its policy yet?")
         if which == "best" and not (self.path / POLICY_ARRAYS[which]).is_file():

@@ -22,7 +22,7 @@ from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
 from learner.resume_checks import Resumption
 from learner.rollout_service.service import describe_settings
-from learner.run import RunSetup, known_environment, open_run, prometheus_observer, run_folder
+from learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from learner.torch_setup import one_thread, torch_device
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread, step_lanes
@@ -73,6 +73,8 @@ def train(
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once
         processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
+        from learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
+
         with interrupts, one_thread():
             run = open_run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
             # The learner's own endpoint is inproc: `millrace status` asks where the workers join.

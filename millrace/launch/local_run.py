@@ -15,12 +15,11 @@ from learner.config.validation import check_copies, idle_workers, workers_to_wai
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.resume_checks import Resumption, unless_finished
-from learner.run import (
+from learner.run_setup import (
     RunSetup,
     describe_over,
     known_environment,
     named_environment,
-    open_run,
     prometheus_observer,
     run_folder,
 )
@@ -73,6 +72,8 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
+        from learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
+
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
             open_run(setup, endpoint.link, processes, watch, observer).train(workers)

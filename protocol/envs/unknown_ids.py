@@ -8,6 +8,7 @@ installed package would register is read from its source text.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import importlib
 import io
 import re
@@ -156,8 +157,6 @@ def what_to_write(env_id: str) -> str:
 
 def most_similar(env_id: str, names: Iterable[str] = ()) -> str | None:
     """The registered id that is most similar, or one of these `module:name`; None if none is similar."""
-    import difflib
-
     known = [*gymnasium.registry, *names]
     by_name = {one.rpartition(":")[2].lower(): one for one in known}
     close = difflib.get_close_matches(env_id.lower(), by_name, n=1, cutoff=0.75)

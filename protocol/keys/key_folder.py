@@ -11,6 +11,7 @@ connect.
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
 import stat
@@ -142,8 +143,6 @@ class KeyFolder:
     @contextmanager
     def _locked(self) -> Iterator[None]:
         """Hold the folder's lock, so that two commands at the same time do not lose each other's entry."""
-        import fcntl  # Unix only; workers do not need it
-
         folder = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)

@@ -26,9 +26,9 @@ from learner.config.layers import resolve
 from learner.metric_names import METRICS
 from learner.prometheus import EVERY_S, STAGES, MetricsCollector, metrics_server
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
-from learner.run import prometheus_observer
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
+from learner.run_setup import prometheus_observer
 from millrace.launch import local_run
 from protocol.bounds import MAX_FACTS, Stage
 from protocol.errors import UsageError

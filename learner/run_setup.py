@@ -1,0 +1,164 @@
+"""What exists of a run before PyTorch is imported: its folder, what a worker says of the environment, and its interrupts.
+
+The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let a worker describe the
+environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/run.py`); train. This file
+does not know who the workers are, and the learner runs no code of the environment.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from learner.config.config import Config
+from learner.env_spaces import EnvSpaces
+from learner.imports_ahead import ImportsAhead
+from learner.interrupts import Interrupts
+from learner.members.describe import described_by_workers
+from learner.members.describe_coordinator import Accept
+from learner.members.process_callbacks import ProcessCallbacks
+from learner.resume_checks import Resumption, check_spaces
+from learner.rollout_service.service import describe_settings
+from learner.rollouts.hub import HubObserver
+from learner.run_folder.run_folder import Interrupted, RunFolder
+from learner.run_folder.run_lock import RunLock
+from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
+from protocol.errors import UsageError
+from protocol.logs.notices import log_notice
+from protocol.specs import DescribeSpec
+from protocol.wire.learner_link import LearnerLink
+
+log = logging.getLogger("millrace.learner")
+
+
+def stopped(resumed: Path | None) -> KeyboardInterrupt:
+    """The exception if the user stops the program before it trains. `resumed`: the run that it was to resume, if any."""
+    return KeyboardInterrupt() if resumed is None else Interrupted(resumed)
+
+
+@dataclass(frozen=True)
+class KnownEnvironment:
+    """What a run must know of its environment before it begins."""
+
+    env: EnvSpec
+    spaces: EnvSpaces
+    described: DescribedEnv
+    """As a worker described it."""
+    evaluation_limit: int | None
+    """Env steps after which an episode of an evaluation is truncated, if it is."""
+
+
+@dataclass(frozen=True)
+class RunSetup:
+    """The parts of a run that exist before the `Run`."""
+
+    config: Config
+    known: KnownEnvironment
+    folder: RunFolder
+    resumed: bool
+    interrupts: Interrupts
+    """Entered: signals are noted from now on."""
+
+    def check_interrupt(self) -> None:
+        """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""
+        if self.interrupts.received:
+            raise stopped(self.folder.path if self.resumed else None)
+
+    def check_running(self) -> None:
+        """Raises `Interrupted` if the user has interrupted the run, and `RunTakenOver` if another process trains it."""
+        if self.interrupts.received:
+            raise Interrupted(self.folder.path)
+        if self.folder.lock is not None:
+            self.folder.lock.check()
+
+
+@contextmanager
+def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]:
+    """A new run folder, or the folder of the run to `resume`, locked. A new one is removed if no `Run` can be made of it.
+
+    Raises `UsageError`, also if another process trains the run.
+    """
+    folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
+    try:
+        with RunLock(folder.path) as folder.lock:
+            for line in () if resume is None else resume.differences:
+                log.warning("%s", line)
+            yield folder
+    except BaseException:
+        folder.remove()
+        raise
+
+
+def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: DescribedEnv) -> None:
+    """Raises `UsageError` if an environment with `eval_env_kwargs` has other spaces than one without them."""
+    expected, got = (EnvSpaces.of_description(env, config.action_masks) for env in (training, evaluation))
+    if (expected.observation, expected.action) != (got.observation, got.action):
+        raise UsageError(
+            f"eval_env_kwargs: expected the spaces of training, {training.observation_space} and {training.action_space}, "
+            f"got {evaluation.observation_space} and {evaluation.action_space}"
+        )
+
+
+Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
+"""Has a worker describe the environment. What the second argument raises ends the wait; the third accepts a description."""
+
+
+def named_environment(config: Config) -> EnvSpec:
+    """The environment that the settings name."""
+    return EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs)
+
+
+def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, describe: Describe) -> KnownEnvironment:
+    """The environment, as `describe` learns it. Meanwhile another thread imports PyTorch.
+
+    Of a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
+    is no such environment, or no policy for it; `RunError` if no worker describes it in time; and `KeyboardInterrupt` if
+    the user stops the program.
+    """
+    imports = ImportsAhead(config.algo)
+    with Interrupts() as interrupts:
+
+        def check_interrupt() -> None:
+            if interrupts.received:
+                raise stopped(None if resume is None else resume.run)
+
+        policy = None if resume is None else RunFolder.open(resume.run).policy_spec()
+
+        def accept(found: DescribedEnv) -> None:
+            if resume is not None and policy is not None:
+                check_spaces(resume.run, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found, config.action_masks))
+
+        described = describe(
+            DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
+        )
+        evaluation = described
+        if env.eval_kwargs:
+            spec = DescribeSpec(env.for_evaluation(), heartbeat_s=config.heartbeat_s)
+            evaluation = describe(spec, check_interrupt, lambda found: None)
+            check_evaluation_spaces(config, described, evaluation)
+        imports.wait(check_interrupt)
+    spaces = EnvSpaces.of_description(described, config.action_masks)
+    if spaces.masked:
+        log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
+    return KnownEnvironment(env, spaces, described, evaluation.max_episode_steps)
+
+
+def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
+    """Has one of the workers at the link of the run describe the environment."""
+    settings = describe_settings(config, config.steps)
+    return lambda spec, check_interrupt, accept: described_by_workers(
+        link, spec, settings, processes, check_interrupt, accept=accept
+    )
+
+
+def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:
+    """Serves metrics at `config.metrics_bind` while it is entered; without an address it imports no HTTP server."""
+    if not config.metrics_bind:
+        return nullcontext(lambda hub: None)
+    from learner.prometheus import metrics_server
+
+    return metrics_server(config)
