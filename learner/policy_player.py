@@ -14,10 +14,11 @@ from typing import NamedTuple
 import msgspec
 
 from learner.config.rollout_config import RolloutConfig
+from learner.conversations import describe_settings, open_hub
 from learner.members.describe import described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
+from learner.rollouts.hub import Hub
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
 from protocol.env_spec import EnvLike, EnvSpec
@@ -75,12 +76,12 @@ class PolicyPlayer:
         self.policy = policy
         self._link, self._processes = link, processes
         self._check_interrupt, self._watch, self._settings, self._described = check_interrupt, watch, settings, described
-        self._service: RolloutService | None = None
+        self._hub: Hub | None = None
 
     @property
     def workers(self) -> int:
         """Number of workers that have joined since the first `play`."""
-        return 0 if self._service is None else len(self._service.snapshot().members)
+        return 0 if self._hub is None else len(self._hub.snapshot().members)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
         """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""
@@ -102,17 +103,17 @@ class PolicyPlayer:
 
         `bound` and `before` are those of `EvaluationPlan.how_far`, which makes the text that `watch` gets.
         """
-        if self._service is None:
-            self._service = self._published()
+        if self._hub is None:
+            self._hub = self._published()
         show = self._watch
-        return self._service.play(plan, lambda played, steps: show(plan.how_far(played, steps, bound, before)), on_rows)
+        return self._hub.evaluate(plan, lambda played, steps: show(plan.how_far(played, steps, bound, before)), on_rows)
 
     def leave(self, reason: str) -> None:
         """Ask the workers to leave."""
-        if self._service is not None:
-            self._service.drain(reason, timeout_s=2.0)
+        if self._hub is not None:
+            self._hub.drain(reason, timeout_s=2.0)
 
-    def _published(self) -> RolloutService:
+    def _published(self) -> Hub:
         policy = self.policy
         lanes = max(1, self._processes.expected)  # one for each worker of this program: only then do its failures count
         settings = msgspec.structs.replace(self._settings, lanes=lanes)
@@ -127,10 +128,10 @@ class PolicyPlayer:
             masked=policy.masked,
             heartbeat_s=settings.heartbeat_s,
         )
-        service = rollout_service(settings, run, self._link, self._processes, self._check_interrupt)
-        service.wait_for_workers(1)
-        service.publish(0, policy.parameters, policy.buffers, deal=False)
-        return service
+        hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
+        hub.wait_for(1)
+        hub.publish(0, policy.parameters, policy.buffers, deal=False)
+        return hub
 
 
 def useful_workers(workers: int, episodes: int, copies: int) -> int:

@@ -1,4 +1,4 @@
-"""Makes a learner of its parts: algorithm, service, and what a run does between two updates. Imports PyTorch.
+"""Makes a learner of its parts: algorithm, hub, and what a run does between two updates. Imports PyTorch.
 
 `learner/run_setup.py` says what must exist before. Nothing of a resumed run is written before everything fits.
 """
@@ -21,11 +21,11 @@ from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
 from learner.config.validation import unused_target
+from learner.conversations import open_hub
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.prior_dataset import PriorDataset
 from learner.recording.training_recorder import TrainingRecorder
-from learner.rollout_service.service import RolloutService, rollout_service
-from learner.rollouts.hub import HubObserver
+from learner.rollouts.hub import Hub, HubObserver
 from learner.run_folder.lease import Closed, Listens
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_setup import KnownEnvironment, RunSetup
@@ -53,7 +53,7 @@ class Run:
 
     setup: RunSetup
     algorithm: Algorithm
-    service: RolloutService
+    hub: Hub
     between: BetweenUpdates
     prior: PriorDataset | None
     """The data that the run learns from besides its own, if there are any."""
@@ -82,15 +82,15 @@ class Run:
         try:
             if self.prior is not None and self.between.tally.state.version == 0:
                 self._learn_from_prior(self.prior)
-            train(self.algorithm, self.service, self.between, workers, self._check_time)
+            train(self.algorithm, self.hub, self.between, workers, self._check_time)
         except RunTakenOver as error:
-            self.service.drain(str(error), timeout_s=DRAIN_S)
+            self.hub.drain(str(error), timeout_s=DRAIN_S)
             raise
         except BaseException as error:
             if line := files.saved():
                 error.add_note(line)
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
-            self.service.drain(reason, timeout_s=self.setup.interrupts.at_most(DRAIN_S))
+            self.hub.drain(reason, timeout_s=self.setup.interrupts.at_most(DRAIN_S))
             try:
                 audience.finish(reason, cut_short=True)
             except Exception as later:  # a callback may raise again, and the error of the run is what counts
@@ -105,7 +105,7 @@ class Run:
         tally, files, audience, _ = self.between
 
         def pulse() -> None:
-            self.service.pulse()
+            self.hub.pulse()
             files.save_if_due()
             self.setup.check_running()
 
@@ -142,17 +142,17 @@ def open_run(setup: RunSetup, link: LearnerLink, processes: ProcessCallbacks, wa
     # The last save gets half of what is left of the grace time, and the workers need time to leave.
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
     past = (state.ledger, state.incarnations)
-    service = rollout_service(config, spec, link, processes, setup.check_running, observer, past)
+    hub = open_hub(config, spec, link, processes, setup.check_running, observer, past)
     dataset = _training_recorder(config, folder, setup.known, spec)
     setup.check_interrupt()
     folder.remove_temporary()
     folder.write_config(config, workers_elsewhere=not processes.expected)
     folder.remove_summary()
     tally = Tally(config, spec, state, lambda: callbacks.stop_reason)
-    parts = RunParts(config, spec, folder, algorithm, service, tally)
+    parts = RunParts(config, spec, folder, algorithm, hub, tally)
     between = open_files(parts, callbacks, dataset, setup.known.evaluation_limit)
-    run = Run(setup, algorithm, service, between, prior)
-    service.report(between.audience.progress())
+    run = Run(setup, algorithm, hub, between, prior)
+    hub.report_progress(between.audience.progress())
     if setup.resumed:
         log_notice(log, between.files.continues())
     folder.keep()

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from learner.config.config import Config
+from learner.conversations import describe_settings
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
@@ -21,7 +22,6 @@ from learner.members.describe import described_by_workers
 from learner.members.describe_coordinator import Accept
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resume_checks import Resumption, check_spaces
-from learner.rollout_service.service import describe_settings
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock

@@ -6,8 +6,8 @@ import msgspec
 
 from learner.algorithms import algorithm_class
 from learner.config.config import Config
+from learner.conversations import rollout_spec
 from learner.env_spaces import EnvSpaces
-from learner.rollout_service.spec import rollout_spec
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder

@@ -1,4 +1,4 @@
-"""The training loop. Everything else is called from here; `service.gather` is the only place that waits for rollouts.
+"""The training loop. Everything else is called from here; `hub.gather` is the only place that waits for rollouts.
 
 An evaluation belongs to one version: it comes after that version's checkpoint, and before the next rollouts are collected.
 
@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from learner.algorithms import Algorithm
 from learner.algorithms.algorithm import numbers
 from learner.between_updates.between_updates import BetweenUpdates
-from learner.rollout_service.service import RolloutService
+from learner.rollouts.hub import Hub
 from learner.rollouts.lanes import AcceptedRollout
 from protocol.arrays import Floats
 from protocol.errors import RunError
@@ -30,7 +30,7 @@ ADVICE = "try a lower learning_rate, or normalize_observations"
 
 def train(
     algorithm: Algorithm,
-    service: RolloutService,
+    hub: Hub,
     between: BetweenUpdates,
     workers: int,
     check_time: Callable[[], None] = lambda: None,
@@ -45,12 +45,12 @@ def train(
     tally, files, audience, evaluations = between
 
     def pulse() -> None:
-        service.pulse()
+        hub.pulse()
         check_time()
 
     def publish(weights: tuple[Floats, Floats]) -> None:
         attributes = audience.env_attributes()
-        service.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
+        hub.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
 
     def evaluate() -> None:
         audience.evaluated(evaluations.evaluate_newest(audience.show_now))
@@ -58,17 +58,17 @@ def train(
 
     files.save()
     try:
-        service.wait_for_workers(workers)
+        hub.wait_for(workers)
         audience.start()
         publish(files.weights())
         if tally.evaluation_is_due():  # the run was interrupted before it
             evaluate()
         while (reason := tally.stop_reason()) is None:
-            arrived = service.gather(audience.show_now)
+            arrived = hub.gather(audience.show_now)
             began_s = time.monotonic()
-            with _whole_update(algorithm, service, arrived):
+            with _whole_update(algorithm, hub, arrived):
                 if not audience.gathered(arrived):
-                    service.not_used(arrived)
+                    hub.not_used(arrived)
                     continue
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
                 metrics = numbers(algorithm.update(batch, pulse), type(algorithm).__name__)
@@ -92,19 +92,19 @@ def train(
     except BaseException as error:
         files.save_after_error(error)
         raise
-    service.drain(reason)
+    hub.drain(reason)
     files.confirm_saved()  # before the summary: with one, a run counts as finished
     audience.finish(reason)
     return reason
 
 
 @contextmanager
-def _whole_update(algorithm: Algorithm, service: RolloutService, arrived: list[AcceptedRollout]) -> Iterator[None]:
+def _whole_update(algorithm: Algorithm, hub: Hub, arrived: list[AcceptedRollout]) -> Iterator[None]:
     """An update of the rollouts that have arrived. If the body raises, it is taken back."""
     algorithm.remember()
     try:
         yield
     except BaseException:
         algorithm.roll_back()
-        service.not_used(arrived)
+        hub.not_used(arrived)
         raise

@@ -28,8 +28,7 @@ import numpy as np
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import convert_rollout_settings
 from learner.interrupts import Interrupts
-from learner.rollout_service.saved_state import ServiceState, digest, read, write
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.episode_window import EpisodeWindow
@@ -38,6 +37,7 @@ from learner.run_folder.results import Evaluation
 from millrace.arguments import checked
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
+from millrace.saved_state import ServiceState, digest, read, write
 from protocol.arrays import Array, Ints
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
@@ -172,7 +172,7 @@ class RolloutService:
                     listens=listens,
                     past=past,
                 )
-            self._service, self.run = started.service, started.run
+            self._hub, self.run = started.hub, started.run
             if state is not None:
                 _check_restored(state, spec.id, started.run.policy, str(restore))
                 if state.moments is not None:
@@ -218,7 +218,7 @@ class RolloutService:
             buffers = self._moments.buffers()
         flat, flat_buffers = self.policy.flat(parameters), self.policy.flat_buffers(buffers)
         with self._lock:
-            self._service.publish(self._version + 1, flat, flat_buffers, deal=False)
+            self._hub.publish(self._version + 1, flat, flat_buffers, deal=False)
         self._version += 1
         self._published = True
         return self._version
@@ -253,12 +253,12 @@ class RolloutService:
         if not self._published:
             raise UsageError("rollout service: expected weights before the first batch; call publish")
         with self._lock, self._interrupts:
-            arrived = self._service.gather()
+            arrived = self._hub.gather()
         batch = self._batch(arrived)
         self.env_steps += batch.env_steps
         self._window.extend(batch.episodes)
         with self._lock:
-            self._service.report(self._progress(self._version - batch.version))
+            self._hub.report_progress(self._progress(self._version - batch.version))
         return batch
 
     def __iter__(self) -> Iterator[RolloutBatch]:
@@ -286,7 +286,7 @@ class RolloutService:
             check_at_least(f"evaluate: {name}", value, least)
         plan = EvaluationPlan.of(episodes, seed, EVALUATION_COPIES, max_steps)
         with self._lock, self._interrupts:
-            return self._service.evaluate(plan, lambda played, env_steps: None)
+            return evaluation_of(self._hub.evaluate(plan, lambda played, env_steps: None), self.run.facts)
 
     # ---------------------------------------------------------------- saving, and what else there is to know
 
@@ -309,7 +309,7 @@ class RolloutService:
         """
         self._check_open()
         with self._lock:
-            snapshot = self._service.snapshot()
+            snapshot = self._hub.snapshot()
         state = ServiceState(
             env=self.run.env.id,
             policy=digest(self.run.policy),
@@ -332,7 +332,7 @@ class RolloutService:
         16
         """
         with self._lock:
-            return self._service.snapshot().ledger.counts()
+            return self._hub.snapshot().ledger.counts()
 
     def lags(self) -> dict[str, int]:
         """Number of rollouts used, by lag.
@@ -345,7 +345,7 @@ class RolloutService:
         {'0': 1}
         """
         with self._lock:
-            return self._service.lag_histogram()
+            return self._hub.weight_age.histogram()
 
     def workers(self) -> list[str]:
         """The names of the workers that have joined.
@@ -356,7 +356,7 @@ class RolloutService:
         ['w0']
         """
         with self._lock:
-            return sorted(member.hello.worker for member in self._service.snapshot().members)
+            return sorted(member.hello.worker for member in self._hub.snapshot().members)
 
     def close(self, reason: str = "the learner has ended") -> None:
         """Ask the workers to leave, and release everything. Does nothing the second time.
@@ -370,7 +370,7 @@ class RolloutService:
         self._over.set()
         self._thread.join()
         try:
-            self._service.drain(reason)
+            self._hub.drain(reason)
         finally:
             self._resources.close()
 
@@ -390,7 +390,7 @@ class RolloutService:
         """Answer the workers while the user computes. `publish`, `gather` and `evaluate` do it themselves."""
         while not self._over.wait(PULSE_S):
             with self._lock:
-                self._service.pulse()
+                self._hub.pulse()
 
     def _batch(self, arrived: Sequence[AcceptedRollout]) -> RolloutBatch:
         stacked = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])

@@ -41,7 +41,7 @@ class Audience:
         dataset: TrainingRecorder | None,
     ) -> None:
         """`requests`: what callbacks ask for. `dataset` gets the episodes of training. It is closed with the audience."""
-        self._config, self._service, self._tally, self._state = run.config, run.service, run.tally, run.tally.state
+        self._config, self._hub, self._tally, self._state = run.config, run.hub, run.tally, run.tally.state
         self._callbacks, self._files, self._requests, self._dataset = callbacks, files, requests, dataset
         self._settings = msgspec.to_builtins(run.config)
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
@@ -88,8 +88,8 @@ class Audience:
     def updated(self, metrics: Mapping[str, float]) -> None:
         """The update that was counted last was published."""
         self._say_missing_facts()
-        self._workers_alive = self._service.workers_alive()
-        snapshot = self._service.snapshot()
+        self._workers_alive = self._hub.workers_alive()
+        snapshot = self._hub.snapshot()
         self._update = {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
         progress = self._progress(snapshot)
         self._write_row(progress, metrics)
@@ -139,7 +139,7 @@ class Audience:
 
     def progress(self) -> Progress:
         """The progress of the run."""
-        return self._progress(self._service.snapshot())
+        return self._progress(self._hub.snapshot())
 
     # ---------------------------------------------------------------- inside
 
@@ -158,7 +158,7 @@ class Audience:
             lag_mean=sum(lags) / len(lags),
             lag_max=max(lags),
             workers_alive=self._workers_alive,
-            workers_expected=self._service.workers_expected,
+            workers_expected=self._hub.workers_expected,
             ledger=snapshot.ledger.counts(),
             stages=tally.stages(snapshot),
             note=tally.note,
@@ -173,7 +173,7 @@ class Audience:
 
     def _write_row(self, progress: Progress, metrics: Row) -> None:
         self._files.write_row(progress, metrics)
-        self._service.report(progress)
+        self._hub.report_progress(progress)
 
     def _write_logged(self) -> None:
         """Add what callbacks logged to the row of this update, if there was one."""

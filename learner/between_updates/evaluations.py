@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from learner.between_updates.run_parts import RunParts
 from learner.config.run_rules import EvaluationSize, evaluation_size, final_evaluation_size
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Best, Evaluation
 from protocol.errors import UsageError
 from protocol.logs.notices import log_notice
@@ -85,7 +85,7 @@ class Evaluations:
                 return None
             state.best_policy = parameters, buffers
         chosen_by, at_env_steps = state.best
-        self._run.service.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
+        self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
         confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
@@ -102,9 +102,9 @@ class Evaluations:
         """Evaluate the weights that were published last."""
         config, began_s = self._config, time.monotonic()
         plan = EvaluationPlan.of(size.episodes, config.seed, config.eval_copies, size.max_steps, purpose)
-        found = self._run.service.evaluate(plan, lambda played, env_steps: watch())
+        played = self._run.hub.evaluate(plan, lambda played, env_steps: watch())
         self._tally.evaluate_s += time.monotonic() - began_s
-        return found
+        return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, found: Evaluation) -> None:
         """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""

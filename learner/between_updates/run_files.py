@@ -37,7 +37,7 @@ class RunFiles:
 
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
         """Removes the rows of updates that the checkpoint of a resumed run knows nothing of. Raises `RunError`."""
-        self._config, self._spec, self._folder, self._algorithm, self._service, self._tally = run
+        self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
         self._state, self._evaluations, self._attributes = run.tally.state, evaluations, attributes
         self.path = one_line(str(run.folder.path))
         self.checkpoint = ""
@@ -165,7 +165,7 @@ class RunFiles:
     def _write_state(self) -> None:
         """Write the policy and a checkpoint. Raises `RunError` if the disk refuses one of them; the other one is written."""
         self._make_folder_again()
-        spec, env_steps, snapshot = self._spec, self._state.env_steps, self._service.snapshot()
+        spec, env_steps, snapshot = self._spec, self._state.env_steps, self._hub.snapshot()
         state = msgspec.structs.replace(
             self._state,
             wall_s=self._tally.wall_s(snapshot),
@@ -193,7 +193,7 @@ class RunFiles:
         return state.version, state.next_evaluation, state.best, self._attributes.changes
 
     def _summary(self, reason: str, cut_short: bool) -> Summary:
-        config, state, tally, snapshot = self._config, self._state, self._tally, self._service.snapshot()
+        config, state, tally, snapshot = self._config, self._state, self._tally, self._hub.snapshot()
         wall_s = tally.wall_s(snapshot)
         return Summary(
             env=config.env,
@@ -210,8 +210,8 @@ class RunFiles:
             evaluation=self._evaluations.of_newest(),
             best=self._evaluations.confirmed,
             ledger=snapshot.ledger.counts(),
-            lags=self._service.lag_histogram(),
-            first_use_s=self._service.first_use_s(),
+            lags=self._hub.weight_age.histogram(),
+            first_use_s=self._hub.weight_age.first_use_s(),
             stages=tally.stages(snapshot),
             versions=versions(),
         )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from learner.algorithms import Algorithm
 from learner.between_updates.tally import Tally
 from learner.config.config import Config
-from learner.rollout_service.service import RolloutService
+from learner.rollouts.hub import Hub
 from learner.run_folder.run_folder import RunFolder
 from protocol.specs import RunSpec
 
@@ -19,5 +19,5 @@ class RunParts(NamedTuple):
     spec: RunSpec
     folder: RunFolder
     algorithm: Algorithm
-    service: RolloutService
+    hub: Hub
     tally: Tally

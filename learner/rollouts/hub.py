@@ -1,5 +1,6 @@
 """The hub: link, ticket coordinator and clock together. A training loop waits only in `gather` and in `evaluate`.
 
+It is all that `learner.train` knows of the rest, and what `millrace.RolloutService` gives to a user's own loop.
 Rule: every wait has a deadline and says what it waits for.
 """
 
@@ -241,6 +242,11 @@ class Hub:
     def report_progress(self, progress: Progress) -> None:
         """Store the progress of the run for `millrace status`."""
         self._progress = progress
+
+    @property
+    def workers_expected(self) -> int:
+        """Number of worker processes that the user asked for; 0: any number."""
+        return self._processes.expected
 
     def workers_alive(self) -> int:
         """Number of processes that step the environment."""

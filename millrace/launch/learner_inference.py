@@ -17,11 +17,11 @@ from pathlib import Path
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.config.validation import workers_to_wait_for
+from learner.conversations import describe_settings
 from learner.interrupts import Interrupts
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
 from learner.resume_checks import Resumption
-from learner.rollout_service.service import describe_settings
 from learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from learner.torch_setup import one_thread, torch_device
 from learner.vector_env.settings import VectorEnvSettings
@@ -78,7 +78,7 @@ def train(
         with interrupts, one_thread():
             run = open_run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
             # The learner's own endpoint is inproc: `millrace status` asks where the workers join.
-            env.hub.status_of_run = run.service.status
+            env.hub.status_of_run = run.hub.status
             run.announce(env.address, config.advertise, listening.endpoint.keyring)
             run.train(1)
         return folder.path

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Literal
 
 from learner.config.rollout_config import RolloutConfig
+from learner.conversations import describe_settings
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.policy_player import PolicyPlayer, SavedPolicy
-from learner.rollout_service.service import describe_settings
 from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread, step_lanes

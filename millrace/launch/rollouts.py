@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import workers_to_wait_for
+from learner.conversations import describe_settings, open_hub, rollout_spec
 from learner.env_spaces import EnvSpaces
 from learner.members.describe import described_by_workers
 from learner.members.endpoint import BindSettings
-from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
-from learner.rollout_service.spec import rollout_spec
+from learner.rollouts.hub import Hub
 from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import stopped_on_error, worker_cores
@@ -29,9 +29,9 @@ from workers.supervise.supervisor import core_flags, timeout_flags
 
 @dataclass(frozen=True)
 class StartedService:
-    """A service whose workers have joined."""
+    """A hub whose workers have joined."""
 
-    service: RolloutService
+    hub: Hub
     run: RunSpec
     described: DescribedEnv
 
@@ -68,6 +68,6 @@ def start(
         spaces = EnvSpaces.of_description(described, config.action_masks)
         policy_spec = policy.spec(spaces.observation, spaces.action)
         run = rollout_spec(config, env, policy_spec, rollout_steps, policy.extra_arrays, masked=spaces.masked)
-        service = rollout_service(config, run, link, processes, check_interrupt, past=past)
-        service.wait_for_workers(workers)
-    return StartedService(service, run, described)
+        hub = open_hub(config, run, link, processes, check_interrupt, past=past)
+        hub.wait_for(workers)
+    return StartedService(hub, run, described)

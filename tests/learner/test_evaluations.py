@@ -14,19 +14,19 @@ from learner.between_updates.evaluations import Evaluations
 from learner.between_updates.run_parts import RunParts
 from learner.between_updates.tally import Tally
 from learner.config.config import Config
-from learner.rollout_service.service import RolloutService
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
+from learner.rollouts.hub import Hub
 from learner.run_folder.atomic_write import Writes
-from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
 from millrace.cli.flags import EvaluateFlags
 from protocol.bounds import LARGEST
+from protocol.rollout import Episode
 from tests.support.fake_ends import run_spec
 
 
 class Fakes:
-    """An algorithm whose weights are the number of evaluations so far, a service that finds `returns` in turn, a folder."""
+    """An algorithm whose weights are the number of evaluations so far, a hub that finds `returns` in turn, a folder."""
 
     def __init__(self, *returns: float) -> None:
         self.returns: Iterator[float] = iter(returns)
@@ -40,10 +40,10 @@ class Fakes:
     def weights(self) -> Any:
         return np.array([self.evaluated], np.float32), np.zeros(0, np.float32)
 
-    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int, int], None]) -> Evaluation:
+    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
         self.evaluated += 1
         self.seeds.append(plan.seeds)
-        return Evaluation(episodes=len(plan.seeds), return_mean=next(self.returns), return_std=0.0, length_mean=1.0)
+        return [PlayedEpisode(Episode(next(self.returns), 1, 0.0), cut=False)] * len(plan.seeds)
 
     def publish(self, version: int, *weights: Any, deal: bool) -> None:
         pass
@@ -53,9 +53,9 @@ class Fakes:
 
     def evaluations(self, every: int, state: RunState, seed: int = 1) -> tuple[Tally, Evaluations]:
         config = Config(eval_every=every, eval_episodes=10, seed=seed)
-        folder, algorithm, service = cast(RunFolder, self), cast(Algorithm, self), cast(RolloutService, self)
+        folder, algorithm, hub = cast(RunFolder, self), cast(Algorithm, self), cast(Hub, self)
         tally = Tally(config, run_spec(), state)
-        return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, service, tally), None)
+        return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, tally), None)
 
 
 def due(parts: tuple[Tally, Evaluations], *env_steps: int) -> list[int]:

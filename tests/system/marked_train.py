@@ -101,33 +101,33 @@ class Marker:
 
     def wrap(self) -> None:
         """Wrap the functions in which the phases of a learner begin."""
-        from learner.rollout_service.service import RolloutService
+        from learner.rollouts.hub import Hub
         from learner.run_folder import checkpoint
         from learner.run_folder.run_folder import RunFolder
 
-        gather, publish, save = RolloutService.gather, RolloutService.publish, checkpoint.save
+        gather, publish, save = Hub.gather, Hub.publish, checkpoint.save
 
-        def marked_gather(service: RolloutService, *args: Any) -> Any:
-            found = self.during(Phase.COLLECTING, gather, Phase.UPDATING)(service, *args)
+        def marked_gather(hub: Hub, *args: Any) -> Any:
+            found = self.during(Phase.COLLECTING, gather, Phase.UPDATING)(hub, *args)
             self._gathered += 1
             return found
 
-        def marked_publish(service: RolloutService, version: int, *args: Any, **kwargs: Any) -> None:
+        def marked_publish(hub: Hub, version: int, *args: Any, **kwargs: Any) -> None:
             if self._marks.first < 0:
                 self.mark(first=version, whole=version)
             elif version == self._marks.first + self._gathered:  # the best policy is published under a number beyond it
                 self.mark(whole=version, phase=Phase.RECORDING)
-            publish(service, version, *args, **kwargs)
+            publish(hub, version, *args, **kwargs)
 
         def marked_save(folder: Path, state: dict[str, Any], *args: Any) -> Path:
             found = self.during(Phase.CHECKPOINTING, save)(folder, state, *args)
             self.mark(saved=state["past"]["version"])
             return found
 
-        RolloutService.gather = marked_gather  # type: ignore[assignment,method-assign]
-        RolloutService.publish = marked_publish  # type: ignore[assignment]
-        RolloutService.evaluate = self.during(Phase.EVALUATING, RolloutService.evaluate)  # type: ignore[method-assign]
-        RolloutService.drain = self.during(Phase.DRAINING, RolloutService.drain, Phase.LEAVING)  # type: ignore[method-assign]
+        Hub.gather = marked_gather  # type: ignore[assignment,method-assign]
+        Hub.publish = marked_publish  # type: ignore[assignment]
+        Hub.evaluate = self.during(Phase.EVALUATING, Hub.evaluate)  # type: ignore[method-assign]
+        Hub.drain = self.during(Phase.DRAINING, Hub.drain, Phase.LEAVING)  # type: ignore[method-assign]
         checkpoint.save = marked_save  # type: ignore[assignment]
         RunFolder.write_policy = self.during(Phase.CHECKPOINTING, RunFolder.write_policy)  # type: ignore[method-assign]
 

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("jax")
 
 from examples.ppo_jax import Settings, train
-from learner.rollout_service.saved_state import read
+from millrace.saved_state import read
 from tests.system.network import Network
 from tests.system.processes import ROOT, START_S, Stage, wait_for
 

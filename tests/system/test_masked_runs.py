@@ -15,7 +15,7 @@ import pytest
 
 import millrace
 from learner.config.layers import resolve
-from learner.rollout_service.spec import rollout_spec
+from learner.conversations import rollout_spec
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import MillraceError, UsageError

@@ -9,9 +9,9 @@ from typing import cast
 import pytest
 
 from learner.config.rollout_config import RolloutConfig
+from learner.conversations import open_hub
 from learner.members.events import WorkerLeft, WorkerProcessFailed
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollout_service.service import rollout_service
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
 from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
@@ -314,5 +314,5 @@ def test_with_a_limit_of_copies_as_few_workers_play_evaluations_as_it_allows(mos
 @pytest.mark.parametrize(("of_run", "of_machine", "least"), [(0, 0, 0), (9, 0, 9), (0, 7, 7), (9, 7, 7), (7, 9, 7)])
 def test_a_run_keeps_within_its_own_limit_of_copies_and_its_machine_s(of_run: int, of_machine: int, least: int) -> None:
     config, processes = RolloutConfig(max_env_copies=of_run), ProcessCallbacks(most_copies=of_machine)
-    service = rollout_service(config, run_spec(), cast(LearnerLink, FakeLink()), processes, lambda: None)
-    assert service._hub.coordinator.evaluation.most_copies == (least - 4 if least else None)
+    hub = open_hub(config, run_spec(), cast(LearnerLink, FakeLink()), processes, lambda: None)
+    assert hub.coordinator.evaluation.most_copies == (least - 4 if least else None)

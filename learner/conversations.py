@@ -1,0 +1,129 @@
+"""The two conversations that a learner has with its workers, made from its settings: rollouts, and the description.
+
+A run's specification is what `Welcome` carries in the first, for our training and for a user's own loop.
+Who starts worker processes is not known here: the launchers in `millrace` pass them in as `ProcessCallbacks`. Imports no
+torch.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+
+from learner.config.rollout_config import RolloutConfig
+from learner.members.describe import DescribeSettings
+from learner.members.process_callbacks import ProcessCallbacks
+from learner.rollouts.hub import Hub, HubObserver, HubSettings
+from learner.rollouts.ledger import Ledger
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+from protocol.env_spec import EnvSpec
+from protocol.errors import UsageError
+from protocol.policy.layout import acting_size
+from protocol.specs import ExtraArray, PolicySpec, RunSpec
+from protocol.wire.codec import check_can_be_sent
+from protocol.wire.compression import why_no_zstd
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.socket_options import MAX_FRAME_BYTES
+
+
+def rollout_spec(
+    config: RolloutConfig,
+    env: EnvSpec,
+    policy: PolicySpec,
+    rollout_steps: int,
+    extras: tuple[ExtraArray, ...] = (),
+    *,
+    masked: bool = False,
+) -> RunSpec:
+    """The specification that `Welcome` carries. Raises `UsageError` if it cannot be sent, or settings and policy do not fit.
+
+    `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
+    `masked`: whether workers read masks of the allowed actions.
+    """
+    if masked and config.chosen_vector() == "envpool":
+        raise UsageError(
+            "vector envpool: its environments report no action masks; use --vector loop, or --action-masks none"
+        )
+    if config.compress == "zstd" and (why := why_no_zstd()):
+        raise UsageError(why)
+    if config.images_dtype != "float32" and not policy.convolves:
+        raise UsageError(
+            f"images_dtype {config.images_dtype}: expected float32, for this policy has no convolutions of ours"
+        )
+    run = RunSpec(
+        env=env,
+        policy=policy,
+        rollout_steps=rollout_steps,
+        copies=config.envs // config.lanes,
+        lanes=config.lanes,
+        seed=config.seed,
+        vector=config.chosen_vector(),
+        compress=config.compress,
+        images_dtype=config.images_dtype,
+        masked=masked,
+        extras=extras,
+        facts=config.fact_names(),
+        heartbeat_s=config.heartbeat_s,
+    )
+    _check_weights_can_be_sent(env.id, policy, config)
+    check_can_be_sent(env.id, run)
+    return run
+
+
+def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: RolloutConfig) -> None:
+    """Also a space of few arrays may make a policy too large to allocate: a `Discrete` of 2**53 values."""
+    size = acting_size(policy) * (4 if config.weights_dtype == "float32" else 2)
+    if size > MAX_FRAME_BYTES:
+        raise UsageError(
+            f"environment {env}: expected a policy whose weights take at most {MAX_FRAME_BYTES:,} bytes, got {size:,}; wrap "
+            "the environment so that its spaces are smaller, or choose a smaller net"
+        )
+
+
+def open_hub(
+    config: RolloutConfig,
+    run: RunSpec,
+    link: LearnerLink,
+    processes: ProcessCallbacks,
+    check_interrupt: Callable[[], None],
+    observer: HubObserver = lambda hub: None,
+    past: tuple[Ledger, Sequence[int]] | None = None,
+) -> Hub:
+    """The hub of a run for the workers that connect to this link. An update takes one rollout for each lane.
+
+    `processes`: the worker processes that this program started. `check_interrupt` is called while the hub waits: what it
+    raises ends the wait. `observer` is called each time the hub has listened. `past`: the ledger, and the next
+    incarnation of each lane, of a run that goes on.
+    """
+    ledger, incarnations = (None, ()) if past is None else past
+    coordinator = TicketCoordinator(
+        run,
+        max_lag=config.max_lag,
+        worker_timeout_s=config.worker_timeout_s,
+        first_session=int.from_bytes(os.urandom(6), "little"),
+        ledger=ledger,
+        incarnations=incarnations,
+    )
+    limits = [most for most in (config.max_env_copies, processes.most_copies) if most]
+    if limits:
+        coordinator.evaluation.most_copies = min(limits) - run.lanes * run.copies
+    settings = HubSettings(
+        config.no_workers_timeout_s,
+        config.stall_timeout_s,
+        config.max_env_failures,
+        config.weights_dtype,
+        config.call_timeouts(),
+    )
+    return Hub(link, coordinator, settings, processes, check_interrupt, observer)
+
+
+def describe_settings(config: RolloutConfig, steps: int = 0) -> DescribeSettings:
+    """The settings of the conversation in which a worker describes the environment. `steps`: env steps of the run."""
+    return DescribeSettings(
+        worker_timeout_s=config.worker_timeout_s,
+        no_workers_timeout_s=config.no_workers_timeout_s,
+        stall_timeout_s=config.stall_timeout_s,
+        max_env_failures=config.max_env_failures,
+        steps=steps,
+        launched_workers=config.launched_workers,
+    )
