@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from learner.algorithms.kernels import networks
+from learner.algorithms.kernels import trained_networks
 
 
 class Contest(NamedTuple):
@@ -29,13 +29,13 @@ class Contest(NamedTuple):
 @contextmanager
 def passes_in_torch(all_of_them: bool) -> Iterator[None]:
     """Networks that are made here pass in torch: all of them, or those that are not small or not on the CPU, as in a run."""
-    is_small = networks.is_small
+    is_small = trained_networks.is_small
     if all_of_them:
-        networks.is_small = lambda spec, device: False
+        trained_networks.is_small = lambda spec, device: False
     try:
         yield
     finally:
-        networks.is_small = is_small
+        trained_networks.is_small = is_small
 
 
 def repeated(work: Callable[[], object], times: int) -> float:

@@ -23,7 +23,7 @@ from protocol.messages import ToLearner
 from protocol.rollout import Rollout
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_worker, encode
-from workers.conversation.session import Effect, Identity, Leave, RolloutTask, Send, Session
+from workers.conversation.session import Leave, RolloutTask, SendMessage, Session, WorkerEffect, WorkerIdentity
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 STEPS, COPIES = 32, 8  # T, N: 9 KB
@@ -73,7 +73,7 @@ class Simulated:
         name = f"w{number}"
         self.socket.routing_id = name.encode()
         self.socket.connect(address)
-        self._session = Session(Identity(name, "simulated", os.getpid(), number, "0"), time.monotonic())
+        self._session = Session(WorkerIdentity(name, "simulated", os.getpid(), number, "0"), time.monotonic())
         self._canned: Rollout | None = None
         self.left = False
 
@@ -121,9 +121,9 @@ class Simulated:
             for each in task.assignments
         ]
 
-    def _do(self, effects: Sequence[Effect]) -> None:
+    def _do(self, effects: Sequence[WorkerEffect]) -> None:
         for effect in effects:
-            if isinstance(effect, Send):
+            if isinstance(effect, SendMessage):
                 self._say(effect.message)
             elif isinstance(effect, Leave):
                 self.left = True

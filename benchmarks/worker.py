@@ -32,7 +32,7 @@ from protocol.envs.description import read_description
 from protocol.policy.layout import buffer_size, parameter_layout, total_size
 from protocol.specs import DescribeSpec
 from protocol.wire.learner_link import LearnerLink
-from workers.describe import describing
+from workers.described_copy import describing
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 CASES = {

@@ -48,7 +48,7 @@ DRAIN_S = 2.0  # for the workers to leave, when a run is cut short
 
 
 @dataclass(frozen=True)
-class Run:
+class OpenRun:
     """A learner that listens to workers and has not begun to train. `open_run` makes it."""
 
     setup: RunSetup
@@ -124,7 +124,9 @@ class Run:
             raise Interrupted(self.setup.folder.path)
 
 
-def open_run(setup: RunSetup, link: LearnerLink, processes: ProcessCallbacks, watch: Watch, observer: HubObserver) -> Run:
+def open_run(
+    setup: RunSetup, link: LearnerLink, processes: ProcessCallbacks, watch: Watch, observer: HubObserver
+) -> OpenRun:
     """The run of this setup, whose folder is ready. Raises `MillraceError`.
 
     `watch`: the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
@@ -151,7 +153,7 @@ def open_run(setup: RunSetup, link: LearnerLink, processes: ProcessCallbacks, wa
     tally = Tally(config, spec, state, lambda: callbacks.stop_reason)
     parts = RunParts(config, spec, folder, algorithm, hub, tally)
     between = open_files(parts, callbacks, dataset, setup.known.evaluation_limit)
-    run = Run(setup, algorithm, hub, between, prior)
+    run = OpenRun(setup, algorithm, hub, between, prior)
     hub.report_progress(between.audience.progress())
     if setup.resumed:
         log_notice(log, between.files.continues())

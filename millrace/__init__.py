@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from learner.recording.record import RecordedDataset
     from learner.run_folder.progress import Progress
     from learner.run_folder.results import Evaluation, Summary
-    from millrace.acting import LoadedPolicy, load
     from millrace.launch.vector import make_vec
+    from millrace.loaded_policy import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
     from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
     from protocol.envs.env_copy import EnvCopy
-    from workers.env_copy import env_copy
     from workers.envs.reset_ahead import ResetAhead
+    from workers.made_copies import env_copy
 
 __all__ = [
     "CNN",
@@ -95,7 +95,7 @@ _IMPORTED_WHEN_USED = {
     "Callback": "learner.callbacks.callback",
     "EnvCopy": "protocol.envs.env_copy",
     "Evaluation": "learner.run_folder.results",
-    "LoadedPolicy": "millrace.acting",
+    "LoadedPolicy": "millrace.loaded_policy",
     "MLP": "millrace.policies",
     "Moments": "learner.algorithms.moments",
     "OwnPolicy": "millrace.own_policy",
@@ -110,9 +110,9 @@ _IMPORTED_WHEN_USED = {
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
     "Summary": "learner.run_folder.results",
-    "env_copy": "workers.env_copy",
+    "env_copy": "workers.made_copies",
     "evaluate": "millrace.playing",
-    "load": "millrace.acting",
+    "load": "millrace.loaded_policy",
     "make_vec": "millrace.launch.vector",
     "record": "millrace.playing",
     "train": "millrace.runs",

@@ -22,8 +22,8 @@ wrong with a class of either level. A run takes it as `millrace train CartPole-v
 
 The algorithm itself:
 
-- `Algorithm`, the base of all; `GradientDescent`, the base of ours: optimizers, schedules, statistics, `Metrics`, the state;
-  `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`, `Impala` and `REINFORCE`;
+- `Algorithm`, the base of all; `GradientDescent`, the base of ours: optimizers, schedules, statistics, `UpdateMetrics`, the
+  state; `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`, `Impala` and `REINFORCE`;
   `OffPolicy`, the base of those with a replay buffer, of which are `DQN`, `SAC` and `TD3`. The last two share `Continuous`:
   actions in a bounded Box, an exact replay ratio.
 - `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`, the bases of `Config`; `PPOConfig` and so
@@ -62,7 +62,7 @@ from learner.algorithms.algorithm import Algorithm, Start
 from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.dqn import DQN
-from learner.algorithms.gradient_descent import GradientDescent, Metrics, check_finite, scheduled
+from learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import LossInput, Observations
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
@@ -129,7 +129,6 @@ __all__ = [
     "ImpalaConfig",
     "Leaf",
     "LossInput",
-    "Metrics",
     "MixedReplay",
     "ObservationNormalizer",
     "Observations",
@@ -147,6 +146,7 @@ __all__ = [
     "Start",
     "TD3Config",
     "Transitions",
+    "UpdateMetrics",
     "UsageError",
     "check_finite",
     "features",

@@ -12,7 +12,7 @@ import numpy as np
 from millrace.arguments import plain
 from protocol.env_spec import PickledCallable, Scalar, check_arguments
 from protocol.errors import UsageError
-from protocol.policy.own_policy import LOG_PROB
+from protocol.policy.called_policy import LOG_PROB
 from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
 from protocol.wire.codec import DTYPES
 

@@ -29,7 +29,7 @@ from protocol.errors import UsageError, check_at_least, did_you_mean
 NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
 LEAST = {"steps": 1, "episodes": 1, "seed": 0, "workers": 1, "copies": 1, "max_steps": 1, "max_env_failures": 0}
 """The smallest value of each flag that is a number."""
-Watch = Callable[[str], None]
+ShowPlayed = Callable[[str], None]
 """Gets how far it is, as text."""
 _Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
 
@@ -167,7 +167,7 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     return kind(**keywords)
 
 
-def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tuple[Evaluation, list[Path]]:
+def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) -> tuple[Evaluation, list[Path]]:
     """Play greedy episodes. Returns their evaluation, and the paths of the videos if there are any.
 
     Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
@@ -193,7 +193,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
         return evaluation_of(played, saved.facts), []
 
 
-def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) -> RecordedDataset:
+def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
     """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
     _check_least(flags)
     with policy_player(_saved(flags, given), _workers(flags, flags.workers, 1), watch) as player:

@@ -54,7 +54,7 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Alive(Message, frozen=True):
-    """A supervisor speaks for its workers. It is believed if it knows a worker's `life` and uses the same key.
+    """A supervisor speaks for its workers. It is believed if it knows a worker's `process_nonce` and uses the same key.
 
     Once the run is over, it is answered by `Drain`: the supervisor then ends workers that do not leave by themselves.
     """

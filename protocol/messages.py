@@ -45,11 +45,11 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     """the worker's name; also its routing id"""
     host: Line
     pid: Pid
-    process_nonce: Natural = msgspec.field(name="life")  # the name on the wire, as in every version
+    process_nonce: Natural
     """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner"""
     software: Line
     attempt: Natural
-    """`life` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
+    """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
     Hello keeps the number. So it also tells which process a Welcome answers."""
 
     @property

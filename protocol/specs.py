@@ -91,7 +91,7 @@ class EncoderSpec(msgspec.Struct, frozen=True):
 
 
 class OwnPolicySpec(msgspec.Struct, frozen=True):
-    """A policy written by the user, which acts in the workers; see `protocol/policy/own_policy.py`."""
+    """A policy written by the user, which acts in the workers; see `protocol/policy/called_policy.py`."""
 
     factory: str
     """the callable that makes it, as `my_package.policies:make`; or only the name of `code`"""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+from workers import made_copies
+
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
 
@@ -27,7 +29,7 @@ import psutil
 import pytest
 
 from tests.support import preloaded
-from workers import env_copy, slots
+from workers import slots
 from workers.slots import FILE_VARIABLE
 from workers.supervise import worker_process
 
@@ -97,8 +99,8 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
     own_slots: dict[int, slots.Slots] = {}
     monkeypatch.setattr(slots, "_of_processes", own_slots)  # copies that a test does not close hold no slots of another test
-    monkeypatch.setattr(env_copy, "_slots", {})
-    env_copy._of_process.cache_clear()
+    monkeypatch.setattr(made_copies, "_slots", {})
+    made_copies._of_process.cache_clear()
     threads = set(threading.enumerate())
     yield
     for own in own_slots.values():

@@ -12,9 +12,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from protocol.arrays import Array, Bools, Floats
+from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.distributions import distribution
 from protocol.policy.masks import forbid, masked_distribution
-from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.specs import RunSpec
 
@@ -58,9 +58,9 @@ class Acting(Protocol):
         ...
 
 
-def acting_of(run: RunSpec, policy: Policy | OwnPolicy) -> Acting:
+def acting_of(run: RunSpec, policy: Policy | CalledPolicy) -> Acting:
     """How this policy acts in this run."""
-    return _OwnActing(run, policy) if isinstance(policy, OwnPolicy) else _BuiltInActing(run, policy)
+    return _OwnActing(run, policy) if isinstance(policy, CalledPolicy) else _BuiltInActing(run, policy)
 
 
 class _BuiltInActing:
@@ -114,7 +114,7 @@ class _BuiltInActions:
 class _OwnActing:
     """A policy of the user's, called once for each lane."""
 
-    def __init__(self, run: RunSpec, policy: OwnPolicy) -> None:
+    def __init__(self, run: RunSpec, policy: CalledPolicy) -> None:
         self.run, self.policy = run, policy
 
     def load(self, parameters: Floats, buffers: Floats) -> None:

@@ -24,7 +24,7 @@ from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
 from protocol.errors import BadMessage, EnvironmentFailed, PolicyFailed, UsageError, UserFacingError, first_line
 from protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, Weights
-from protocol.policy.own_policy import OwnPolicy
+from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.policy import make_policy
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from protocol.wire.codec import encode
@@ -36,20 +36,20 @@ from workers.collect.collector import Collector
 from workers.conversation.heartbeat_thread import HeartbeatThread
 from workers.conversation.session import (
     CloseLanes,
-    Effect,
     EvaluationTask,
-    Identity,
     Leave,
     RolloutTask,
-    Send,
+    SendMessage,
     Session,
     SharedOrders,
     StartSession,
     Statistics,
     Work,
+    WorkerEffect,
+    WorkerIdentity,
 )
-from workers.conversation.states import State
-from workers.describe import describing
+from workers.conversation.worker_states import WorkerState
+from workers.described_copy import describing
 from workers.evaluate.evaluator import Evaluator
 from workers.exit_codes import EXIT_UNSUITABLE
 from workers.slots import NoSlot, slots
@@ -68,7 +68,7 @@ MakeActors = Callable[[RunSpec], tuple[Collector, Evaluator]]
 
 def make_local_actors(run: RunSpec) -> tuple[Collector, Evaluator]:
     """A collector and an evaluator that have env copies of their own and share a policy."""
-    policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else OwnPolicy(run.policy, run.extras)
+    policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else CalledPolicy(run.policy, run.extras)
     return Collector(run, policy), Evaluator(run, policy)
 
 
@@ -176,7 +176,7 @@ class Worker:
             case EvaluationTask(weights, order):
                 self._loaded_collector(weights)
                 assert self._evaluator is not None
-                return [self._evaluator.play(order, lambda rows: self._do([Send(rows)]), pulse)]
+                return [self._evaluator.play(order, lambda rows: self._do([SendMessage(rows)]), pulse)]
         assert self._stepper is not None
         with self._heartbeats.lock_released():
             return [self._stepper.execute(work, lambda: self._pulse_from_env_code(work))]
@@ -217,7 +217,7 @@ class Worker:
         Without a connection, this drops the Hellos that have piled up for a learner that is not there yet. Only time spent
         listening counts: while a simulator starts or is closed, nothing is read.
         """
-        if self._session.state is not State.JOINING:
+        if self._session.state is not WorkerState.JOINING:
             self._unheard_from_s = self._waited_s
         elif self._waited_s - self._unheard_from_s > CONNECT_AGAIN_S:
             if self._link.connected:
@@ -270,11 +270,11 @@ class Worker:
 
     def _send_from_env_code(self, answer: Stepped) -> None:
         with self._heartbeats.lock_reacquired():
-            self._do([Send(answer)])
+            self._do([SendMessage(answer)])
 
     def _fail(self, error: Exception) -> None:
         """The environment's code or the user's policy raised, or our code on their data: report it to the learner."""
-        if isinstance(error, NoSlot) and self._session.state is not State.LEFT:
+        if isinstance(error, NoSlot) and self._session.state is not WorkerState.LEFT:
             self._decline(error)
             return
         detail = error.detail if isinstance(error, UserFacingError) else traceback.format_exc()
@@ -305,10 +305,10 @@ class Worker:
             self._statistics = Statistics(steps, stages, self._resident_bytes)
             self._session.update_statistics(self._statistics)
 
-    def _do(self, effects: list[Effect]) -> None:
+    def _do(self, effects: list[WorkerEffect]) -> None:
         for effect in effects:
             match effect:
-                case Send(message):
+                case SendMessage(message):
                     self._send(message)
                 case StartSession(run):
                     self._start_session(run)
@@ -395,7 +395,7 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {first_line(error, '')}".strip()
 
 
-def identity(name: str, process_nonce: int | None = None) -> Identity:
+def identity(name: str, process_nonce: int | None = None) -> WorkerIdentity:
     """Identity of this process, or of a thread of it. `process_nonce`: its secret number; None: draw one."""
     try:
         software = f"millrace {version('millrace-rl')}"
@@ -403,7 +403,7 @@ def identity(name: str, process_nonce: int | None = None) -> Identity:
         software = "millrace"
     software = f"{software}, python {platform.python_version()}"
     nonce = int.from_bytes(os.urandom(6), "little") if process_nonce is None else process_nonce
-    return Identity(name, socket.gethostname(), os.getpid(), nonce, software)
+    return WorkerIdentity(name, socket.gethostname(), os.getpid(), nonce, software)
 
 
 def parent_is_gone(parent: int) -> bool:

@@ -41,7 +41,7 @@ export async function work(options, description) {
 class Worker {
   #state = "joining";
   #session = 0; #run = null; #lanes = null; #replies = 0;
-  #life = randomBytes(6).readUIntBE(0, 6); #attempt = this.#life; #activity = new Activity();
+  #nonce = randomBytes(6).readUIntBE(0, 6); #attempt = this.#nonce; #activity = new Activity();
   #joining = 0; #due = 0; #backoff = 0; #heard = 0; #heardWire = 0; // times in seconds
   #reason = ""; #problem = ""; #unreadable = 0; #sending = Promise.resolve();
   #left; #over = new Promise((resolve) => { this.#left = resolve; });
@@ -151,7 +151,7 @@ class Worker {
       this.#due = at + this.#backoff;
       this.#backoff = Math.min(2 * this.#backoff, LONGEST_BACKOFF_S);
       this.#send({
-        type: "Hello", protocol: PROTOCOL_VERSION, worker: this.name, host: line(hostname()), pid: process.pid, life: this.#life,
+        type: "Hello", protocol: PROTOCOL_VERSION, worker: this.name, host: line(hostname()), pid: process.pid, process_nonce: this.#nonce,
         software: "millrace JavaScript client", attempt: this.#attempt,
       });
     } else if (this.#state !== "left") {
@@ -166,7 +166,7 @@ class Worker {
     const stages = { step: stepSeconds, wait: Math.max(0, at - began - stepSeconds) };
     this.#send(["Heartbeat", this.#session, this.#replies, [], this.#lanes.tickets, steps, stages, process.memoryUsage.rss()]);
     if (this.#run.type === "DescribeSpec") return this.#describe(); // it may have been lost
-    this.#send(["Alive", [[this.name, this.#life, doing, Math.max(0, at - since), calls]], []]);
+    this.#send(["Alive", [[this.name, this.#nonce, doing, Math.max(0, at - since), calls]], []]);
   }
 
   #handle(type, fields, frames) {

@@ -8,7 +8,7 @@ class Worker
   def initialize(address, environment, name)
     @address, @environment, @name, @give_up_at = address, environment, name, now + 600 # seconds
     @context, @lock, @lanes, @held, @steps = ZMQ::Context.new, Mutex.new, {}, [], 0
-    @life = @attempt = rand(2**52)
+    @nonce = @attempt = rand(2**52)
     %w[TERM INT].each { |signal| trap(signal) { @stop = true } }
   end
 
@@ -49,7 +49,7 @@ class Worker
 
   def hello
     say({ type: "Hello", protocol: 6, worker: @name, host: Socket.gethostname.encode("UTF-8"),
-          pid: Process.pid, life: @life, software: "millrace.rb", attempt: @attempt })
+          pid: Process.pid, process_nonce: @nonce, software: "millrace.rb", attempt: @attempt })
     @next_at, @pause_s = now + @pause_s, [2 * @pause_s, 4].min
   end
 

@@ -25,7 +25,7 @@ from learner.algorithm_check.toy_batches import (
     ACTIONS,
     CHOICES,
     OBSERVATION,
-    Acting,
+    ToyActor,
     identity_batch,
     noise_batch,
     with_other_invalid_rows,
@@ -54,7 +54,7 @@ SEED = 3
 Pulse = Callable[[], None]
 
 
-class Stopped(Exception):
+class StoppedByPulse(Exception):
     """What a pulse raises here."""
 
 
@@ -140,7 +140,7 @@ def _with_batches(subject: Subject, found: list[str]) -> Subject:
     before = _weights(algorithm)
     goes_on = MOST_WARM_UP
     while goes_on:
-        acting = Acting(subject.policy, *_weights(algorithm))
+        acting = ToyActor(subject.policy, *_weights(algorithm))
         batch = noise_batch(acting, subject.steps, generator, fresh=not batches)
         batches.append(copy.deepcopy(batch))
         algorithm.update(batch, pulse)
@@ -285,7 +285,7 @@ def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
         pulse = _stopping() if stop else _no_pulse
         try:
             disturbed.update(copy.deepcopy(third), pulse)
-        except Stopped:
+        except StoppedByPulse:
             pass
         else:
             if stop:
@@ -333,7 +333,7 @@ def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
     box = subject.policy.action.kind == "box"
     goal = math.nan
     while env_steps < LEARNING_STEPS:
-        acting = Acting(subject.policy, *_weights(algorithm))
+        acting = ToyActor(subject.policy, *_weights(algorithm))
         batch, reward = identity_batch(acting, subject.steps, generator)
         rewards.append(reward)
         if len(rewards) == MEASURED_BATCHES:
@@ -369,13 +369,13 @@ def _no_pulse() -> None:
 
 
 def _stopping() -> Pulse:
-    """A pulse that raises `Stopped` when it is called for the second time."""
+    """A pulse that raises `StoppedByPulse` when it is called for the second time."""
     calls = [0]
 
     def pulse() -> None:
         calls[0] += 1
         if calls[0] == 2:
-            raise Stopped
+            raise StoppedByPulse
 
     return pulse
 

@@ -28,7 +28,7 @@ LANES, COPIES = 2, 4
 GARBAGE_REWARD = 50.0  # on rows that are not valid
 
 
-class Acting(NamedTuple):
+class ToyActor(NamedTuple):
     """A policy and its weights."""
 
     spec: PolicySpec
@@ -36,7 +36,7 @@ class Acting(NamedTuple):
     buffers: Floats
 
 
-def noise_batch(acting: Acting, steps: int, generator: np.random.Generator, fresh: bool) -> Batch:
+def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fresh: bool) -> Batch:
     """Random observations and rewards; an episode ends on one of seven rows. `fresh`: the lanes begin here."""
     columns = LANES * COPIES
     obs = generator.normal(1, 2, (steps + 1, columns, CHOICES)).astype(np.float32)
@@ -47,10 +47,10 @@ def noise_batch(acting: Acting, steps: int, generator: np.random.Generator, fres
         ended[t] &= valid[t]
     terminated = ended & (generator.random((steps, columns)) < 0.5)
     reward = generator.normal(1, 2, (steps, columns)).astype(np.float32)
-    return _batch(acting, generator, obs, _Rows(reward, terminated, ended & ~terminated, valid), fresh)
+    return _batch(acting, generator, obs, _OtherColumns(reward, terminated, ended & ~terminated, valid), fresh)
 
 
-def identity_batch(acting: Acting, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
+def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
     """The identity environment: the right action is what is observed. Also returns the mean reward.
 
     Each episode has one step. Discrete actions: reward 1 for the right choice. Box: minus the squared distance.
@@ -61,7 +61,9 @@ def identity_batch(acting: Acting, steps: int, generator: np.random.Generator) -
     valid = np.zeros((steps, columns), bool)
     valid[::2] = True
     none = np.zeros((steps, columns), bool)
-    batch = _batch(acting, generator, obs, _Rows(np.zeros((steps, columns), np.float32), valid.copy(), none, valid), False)
+    batch = _batch(
+        acting, generator, obs, _OtherColumns(np.zeros((steps, columns), np.float32), valid.copy(), none, valid), False
+    )
     if acting.spec.action.kind == "box":
         reward = -np.square(batch.action - obs[:-1, :, :2]).sum(-1)
     else:
@@ -99,7 +101,7 @@ def with_rewards(batch: Batch, reward: float) -> Batch:
     return msgspec.structs.replace(batch, reward=np.where(batch.valid, np.float32(reward), batch.reward))
 
 
-class _Rows(NamedTuple):
+class _OtherColumns(NamedTuple):
     """What a row says besides observation and action. [T, ΣN] each."""
 
     reward: Floats
@@ -108,7 +110,7 @@ class _Rows(NamedTuple):
     valid: Bools
 
 
-def _batch(acting: Acting, generator: np.random.Generator, obs: Array, rows: _Rows, fresh: bool) -> Batch:
+def _batch(acting: ToyActor, generator: np.random.Generator, obs: Array, rows: _OtherColumns, fresh: bool) -> Batch:
     """A batch in which the policy acts on these observations [T+1, ΣN, CHOICES]."""
     steps, columns = rows.valid.shape
     policy, over = make_policy(acting.spec), distribution(acting.spec)

@@ -20,9 +20,9 @@ from learner.algorithms import losses
 from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.gradient_descent import Metrics, clip_norm
-from learner.algorithms.kernels.networks import actor_critic_network
+from learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
 from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
+from learner.algorithms.kernels.trained_networks import actor_critic_network
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, flat_tensor
 from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
@@ -46,7 +46,7 @@ class Estimates(NamedTuple):
     target: Floats  # the critic is trained to predict these
     values: Floats  # [T+1, ΣN] the values from which advantages and targets were computed
     used: Bools  # True for the rows to learn from; all of these are valid
-    metrics: Metrics  # without the prefix "train/"
+    metrics: UpdateMetrics  # without the prefix "train/"
 
 
 class ActorCritic(Clones):
@@ -128,13 +128,13 @@ class ActorCritic(Clones):
         found: bool = self.config.normalize_advantage
         return found
 
-    def stops(self, metrics: Metrics) -> bool:
+    def stops(self, metrics: UpdateMetrics) -> bool:
         """Whether a minibatch with these metrics ends the update, before its gradient step is taken."""
         return False
 
     # ---------------------------------------------------------------- an update
 
-    def update(self, batch: Batch, pulse: Pulse) -> Metrics:
+    def update(self, batch: Batch, pulse: Pulse) -> UpdateMetrics:
         """Learn from a batch, calling `pulse` between minibatches. Returns metrics with the names of Stable-Baselines3.
 
         Raises `RunError` when a loss, a logged number or the norm of a gradient is not finite, before the step; and when
@@ -147,7 +147,7 @@ class ActorCritic(Clones):
         self.count(batch)
         reward = self.scaled(batch.reward)
         estimates: list[Estimates] = []
-        epochs: list[list[Metrics]] = []
+        epochs: list[list[UpdateMetrics]] = []
         ended = False
         while len(epochs) < self.n_epochs and not ended:
             if not estimates or self.estimates_each_epoch:
@@ -172,7 +172,7 @@ class ActorCritic(Clones):
         while True:
             yield single or rows.shuffled(estimates.used, count, self.generator)
 
-    def step(self, minibatch: Minibatch) -> tuple[Metrics, bool]:
+    def step(self, minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
         """One gradient step on a minibatch. Returns what was measured before it, and whether that ends the update instead.
 
         Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the logged numbers and the
@@ -225,7 +225,7 @@ class ActorCritic(Clones):
         # new statistics take effect only after the update. They are published together with the weights.
         self.statistics = self.normalizer.buffers()
 
-    def metrics(self, epochs: Sequence[Sequence[Metrics]], estimates: Sequence[Estimates]) -> Metrics:
+    def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
         """The metrics of an update: means over its gradient steps and estimates, and the state of the schedules."""
         found = self.means(step for epoch in epochs for step in epoch)
         found["train/learning_rate"] = self.learning_rate

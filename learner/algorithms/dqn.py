@@ -15,9 +15,9 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
-from learner.algorithms.gradient_descent import Metrics, clip_norm
-from learner.algorithms.kernels.networks import q_network
+from learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
 from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
+from learner.algorithms.kernels.trained_networks import q_network
 from learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Floats
@@ -85,7 +85,7 @@ class DQN(OffPolicy):
         error = values - self.targets(rows)
         return CriticLoss(LOSSES[self.config.loss](error, rows.weight), error, {"q_mean": values.mean()})
 
-    def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
+    def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
         """One gradient step on a minibatch; then the target network is updated."""
         found = self.loss(rows)
         optimizer = self.optimizers["optimizer"]

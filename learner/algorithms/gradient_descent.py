@@ -26,7 +26,7 @@ from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwo
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
-Metrics = dict[str, float]
+UpdateMetrics = dict[str, float]
 
 ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards"
 
@@ -100,7 +100,7 @@ class GradientDescent(Algorithm):
             self.count(batch)
         self.statistics = self.normalizer.buffers()
 
-    def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> Metrics:
+    def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
         """Write the gradient of a loss into `grad` of the flat tensor of an optimizer, the memory of all its gradients.
 
         Sets it to zero first, and calls `loss.backward()`. Returns the numbers, and `grad_norm`, as floats.
@@ -133,7 +133,7 @@ class GradientDescent(Algorithm):
         raise UsageError(f"{type(self).__name__}.loss: {name}: expected one number to log, got {got}")
 
     @staticmethod
-    def means(measured: Iterable[Mapping[str, float]]) -> Metrics:
+    def means(measured: Iterable[Mapping[str, float]]) -> UpdateMetrics:
         """The mean of each metric over the measurements that have it, with the prefix "train/"."""
         by_name: dict[str, list[float]] = {}
         for each in measured:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from learner.algorithms import losses
 from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.gradient_descent import Metrics, scheduled
+from learner.algorithms.gradient_descent import UpdateMetrics, scheduled
 from learner.algorithms.minibatches import LossInput
 from learner.config.hyperparameters import PPOConfig
 from protocol.errors import UsageError
@@ -41,7 +41,7 @@ class PPO(ActorCritic):
         super().set_schedules()
         self.clip_range = scheduled(self.config.clip_range, self.config.clip_range_schedule, self.remaining())
 
-    def stops(self, metrics: Metrics) -> bool:
+    def stops(self, metrics: UpdateMetrics) -> bool:
         """Whether the KL divergence from the policy that acted is more than 1.5 times `target_kl`."""
         if math.isinf(self._kl_limit):
             return False
@@ -75,7 +75,7 @@ class PPO(ActorCritic):
             "clip_fraction": losses.clip_fraction(log_ratio, self.clip_range),
         }
 
-    def metrics(self, epochs: Sequence[Sequence[Metrics]], estimates: Sequence[Estimates]) -> Metrics:
+    def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
         """Those of `ActorCritic`, the last loss, the KL divergence of the last epoch, the clip range and the epochs so far.
 
         A subclass with a loss of its own logs what it likes: what it does not log is not among them.

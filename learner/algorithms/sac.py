@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from learner.algorithms.algorithm import Start
-from learner.algorithms.gradient_descent import Metrics
+from learner.algorithms.gradient_descent import UpdateMetrics
 from learner.algorithms.kernels.optimizer_step import make_optimizer
 from learner.algorithms.replay.continuous import Continuous
 from learner.algorithms.replay.off_policy import CriticLoss, Transitions
@@ -78,7 +78,7 @@ class SAC(Continuous):
         anew = {"log_temperature": self.log_temperature, "ent_coef_optimizer": {"state": {}}}
         super().start_from(start._replace(state=anew | start.state))
 
-    def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
+    def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
         """One gradient step of the critics, the actor and the temperature; then the target critics move."""
         critic = self.critic_loss(rows)
         measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)

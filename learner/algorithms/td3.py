@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from learner.algorithms.gradient_descent import Metrics
+from learner.algorithms.gradient_descent import UpdateMetrics
 from learner.algorithms.replay.continuous import Continuous
 from learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from learner.config.hyperparameters import TD3Config
@@ -50,7 +50,7 @@ class TD3(Continuous):
         value = self.net.values(x, self.net.params(x).tanh(), constant=True, critics=1)  # [1, B], no gradient for Q
         return -value.mean()
 
-    def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
+    def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
         """One gradient step of the critics, and perhaps one of the actor and the targets."""
         critic = self.critic_loss(rows)
         measured = self.descend("critic", critic.loss, critic.numbers)

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 
 import zmq
 
-from learner.members.endpoint import Listening, join_lines, keyring_for
+from learner.members.bind_settings import Listening, join_lines, keyring_for
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring
 from protocol.logs.notices import log_notice

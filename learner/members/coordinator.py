@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from typing import Generic
 
 from learner.members.events import EnvironmentRaised, Event, Failed
+from learner.members.member_states import MemberState, SentUnusable
 from learner.members.membership import M, Membership, Outgoing
-from learner.members.states import MemberState, SentUnusable
 from protocol.bounds import one_line
 from protocol.messages import (
     Alive,

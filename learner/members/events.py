@@ -36,7 +36,7 @@ class WorkerLeft:
 class WorkerRefused:
     """A worker was refused, and is no member. If it was one, `tickets` of its tickets are dealt again."""
 
-    json_name: ClassVar[str] = "turned"
+    json_name: ClassVar[str] = "refused"
     worker: str
     why: str
     tickets: int = 0
@@ -64,21 +64,21 @@ class Failed:
 class EnvironmentRaised(Failed):
     """A worker's environment raised an exception."""
 
-    json_name: ClassVar[str] = "broke"
+    json_name: ClassVar[str] = "environment_raised"
 
 
 @dataclass(frozen=True)
 class PolicyRaised(Failed):
     """A policy that the user wrote raised in a worker, or returned what no rollout can hold."""
 
-    json_name: ClassVar[str] = "policy_broke"
+    json_name: ClassVar[str] = "policy_raised"
 
 
 @dataclass(frozen=True)
 class WorkerProcessFailed(Failed):
     """A worker's process ended in a way that it did not announce: its environment is to blame, as if it had raised."""
 
-    json_name: ClassVar[str] = "died"
+    json_name: ClassVar[str] = "process_failed"
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class RejoinRequested:
     The `late` transitions that its message carried are counted and not used.
     """
 
-    json_name: ClassVar[str] = "told"
+    json_name: ClassVar[str] = "asked_to_rejoin"
     worker: str
     session: int
     late: int

@@ -33,9 +33,9 @@ from learner.members.events import (
 from learner.members.join_limiter import JoinLimiter
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
+from learner.members.member_states import SentUnusable
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.members.states import SentUnusable
 from protocol.address import advertised_address, name_for_people
 from protocol.bounds import one_line
 from protocol.errors import BadMessage, NoWorkers

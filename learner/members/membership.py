@@ -27,7 +27,7 @@ from learner.members.events import (
     WorkerProcessFailed,
     WorkerRefused,
 )
-from learner.members.states import TABLE, KeyRevoked, MemberState, TimedOut
+from learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import key_of_peer, name_for_people, worker_name
 from protocol.alive import NO_ENVIRONMENT_CODE
 from protocol.bounds import Stage, Stages, escaped, one_line

@@ -31,7 +31,7 @@ class Curve(NamedTuple):
     returns: Doubles  # [K] mean return of the last 100 training episodes
 
 
-class RunFiles(NamedTuple):
+class RunRecord(NamedTuple):
     """The configuration (config.toml) and the rows of metrics of one run folder."""
 
     env: str
@@ -60,7 +60,7 @@ def algorithm_label(algo: str) -> str:
     return name if own else algo.upper()
 
 
-def read_run_files(run: Path) -> RunFiles:
+def read_run_files(run: Path) -> RunRecord:
     """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
     RunFolder.open(run)
     elsewhere = check_format(run).workers_elsewhere
@@ -70,7 +70,7 @@ def read_run_files(run: Path) -> RunFiles:
         rows = read_rows(run / METRICS_FILE)
     except OSError as error:
         raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
-    return RunFiles(env, config["algo"], config["seed"], config, elsewhere, rows)
+    return RunRecord(env, config["algo"], config["seed"], config, elsewhere, rows)
 
 
 def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:

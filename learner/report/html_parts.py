@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from learner.report.charts import COLORS, MINUS
-from learner.report.runs import RunGroup
+from learner.report.reported_runs import RunGroup
 
 
 def section(name: str, about: str, content: str) -> str:

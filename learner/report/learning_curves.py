@@ -17,7 +17,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from learner.report.curve import Curve, common_grid, read_run_files
-from learner.report.runs import RunGroup, group_runs, read_run
+from learner.report.reported_runs import RunGroup, group_runs, read_run
 from learner.run_folder.atomic_write import write_file
 from learner.run_folder.episode_window import WINDOW_EPISODES
 from protocol.errors import UsageError

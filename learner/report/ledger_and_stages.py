@@ -6,7 +6,7 @@ from html import escape
 
 from learner.report.charts import COLORS, MINUS
 from learner.report.html_parts import color_dot, section, time_text
-from learner.report.runs import ReportData
+from learner.report.reported_runs import ReportData
 
 TICKETS = ("issued", ("used", "outstanding", "lost"))
 TRANSITIONS = ("received", ("used", "waiting", "duplicate", "late", "invalid"))

@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 
 from learner.report import ledger_and_stages, sections
-from learner.report.runs import group_runs, read_run
+from learner.report.reported_runs import group_runs, read_run
 from learner.run_folder.atomic_write import write_file
 from protocol.errors import UsageError
 

@@ -15,7 +15,7 @@ import numpy as np
 from learner.report.charts import Series, chart
 from learner.report.curve import common_grid
 from learner.report.html_parts import color_dot, return_text, section, time_text
-from learner.report.runs import ReportData, RunGroup, differing_settings
+from learner.report.reported_runs import ReportData, RunGroup, differing_settings
 from learner.run_folder.episode_window import WINDOW_EPISODES
 from learner.run_folder.regular_files import read
 from learner.run_folder.results import FactMean

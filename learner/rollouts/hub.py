@@ -16,15 +16,15 @@ from typing import NamedTuple, TypeVar
 from learner.members.failure_count import FailureCount
 from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
+from learner.members.member_states import MemberState
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.members.states import MemberState
 from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.run_status import status
 from learner.rollouts.stall_watch import StallWatch, Standstill
-from learner.rollouts.status import status
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.rollouts.waiting import LearnerTime
 from learner.rollouts.weight_age import WeightAge

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from learner.members.coordinator import Coordinator
 from learner.members.events import Failed, PolicyRaised
 from learner.members.lane_placement import LanePlacement, is_spare
+from learner.members.member_states import SentUnusable
 from learner.members.membership import Member, Membership, Outgoing
-from learner.members.states import SentUnusable
 from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.evaluation_tickets import EvaluationPlan, EvaluationTickets, OnRows
 from learner.rollouts.ledger import Ledger

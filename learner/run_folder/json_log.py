@@ -1,8 +1,8 @@
 """The log as JSON, one event per line (`--log-json`).
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
-"left", "turned", "broke", "policy_broke", "died", "told" (`learner.members.events`, whose fields stand beside
-it), "progress", or "said" for any other line of the log.
+"left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin" (`learner.members.events`,
+whose fields stand beside it), "progress", or "said" for any other line of the log.
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from learner.vector_env.arguments import Options, action_arrays, seed_list, take_reset_mask
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.calls import CopyCalls
@@ -26,6 +25,7 @@ from learner.vector_env.lost_lanes import LostLanes
 from learner.vector_env.send_recv import SendRecv, VectorEnvParts, numbered
 from learner.vector_env.sent_lanes import Infos, ReadyLane
 from learner.vector_env.spec import VectorEnvDescription
+from learner.vector_env.step_arguments import Options, action_arrays, seed_list, take_reset_mask
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten

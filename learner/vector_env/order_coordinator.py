@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from learner.members.coordinator import Coordinator
 from learner.members.events import Failed
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
+from learner.members.member_states import TimedOut
 from learner.members.membership import Member, Membership, Outgoing
-from learner.members.states import TimedOut
 from protocol.errors import BadMessage, EnvironmentFailed
 from protocol.messages import (
     Answer,

@@ -15,13 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from learner.vector_env.arguments import Options
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import packed, step_order
 from learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
 from learner.vector_env.order_coordinator import MakeOrder
 from learner.vector_env.sent_lanes import AfterLoss, Asked, AskedReset, ReadyLane, Sent, SentLanes, WatchedTime, after_loss
+from learner.vector_env.step_arguments import Options
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array, Bools
 from protocol.errors import NoWorkers, UsageError, WorkerLost

@@ -12,7 +12,7 @@ from typing import Literal
 
 from gymnasium.vector import AutoresetMode
 
-from learner.members.endpoint import BindSettings
+from learner.members.bind_settings import BindSettings
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError

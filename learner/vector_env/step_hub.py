@@ -18,7 +18,7 @@ from learner.members.member_server import MemberServer, ServerCallbacks, ServerS
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.shared_steps import SharedSteps
-from learner.vector_env.status import status
+from learner.vector_env.vector_env_status import status
 from protocol.errors import NoWorkers
 from protocol.messages import Answer, Order, Status, WorkerActivity, WorkerExit
 from protocol.specs import StepSpec

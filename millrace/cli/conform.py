@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from millrace.cli.arguments import Arguments
-from millrace.conformance.conform import ADDRESS_VARIABLE, Client, conform
-from millrace.conformance.examiner import Check, Result
+from millrace.conformance.conform import ADDRESS_VARIABLE, ClientCommand, conform
+from millrace.conformance.examiner import Check, CheckResult
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import as_data, explanation, line_of, summary
@@ -71,15 +71,15 @@ def check(argv: list[str], write: Callable[[str], None]) -> int:
         raise UsageError("conform: expected --copies of 1 or more, and seconds above 0")
     checks = _chosen(PROFILES[values.profile], values.only)
     settings = Settings(EnvSpec(values.env), copies=values.copies, patience_s=values.patience_s, start_s=values.start_s)
-    results: list[Result] = []
+    results: list[CheckResult] = []
 
-    def watch(result: Result) -> None:
+    def watch(result: CheckResult) -> None:
         write("\n".join([line_of(result), *explanation(result, results)]))
         results.append(result)
 
     about = f"profile {values.profile}, {values.env}, {values.copies} copies in a lane, {len(checks)} checks"
     write(f"{about}: {' '.join(command)}")
-    conform(Client(tuple(command), values.with_keys), checks, settings, values.limit_s, watch)
+    conform(ClientCommand(tuple(command), values.with_keys), checks, settings, values.limit_s, watch)
     write(summary(results))
     if values.json:
         report = json.dumps(as_data(results, values.profile, command), indent=2, ensure_ascii=False)

@@ -22,17 +22,17 @@ from pathlib import Path
 import zmq
 
 from learner.members.bound import bind
-from millrace.conformance.examiner import Check, Examiner, Result
+from millrace.conformance.examiner import Check, CheckResult, Examiner
 from millrace.conformance.learner import Settings
 from millrace.conformance.script import (
     AskToStop,
     CutConnection,
-    Effect,
     EndClient,
     Ended,
     Heard,
+    LearnerEffect,
     Listen,
-    Send,
+    SendFrames,
     StartClient,
 )
 from protocol.bounds import escaped
@@ -51,7 +51,7 @@ MOST_PACKED_BYTES = 1 << 26  # of one message
 
 
 @dataclass(frozen=True)
-class Client:
+class ClientCommand:
     """The client's command."""
 
     command: tuple[str, ...]
@@ -61,8 +61,8 @@ class Client:
 
 
 def conform(
-    client: Client, checks: Sequence[Check], settings: Settings, limit_s: float, watch: Callable[[Result], None]
-) -> list[Result]:
+    client: ClientCommand, checks: Sequence[Check], settings: Settings, limit_s: float, watch: Callable[[CheckResult], None]
+) -> list[CheckResult]:
     """Run the checks. `watch` is called with each result. Raises `UsageError` if the command cannot be started."""
     with ExitStack() as resources:
         port = resources.enter_context(_Port(client.with_keys or any(TOKEN_WORD in word for word in client.command)))
@@ -71,10 +71,10 @@ def conform(
         examiner = Examiner(checks, replace(settings, token=token), time.monotonic(), limit_s)
         told = 0
 
-        def perform(effects: list[Effect]) -> None:
+        def perform(effects: list[LearnerEffect]) -> None:
             for effect in effects:
                 match effect:
-                    case Send(peer, frames):
+                    case SendFrames(peer, frames):
                         port.send(peer, frames)
                     case StartClient():
                         process.start()

@@ -12,7 +12,7 @@ from typing import Literal
 from millrace.conformance import rules
 from millrace.conformance.learner import Learner, Settings
 from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, Effect, EndClient, Event, Script, Skipped, Wait
+from millrace.conformance.script import Broken, ClientEvent, EndClient, LearnerEffect, Script, Skipped, Wait
 
 CHECK_S = 40.0  # longest time that one check may take
 
@@ -26,7 +26,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Result:
+class CheckResult:
     """How a check ended."""
 
     name: str
@@ -45,7 +45,7 @@ class Examiner:
     def __init__(self, checks: Sequence[Check], settings: Settings, now: float, limit_s: float) -> None:
         """`limit_s`: the whole test ends after so long; what was not checked by then has failed."""
         self.learner = Learner(settings)
-        self.results: list[Result] = []
+        self.results: list[CheckResult] = []
         self._checks = list(checks)
         self._deadline_s = now + limit_s
         self._script: Script[None] | None = None
@@ -57,7 +57,7 @@ class Examiner:
         """Whether every check has a result."""
         return len(self.results) == len(self._checks)
 
-    def handle(self, event: Event, now: float) -> list[Effect]:
+    def handle(self, event: ClientEvent, now: float) -> list[LearnerEffect]:
         """Handle an event."""
         self.learner.now = now
         if self._script is not None:
@@ -68,7 +68,7 @@ class Examiner:
                 self._failed(broken)
         return self._taken()
 
-    def tick(self, now: float) -> list[Effect]:
+    def tick(self, now: float) -> list[LearnerEffect]:
         """Do what is due: begin the next check, or end a wait."""
         learner = self.learner
         learner.now = now
@@ -99,7 +99,7 @@ class Examiner:
         self._script = check.script(self.learner)
         self._resume(None)
 
-    def _resume(self, event: Event | None) -> None:
+    def _resume(self, event: ClientEvent | None) -> None:
         """Let the check go on until it waits again or ends."""
         assert self._script is not None
         try:
@@ -130,7 +130,7 @@ class Examiner:
         note: str = "",
     ) -> None:
         name = self._checks[len(self.results)].name
-        self.results.append(Result(name, outcome, self.learner.now - self._began_s, rule, expected, got, note))
+        self.results.append(CheckResult(name, outcome, self.learner.now - self._began_s, rule, expected, got, note))
         self._script, self._due_s = None, self.learner.now
         if self.done and self.learner.runs:
             self.learner.do(EndClient())
@@ -140,6 +140,6 @@ class Examiner:
             self._began_s = self.learner.now
             self._record("failed", rule=rules.PATIENCE, expected="the whole test within --limit-s", got="no time left")
 
-    def _taken(self) -> list[Effect]:
+    def _taken(self) -> list[LearnerEffect]:
         effects, self.learner.effects = self.learner.effects, []
         return effects

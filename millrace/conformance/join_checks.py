@@ -307,9 +307,9 @@ def stops_while_joining(learner: Learner) -> Script[None]:
     yield from learner.left(rules.STOP, "SIGTERM while joining")
 
 
-def draws_its_life(learner: Learner) -> Script[None]:
+def draws_its_nonce(learner: Learner) -> Script[None]:
     """Two processes of the same command have different lives."""
     one = yield from learner.newly_started()
     other = yield from learner.newly_started()
     if one.process_nonce == other.process_nonce:
-        raise Broken(rules.REAPPEARS, f"another life than {one.process_nonce} in the second process", "the same")
+        raise Broken(rules.REAPPEARS, f"another process_nonce than {one.process_nonce} in the second process", "the same")

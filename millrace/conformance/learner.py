@@ -15,20 +15,20 @@ from millrace.conformance import rules
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import (
     Broken,
+    ClientEvent,
     CutConnection,
-    Effect,
     EndClient,
     Ended,
-    Event,
     Heard,
+    LearnerEffect,
     Script,
-    Send,
+    SendFrames,
     Skipped,
     StartClient,
     Wait,
     brief,
 )
-from millrace.conformance.watch import Watch
+from millrace.conformance.watch import WatchedSession
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import BadMessage
@@ -76,7 +76,7 @@ class Learner:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.now = 0.0
-        self.effects: list[Effect] = []
+        self.effects: list[LearnerEffect] = []
         self.runs = False
         """whether the client's process runs"""
         self.is_mute = False
@@ -95,10 +95,10 @@ class Learner:
         self._sessions = count(0x5EED_0001)
         self._had_a_session = False  # the process
         self._steps = 0  # env steps that the process has reported
-        self._watch: Watch | None = None  # of the current session
+        self._watch: WatchedSession | None = None  # of the current session
 
     @property
-    def watch(self) -> Watch:
+    def watch(self) -> WatchedSession:
         """The watch over the current session."""
         assert self._watch is not None, "the check has welcomed the client"
         return self._watch
@@ -114,23 +114,23 @@ class Learner:
         """Send a message to the client."""
         if self._watch is not None:
             self._watch.sent(message)
-        self.effects.append(Send(self.peer, encode(message)))
+        self.effects.append(SendFrames(self.peer, encode(message)))
 
     def send_unreadable(self, ticket: int, *messages: list[Buffer]) -> None:
         """Send frames that cannot be read, some of them with this ticket, which the client must not answer."""
         self.watch.unreadable(ticket)
-        self.effects += [Send(self.peer, frames) for frames in messages]
+        self.effects += [SendFrames(self.peer, frames) for frames in messages]
 
     def welcome(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
         """Answer the newest Hello: a new session begins."""
         assert self.hello is not None
         self.answers_heartbeats = True
         welcome = Welcome(next(self._sessions), self.hello.attempt, run)
-        self._watch = Watch(welcome, self.now, self._steps, is_first=not self._had_a_session)
+        self._watch = WatchedSession(welcome, self.now, self._steps, is_first=not self._had_a_session)
         self._had_a_session = True
         self.send(self._watch.welcome)
 
-    def do(self, *effects: Effect) -> None:
+    def do(self, *effects: LearnerEffect) -> None:
         """Have these effects on the client's process and its connections."""
         self.effects += effects
         for effect in effects:
@@ -145,7 +145,7 @@ class Learner:
 
     # --------------------------------------------------------------------------------------------------------- hearing
 
-    def take(self, event: Event, wanted: Callable[[Event], bool]) -> bool:
+    def take(self, event: ClientEvent, wanted: Callable[[ClientEvent], bool]) -> bool:
         """Do the books for an event; whether the check waits for it. Raises `Broken`."""
         match event:
             case Ended():
@@ -182,7 +182,7 @@ class Learner:
             raise Broken(rules.SILENT, "the client to stay in its session while the learner answers", brief(hello))
 
     def _take_message(
-        self, message: ToLearner | Inquire | BadMessage, event: Event, wanted: Callable[[Event], bool]
+        self, message: ToLearner | Inquire | BadMessage, event: ClientEvent, wanted: Callable[[ClientEvent], bool]
     ) -> bool:
         watch = self._watch
         if watch is None and wanted(event):
@@ -220,7 +220,7 @@ class Learner:
         """The next message of these kinds whose fields have these values, within `within_s` or the patience. Or `Broken`."""
         may_end = Goodbye in (kinds if isinstance(kinds, tuple) else (kinds,))
 
-        def is_it(event: Event) -> bool:
+        def is_it(event: ClientEvent) -> bool:
             if isinstance(event, Ended):
                 return may_end
             message = event.message

@@ -49,7 +49,7 @@ FAULTS = [
     Check("joins a learner that was started again", join_checks.outlives_a_restart),
     Check("joins again when the learner falls silent", join_checks.notices_silence),
     Check("repeats Hello with backoff while its answers are lost", join_checks.repeats_hello),
-    Check("draws another life in each process", join_checks.draws_its_life),
+    Check("draws another process_nonce in each process", join_checks.draws_its_nonce),
     Check("leaves with exit code 2 when it is refused", join_checks.leaves_when_refused),
     Check("leaves with exit code 2 when it is refused in a session", join_checks.leaves_when_refused_later),
     Check("leaves when Drain answers its Hello", join_checks.drains_while_joining),

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-from millrace.conformance.examiner import Result
+from millrace.conformance.examiner import CheckResult
 from millrace.conformance.rules import DOCUMENT
 
 WIDTH = 110
@@ -19,13 +19,13 @@ NUMBER = re.compile(r"\d{3,}")  # shapes and exit codes have fewer digits
 MARKS = {"passed": "ok     ", "failed": "FAILED ", "skipped": "skipped"}
 
 
-def line_of(result: Result) -> str:
+def line_of(result: CheckResult) -> str:
     """One line about a check."""
     note = f"  ({result.note})" if result.note else ""
     return f"{MARKS[result.outcome]}  {result.name}{note}"
 
 
-def explanation(result: Result, earlier: Sequence[Result] = ()) -> list[str]:
+def explanation(result: CheckResult, earlier: Sequence[CheckResult] = ()) -> list[str]:
     """What a failure means, indented. If an earlier check failed by the same rule for the same reason, only its name."""
     if result.rule is None:
         return []
@@ -45,12 +45,12 @@ def explanation(result: Result, earlier: Sequence[Result] = ()) -> list[str]:
     ]
 
 
-def _essence(result: Result) -> tuple[object, str, str]:
+def _essence(result: CheckResult) -> tuple[object, str, str]:
     """A failure without the numbers in it, such as those of sessions and tickets, which differ from check to check."""
     return result.rule, NUMBER.sub("", result.expected), NUMBER.sub("", result.got)
 
 
-def summary(results: Sequence[Result]) -> str:
+def summary(results: Sequence[CheckResult]) -> str:
     """The last line."""
     counts = {outcome: sum(each.outcome == outcome for each in results) for outcome in MARKS}
     seconds = sum(each.seconds for each in results)
@@ -59,7 +59,7 @@ def summary(results: Sequence[Result]) -> str:
     return f"{counts['passed']} checks passed, {counts['failed']} failed{skipped}, {seconds:.0f} s: {verdict}"
 
 
-def as_data(results: Sequence[Result], profile: str, command: Sequence[str]) -> dict[str, Any]:
+def as_data(results: Sequence[CheckResult], profile: str, command: Sequence[str]) -> dict[str, Any]:
     """The report as plain data, for a program."""
     return {
         "profile": profile,

@@ -34,8 +34,8 @@ class Skipped(Exception):
 
 
 @dataclass(frozen=True)
-class Send:
-    """Effect: send these frames to this peer."""
+class SendFrames:
+    """LearnerEffect: send these frames to this peer."""
 
     peer: bytes
     frames: Sequence[Buffer]
@@ -43,37 +43,37 @@ class Send:
 
 @dataclass(frozen=True)
 class StartClient:
-    """Effect: start the client's process."""
+    """LearnerEffect: start the client's process."""
 
 
 @dataclass(frozen=True)
 class AskToStop:
-    """Effect: send SIGTERM to the client."""
+    """LearnerEffect: send SIGTERM to the client."""
 
 
 @dataclass(frozen=True)
 class EndClient:
-    """Effect: end the client, whatever it does."""
+    """LearnerEffect: end the client, whatever it does."""
 
 
 @dataclass(frozen=True)
 class CutConnection:
-    """Effect: close the socket; with it every connection, and what is queued."""
+    """LearnerEffect: close the socket; with it every connection, and what is queued."""
 
 
 @dataclass(frozen=True)
 class Listen:
-    """Effect: open the socket again, at the same address."""
+    """LearnerEffect: open the socket again, at the same address."""
 
 
-Effect = Send | StartClient | AskToStop | EndClient | CutConnection | Listen
+LearnerEffect = SendFrames | StartClient | AskToStop | EndClient | CutConnection | Listen
 
 # -------------------------------------------------------------------------------------------------------------- events
 
 
 @dataclass(frozen=True)
 class Heard:
-    """Event: a message arrived, or one that cannot be read."""
+    """ClientEvent: a message arrived, or one that cannot be read."""
 
     peer: bytes
     message: ToLearner | Inquire | BadMessage
@@ -81,7 +81,7 @@ class Heard:
 
 @dataclass(frozen=True)
 class Ended:
-    """Event: the client's process has ended."""
+    """ClientEvent: the client's process has ended."""
 
     code: int
     """exit code; below 0: the number of the signal"""
@@ -92,10 +92,10 @@ class Ended:
         return f"its end with exit code {self.code}" + (f"; it printed: {self.last_line}" if self.last_line else "")
 
 
-Event = Heard | Ended
+ClientEvent = Heard | Ended
 
 
-def nothing(event: Event) -> bool:
+def nothing(event: ClientEvent) -> bool:
     """Wait for no event, only for the time."""
     return False
 
@@ -105,10 +105,10 @@ class Wait:
     """Wait until `wanted` says yes to an event, at most `for_s`."""
 
     for_s: float
-    wanted: Callable[[Event], bool] = nothing
+    wanted: Callable[[ClientEvent], bool] = nothing
 
 
-Script = Generator[Wait, Event | None, T]
+Script = Generator[Wait, ClientEvent | None, T]
 """What a part of a check is: it yields waits and returns a value."""
 
 

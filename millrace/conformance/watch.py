@@ -62,7 +62,7 @@ class Dealt(NamedTuple):
     version: int
 
 
-class Watch:
+class WatchedSession:
     """One session, as the learner sees it."""
 
     def __init__(self, welcome: Welcome, now: float, steps: int = 0, *, is_first: bool = True) -> None:

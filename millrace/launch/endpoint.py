@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from learner.members.bind_settings import BindSettings
 from learner.members.bound import Bound, bind, listen
-from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
 from protocol.alive import CallTimeouts

@@ -19,8 +19,8 @@ from learner.config.config import Config
 from learner.config.validation import workers_to_wait_for
 from learner.conversations import describe_settings
 from learner.interrupts import Interrupts
+from learner.members.bind_settings import BindSettings
 from learner.members.describe_coordinator import Accept
-from learner.members.endpoint import BindSettings
 from learner.resume_checks import Resumption
 from learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from learner.torch_setup import one_thread, torch_device

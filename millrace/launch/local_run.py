@@ -13,7 +13,7 @@ from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.config.validation import check_copies, idle_workers, workers_to_wait_for
 from learner.interrupts import Interrupts
-from learner.members.endpoint import BindSettings
+from learner.members.bind_settings import BindSettings
 from learner.resume_checks import Resumption, unless_finished
 from learner.run_setup import (
     RunSetup,

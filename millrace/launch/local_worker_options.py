@@ -16,7 +16,7 @@ from pathlib import Path
 
 from learner.config.config import Config
 from learner.config.rollout_config import RolloutConfig
-from learner.members.endpoint import generate_run_keys
+from learner.members.bind_settings import generate_run_keys
 from learner.run_folder.regular_files import open_regular, reason, subfolder
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder

@@ -16,7 +16,7 @@ from typing import Literal
 from learner.config.rollout_config import RolloutConfig
 from learner.conversations import describe_settings
 from learner.interrupts import Interrupts
-from learner.members.endpoint import BindSettings
+from learner.members.bind_settings import BindSettings
 from learner.policy_player import PolicyPlayer, SavedPolicy
 from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings

@@ -16,7 +16,7 @@ import ray
 
 from learner.callbacks.callbacks import Watch
 from learner.config.command_line import read_config
-from learner.members.endpoint import keyring_for
+from learner.members.bind_settings import keyring_for
 from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
 from millrace.launch.local_run import train

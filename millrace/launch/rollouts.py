@@ -13,8 +13,8 @@ from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import workers_to_wait_for
 from learner.conversations import describe_settings, open_hub, rollout_spec
 from learner.env_spaces import EnvSpaces
+from learner.members.bind_settings import BindSettings
 from learner.members.describe import described_by_workers
-from learner.members.endpoint import BindSettings
 from learner.rollouts.hub import Hub
 from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint

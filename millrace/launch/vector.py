@@ -16,9 +16,9 @@ from typing import Literal
 import msgspec
 from gymnasium.vector import AutoresetMode
 
+from learner.members.bind_settings import BindSettings
 from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, accept_any
-from learner.members.endpoint import BindSettings
 from learner.members.events import Failed
 from learner.members.failure_count import FailureCount
 from learner.vector_env.env import ZmqVectorEnv

@@ -47,7 +47,7 @@ def refuse_second_derivatives() -> None:
         raise RuntimeError("millrace's networks have no second derivatives; call backward without create_graph")
 
 
-class MLP(torch.autograd.Function):
+class MLPNode(torch.autograd.Function):
     """Hidden layers and a linear head as one node of autograd's graph: with many nodes, small networks are slow.
 
     Forward: h₀ = x [B, D];  hᵢ = φ(hᵢ₋₁ Wᵢᵀ + bᵢ);  output = h Wᵀ + b [B, O].
@@ -86,7 +86,7 @@ class MLP(torch.autograd.Function):
 
 
 class StackedMLP(torch.autograd.Function):
-    """K networks of one form on the same input, as one node: `MLP` with batched matrix products, [B, D] -> [K, B, O]."""
+    """K networks of one form on the same input, as one node: `MLPNode` with batched matrix products, [B, D] -> [K, B, O]."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, relu: bool, flat: Tensor, layers_of: Callable[[Tensor], list[Tensor]]) -> Tensor:
@@ -197,12 +197,12 @@ class FlatNetwork:
         return encoder
 
     def layers(self, names: Sequence[str]) -> list[Tensor]:
-        """Weight and bias of each layer, one after another, as `MLP` takes them."""
+        """Weight and bias of each layer, one after another, as `MLPNode` takes them."""
         return [self.parameters[f"{name}.{kind}"] for name in names for kind in ("weight", "bias")]
 
     def mlp(self, x: Tensor, layers: Sequence[Tensor]) -> Tensor:
         """Hidden layers with the activation between them, the last one linear."""
-        out: Tensor = MLP.apply(x, self._relu, *layers)  # type: ignore[no-untyped-call]
+        out: Tensor = MLPNode.apply(x, self._relu, *layers)  # type: ignore[no-untyped-call]
         return out
 
     def hidden(self, x: Tensor, layers: Sequence[Tensor]) -> Tensor:
@@ -257,7 +257,7 @@ class FlatNetwork:
 
 
 class ActorCriticNetwork(FlatNetwork):
-    """An actor and a critic: each has its own MLP, or they share one. If there is a recurrent core, they share it."""
+    """An actor and a critic: each has its own MLPNode, or they share one. If there is a recurrent core, they share it."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
@@ -346,7 +346,7 @@ class QNetwork(FlatNetwork):
 
 
 class ActorAndCritics(FlatNetwork):
-    """An actor of actions in [-1, 1] and two critics, which value an observation with an action. Each has its own MLP.
+    """An actor of actions in [-1, 1] and two critics, which value an observation with an action. Each has its own MLPNode.
 
     `actor` and `critics` are the two parts of the flat tensor, with their parts of the gradients: one for each optimizer.
     """

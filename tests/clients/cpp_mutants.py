@@ -41,7 +41,7 @@ MUTANTS = [
     Mutant(
         "stale attempt", "session.hpp",
         "    ++attempt_;\n",
-        "    attempt_ = life_ + 1;\n",
+        "    attempt_ = process_nonce_ + 1;\n",
         "environment", "joins again after Rejoin", rules.REJOIN, "attempt",
     ),
     Mutant(
@@ -53,10 +53,10 @@ MUTANTS = [
         "environment", "joins again after Rejoin", rules.REJOIN, "none within",
     ),
     Mutant(
-        "same life in every process", "session.hpp",
+        "same process_nonce in every process", "session.hpp",
         "(std::uint64_t(random()) << 32 | random()) >> 16",
         "7",
-        "environment", "draws another life", rules.REAPPEARS, "the same",
+        "environment", "draws another process_nonce", rules.REAPPEARS, "the same",
     ),
     Mutant(
         "begins again at a repeated Welcome", "session.hpp",

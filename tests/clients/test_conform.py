@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.conformance.conform import Client, _Process, conform
+from millrace.conformance.conform import ClientCommand, _Process, conform
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import explanation
@@ -49,7 +49,7 @@ SKIPPED = {  # by clients in other languages
 @pytest.mark.parametrize("profile", SHORT)
 def test_the_python_worker_passes_five_checks(profile: str) -> None:
     checks = [check for check in PROFILES[profile] if check.name in SHORT[profile]]
-    results = conform(Client(WORKER), checks, Settings(EnvSpec("CartPole-v1")), 60.0, lambda result: None)
+    results = conform(ClientCommand(WORKER), checks, Settings(EnvSpec("CartPole-v1")), 60.0, lambda result: None)
     assert [result.name for result in results] == list(SHORT[profile])
     assert [result.outcome for result in results] == ["passed"] * 5, [explanation(result) for result in results]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.conformance.conform import Client, conform
+from millrace.conformance.conform import ClientCommand, conform
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import explanation
@@ -55,7 +55,7 @@ def test_every_mutant_changes_one_place(tmp_path: Path) -> None:
 def test_the_report_names_the_rule_that_a_mutant_breaks(mutant: Mutant, compiler: None, tmp_path: Path) -> None:
     checks = [check for check in PROFILES[mutant.profile] if mutant.check in check.name]
     assert checks, mutant.check
-    client = Client((str(build(mutant, tmp_path)), "{address}"))
+    client = ClientCommand((str(build(mutant, tmp_path)), "{address}"))
     results = conform(client, checks, Settings(EnvSpec("CartPole-v1"), patience_s=3.0), 100.0, lambda result: None)
     failed = [each for each in results if each.outcome == "failed"]
     assert failed, f"{mutant.name} was not caught"

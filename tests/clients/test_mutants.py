@@ -8,8 +8,8 @@ from typing import NamedTuple
 import pytest
 
 from millrace.conformance import rules
-from millrace.conformance.conform import Client, conform
-from millrace.conformance.examiner import Result
+from millrace.conformance.conform import ClientCommand, conform
+from millrace.conformance.examiner import CheckResult
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import explanation
@@ -98,11 +98,11 @@ MUTANTS = [
 ]
 
 
-def checked(mutant: str, profile: str, names: set[str]) -> list[Result]:
+def checked(mutant: str, profile: str, names: set[str]) -> list[CheckResult]:
     """The results of the checks whose names contain one of these."""
     checks = [check for check in PROFILES[profile] if any(name in check.name for name in names)]
     assert checks, names
-    client = Client((sys.executable, "-m", "tests.clients.mutant_client", mutant, "{address}"))
+    client = ClientCommand((sys.executable, "-m", "tests.clients.mutant_client", mutant, "{address}"))
     return conform(client, checks, Settings(EnvSpec("CartPole-v1"), patience_s=3.0), 100.0, lambda result: None)
 
 

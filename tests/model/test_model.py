@@ -29,7 +29,7 @@ from tests.model.settings import Settings
 from tests.model.training import Training
 from tests.model.world import GONE, World
 from workers.conversation.held import HeldRollouts, RolloutLane
-from workers.conversation.session import Identity, Session, _SessionState
+from workers.conversation.session import Session, WorkerIdentity, _SessionState
 
 SMALL = Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1)
 
@@ -108,7 +108,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     settings = Settings(workers=1, lanes=1, updates=1, faults=0)
     learner, _ = learner_part.first_learner(settings, learner_part.Learner)
     coordinator = learner.coordinator
-    session = Session(Identity("w0", "host", 1, 1, "model"), 0.0)
+    session = Session(WorkerIdentity("w0", "host", 1, 1, "model"), 0.0)
     known = {each: learner_part.SAVED[each] | learner_part.NOT_SAVED[each] for each in learner_part.SAVED}
     known |= {each: worker_part.SAVED[each] | worker_part.NOT_SAVED[each] for each in worker_part.SAVED}
     objects: list[object] = [

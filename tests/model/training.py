@@ -13,7 +13,7 @@ from tests.model.learner_part import Learner, first_learner
 from tests.model.message_content import content_of, message_of, worker_of
 from tests.model.settings import TICK_S, Settings
 from tests.model.worker_part import Worker
-from workers.conversation.states import State as SessionState
+from workers.conversation.worker_states import WorkerState as SessionState
 
 
 class Training(Settings):

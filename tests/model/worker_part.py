@@ -15,8 +15,17 @@ from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
 from workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
-from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, RolloutTask, Send, Session, _SessionState
-from workers.conversation.states import State
+from workers.conversation.session import (
+    EvaluationTask,
+    Leave,
+    RolloutTask,
+    SendMessage,
+    Session,
+    WorkerEffect,
+    WorkerIdentity,
+    _SessionState,
+)
+from workers.conversation.worker_states import WorkerState
 
 SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
@@ -54,7 +63,7 @@ class Worker:
         """A new process starts under the same name."""
         self.nonce += ATTEMPTS
         self.shut_out = False
-        who = Identity(f"w{self.number}", "host", 1, self.nonce, "model")
+        who = WorkerIdentity(f"w{self.number}", "host", 1, self.nonce, "model")
         self.session = Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
         return self._turn([], now)
 
@@ -141,7 +150,7 @@ class Worker:
             assert [version] * len(work.assignments) == lowest, "others are collected than all of the lowest version"
         return []
 
-    def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
+    def _turn(self, effects: list[WorkerEffect], now: float) -> list[ToLearner]:
         current = self.session
         assert current is not None
         if self.task is not None and current.is_unwanted(self.task):
@@ -151,7 +160,7 @@ class Worker:
         if work is not None:
             assert self.task is None, "a worker does two pieces of work at the same time"
             assert isinstance(work, RolloutTask | EvaluationTask)
-            effects = effects + [Send(said) for said in self._begin(work)]
+            effects = effects + [SendMessage(said) for said in self._begin(work)]
         effects = effects + current.tick(now)
         rounds = 1 + self.settings.max_lag
         most, held = self.settings.lanes * rounds, held_count(current)
@@ -160,7 +169,7 @@ class Worker:
         assert versions <= rounds + 1, f"a worker holds {versions} versions, of at most {rounds + 1}"
         sent: list[ToLearner] = []
         for effect in effects:
-            if isinstance(effect, Send):
+            if isinstance(effect, SendMessage):
                 sent.append(effect.message)
             if isinstance(effect, Leave):
                 self.end()
@@ -219,10 +228,10 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     if fields is None:
         return worker
     state, of_session, attempt, heard, due, lanes, versions, in_progress, replies = fields
-    who = Identity(f"w{number}", "host", 1, nonce.value, "model")
+    who = WorkerIdentity(f"w{number}", "host", 1, nonce.value, "model")
     current = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
-    current.state, current._attempt = State(state), attempt.value
+    current.state, current._attempt = WorkerState(state), attempt.value
     current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
     held.weights = {version: weights(version) for version in versions}

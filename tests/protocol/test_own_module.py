@@ -14,15 +14,15 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import PolicyFailed, UserFacingError
 from protocol.own_module import own_callable
+from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.encoder import describe_encoder
-from protocol.policy.own_policy import OwnPolicy
 from protocol.specs import OwnPolicySpec, PolicySpec
 
 OBSERVATION, ACTION = observation_leaves(Box(-1, 1, (4,))), action_spec(Discrete(2))
 
 
 def policy(name: str) -> object:
-    return OwnPolicy(PolicySpec(OBSERVATION, ACTION, own=OwnPolicySpec(name, ())), ())
+    return CalledPolicy(PolicySpec(OBSERVATION, ACTION, own=OwnPolicySpec(name, ())), ())
 
 
 USES: dict[str, Callable[[str], object]] = {

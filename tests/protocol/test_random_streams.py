@@ -21,8 +21,8 @@ from learner.recording.played_episodes import recording_seeds
 from learner.rollouts.evaluation_tickets import episode_seeds
 from learner.vector_env.lost_lanes import replacement_seeds
 from protocol.messages import Evaluate
+from protocol.policy.called_policy import Acted, CalledPolicy
 from protocol.policy.encoder import describe_encoder
-from protocol.policy.own_policy import Acted, OwnPolicy
 from protocol.policy.policy import make_policy
 from protocol.random_streams import Purpose, env_seed, generator, torch_seed
 from protocol.specs import PolicySpec
@@ -93,7 +93,7 @@ gymnasium.register("millrace-tests/StreamsCoin-v0", entry_point=lambda **kwargs:
 COIN = with_env(run_around(Coin(), T=4), "millrace-tests/StreamsCoin-v0")
 
 
-class RandomGuess(OwnPolicy):
+class RandomGuess(CalledPolicy):
     """A user's policy that tosses a coin of its own, and keeps what it would have drawn from the first generators."""
 
     def __init__(self) -> None:

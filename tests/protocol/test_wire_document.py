@@ -21,14 +21,14 @@ import numpy as np
 import pytest
 
 from learner.members import join_limiter, membership
-from learner.members import states as standing
+from learner.members import member_states as standing
 from learner.rollouts import ticket_coordinator
 from protocol import bounds, env_spec, messages, rollout, space_spec, specs
 from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from protocol.wire import codec, socket_options
 from protocol.wire import compression as packing
-from workers.conversation import held, session, states
+from workers.conversation import held, session, worker_states
 
 DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
@@ -98,7 +98,7 @@ WORDS: Mapping[str, str] = {
     "n": "number of values",
     "start": "the smallest value",
     "worker": "the worker's name",
-    "process_nonce": "`life` of the worker's Hello",
+    "process_nonce": "`process_nonce` of the worker's Hello",
     "doing": "what it does; environment code runs in all of these except `starting` and `waiting`",
     "running": "its workers that run",
     "description": "the environment",
@@ -375,7 +375,7 @@ PARTS = {
     "example": part_example,
     "dtypes": part_dtypes,
     "messages": part_messages,
-    "worker table": lambda: state_table(states.TABLE),
+    "worker table": lambda: state_table(worker_states.TABLE),
     "learner table": lambda: state_table(standing.TABLE),
     "limits": part_limits,
 }
@@ -461,13 +461,13 @@ def test_every_limit_is_in_the_document() -> None:
 
 
 def test_every_state_has_a_row_in_its_table() -> None:
-    assert set(states.TABLE) == set(states.State)
+    assert set(worker_states.TABLE) == set(worker_states.WorkerState)
     assert set(standing.TABLE) == set(standing.MemberState)
 
 
 def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:
     """Every message to a worker is heeded in some state, and every message to a learner in some standing."""
-    heeded = {event for row in states.TABLE.values() for event in row if is_message(event)}
+    heeded = {event for row in worker_states.TABLE.values() for event in row if is_message(event)}
     assert heeded == set(ToWorker.__args__)
     heard = {event for row in standing.TABLE.values() for event in row if is_message(event)}
     assert heard - {messages.Drain} == set(ToLearner.__args__)

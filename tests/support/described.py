@@ -16,7 +16,7 @@ from protocol.envs.description import DescribedEnv, read_description
 from protocol.messages import Described
 from protocol.specs import DescribeSpec, RunSpec, StepSpec, Vector
 from protocol.wire.codec import decode_to_learner, encode
-from workers.describe import describing
+from workers.described_copy import describing
 
 
 def described(env: EnvSpec, vector: Vector = "loop", render_mode: str | None = None) -> DescribedEnv:

@@ -25,7 +25,15 @@ from protocol.env_spec import EnvSpec
 from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker, WorkerExit
 from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from workers.conversation.session import Effect, EvaluationTask, Identity, Leave, RolloutTask, Send, Session
+from workers.conversation.session import (
+    EvaluationTask,
+    Leave,
+    RolloutTask,
+    SendMessage,
+    Session,
+    WorkerEffect,
+    WorkerIdentity,
+)
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
@@ -197,10 +205,10 @@ class World:
         worker.inbox.append(message)
         self._serve(worker)
 
-    def say(self, worker: FakeWorker, effects: list[Effect]) -> None:
+    def say(self, worker: FakeWorker, effects: list[WorkerEffect]) -> None:
         for effect in effects:
             match effect:
-                case Send(message):
+                case SendMessage(message):
                     self.carry((worker.name, "up"), lambda m=message: self._hears(worker.name, m))  # type: ignore[misc]
                 case Leave():
                     self.workers.pop(worker.name, None)
@@ -217,7 +225,7 @@ class World:
     # ------------------------------------------------------------ worker
 
     def spawn(self, name: bytes) -> None:
-        who = Identity(name.decode(), "host", 1, next(self.lives), "fake")  # in a container every pid is 1
+        who = WorkerIdentity(name.decode(), "host", 1, next(self.lives), "fake")  # in a container every pid is 1
         worker = FakeWorker(name, Session(who, self.now, join_timeout_s=1e9, rejoin_timeout_s=1e9))
         self.workers[name] = worker
 
@@ -257,7 +265,7 @@ class World:
             order = task.order
             assert task.weights.version == order.version, "evaluated under other weights than those of the order"
             for n, step in itertools.product(range(len(order.seeds)), range(2)) if order.send_rows else ():
-                self.say(worker, [Send(fake_rows(order.session, order.ticket, n, step))])
+                self.say(worker, [SendMessage(fake_rows(order.session, order.ticket, n, step))])
             self.say(worker, worker.session.work_ended([fake_evaluated(task)]))
         self._serve(worker)
 

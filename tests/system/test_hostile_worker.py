@@ -43,7 +43,16 @@ LANES = 2
 SETTINGS: dict[str, object] = {"envs": LANES, "lanes": LANES, "min-workers": LANES, "seed": 3, "batch-size": 16}
 MEMORY_MB, LOG_BYTES = 20, 1_000_000
 END_S = 400.0  # of a run with a hostile worker, on a crowded machine
-EVENTS = ("joined", "left", "turned", "broke", "policy_broke", "told", "progress", "said")  # of `--log-json`
+EVENTS = (
+    "joined",
+    "left",
+    "refused",
+    "environment_raised",
+    "policy_raised",
+    "asked_to_rejoin",
+    "progress",
+    "said",
+)  # of `--log-json`
 BLOCK = re.compile(rb"[^\w]* \d+% |[\d,]+ steps/s |(learner time|worker time|tickets|transitions|messages|run) |\s*$")
 FORGED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 

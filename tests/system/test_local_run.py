@@ -23,7 +23,7 @@ import pytest
 import millrace
 from learner.config.config import Config
 from learner.config.layers import config_from_toml, resolve
-from learner.report.runs import read_run
+from learner.report.reported_runs import read_run
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_format import check_format

@@ -28,8 +28,8 @@ from workers.envs.double_pendulum import (
     SPEED_LIMIT,
     SUBSTEPS,
     CartDoublePendulum,
+    PendulumState,
     Physics,
-    State,
     accelerations,
     advance,
     energy,
@@ -46,7 +46,7 @@ ANYWHERE = np.array([3, np.pi, np.pi, 4, 8, 8])
 NEAR = np.full(6, 0.05)
 
 
-def state_within(spread: Doubles, seed: int) -> State:
+def state_within(spread: Doubles, seed: int) -> PendulumState:
     x, theta, phi, *speeds = np.random.default_rng(seed).uniform(-spread, spread).tolist()
     return (x, theta, phi, *speeds)
 
@@ -104,7 +104,9 @@ class Derived:
         self.linear_rest = sympy.lambdify(arguments, flat.subs(dict.fromkeys(second, 0)))
 
     @staticmethod
-    def solved(mass: Callable[..., Any], rest: Callable[..., Any], physics: Physics, state: State, force: float) -> Doubles:
+    def solved(
+        mass: Callable[..., Any], rest: Callable[..., Any], physics: Physics, state: PendulumState, force: float
+    ) -> Doubles:
         p = physics
         constants = (p.cart_kg, p.link_kg, p.link_m, p.inertia_kgm2, p.gravity_m_s2, p.friction_Ns_m, force)
         return np.linalg.solve(np.array(mass(*constants, *state), float), -np.ravel(rest(*constants, *state)))
@@ -157,7 +159,7 @@ def test_the_linear_model_is_the_jacobian_at_the_top(physics: Physics) -> None:
 # Time steps ---------------------------------------------------------------------------------------------------------------
 
 
-def after(seconds: float, h: float, state: State, physics: Physics = FREE, force: float = 0.0) -> State:
+def after(seconds: float, h: float, state: PendulumState, physics: Physics = FREE, force: float = 0.0) -> PendulumState:
     solve = accelerations(physics)
     for _ in range(round(seconds / h)):
         state = advance(solve, state, force, h)
@@ -193,13 +195,13 @@ def test_the_method_is_of_fourth_order() -> None:
 
 
 def test_friction_takes_energy_away() -> None:
-    state: State = (0.0, 0.05, 0.05, 1.0, 0.0, 0.0)
+    state: PendulumState = (0.0, 0.05, 0.05, 1.0, 0.0, 0.0)
     energies = [energy(Physics(), after(n / 10, 0.01, state, Physics())) for n in range(0, 50, 10)]
     assert all(later < earlier for earlier, later in pairwise(energies))
 
 
 def test_the_force_does_the_work_that_it_gives() -> None:
-    state: State = (0.0, 0.05, -0.05, 0.0, 0.0, 0.0)
+    state: PendulumState = (0.0, 0.05, -0.05, 0.0, 0.0, 0.0)
     moved = after(0.5, 0.001, state, FREE, 3.0)
     assert energy(FREE, moved) - energy(FREE, state) == pytest.approx(3.0 * moved[0], rel=1e-6)
 

@@ -15,7 +15,7 @@ from protocol.arrays import Array
 from protocol.env_spec import AllowedCode
 from protocol.errors import PolicyFailed
 from protocol.messages import Evaluate
-from protocol.policy.own_policy import OwnPolicy
+from protocol.policy.called_policy import CalledPolicy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
 from tests.support.collectors import bits, collect, no_pulse, run_around, run_of
@@ -37,8 +37,8 @@ def run_with(factory: Any = Linear, extras: Any = EXTRAS, T: int = 40, N: int = 
     return msgspec.structs.replace(run, policy=spec, extras=policy.extra_arrays)
 
 
-def loaded(run: RunSpec) -> OwnPolicy:
-    policy = OwnPolicy(run.policy, run.extras)
+def loaded(run: RunSpec) -> CalledPolicy:
+    policy = CalledPolicy(run.policy, run.extras)
     policy.load(WEIGHTS, NONE)
     return policy
 
@@ -97,7 +97,7 @@ def test_an_environment_that_changes_its_action_does_not_change_the_rollout() ->
     run = run_around(Shifts(), 5)
     policy = Declared(Ones, {})
     run = msgspec.structs.replace(run, policy=policy.spec(run.policy.observation, run.policy.action))
-    collector = Collector(run, OwnPolicy(run.policy, ()), lambda run, lane, pulse: LoopedCopies([Shifts], pulse))
+    collector = Collector(run, CalledPolicy(run.policy, ()), lambda run, lane, pulse: LoopedCopies([Shifts], pulse))
     (rollout,) = collect(collector, run)
     assert (rollout.action == 1).all()
 

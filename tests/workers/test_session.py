@@ -49,22 +49,22 @@ from workers.conversation.session import (
     HELLO_MOST_S,
     NO_LEARNER,
     CloseLanes,
-    Effect,
     EvaluationTask,
-    Identity,
     Leave,
     RolloutTask,
-    Send,
+    SendMessage,
     Session,
     StartSession,
     Statistics,
+    WorkerEffect,
+    WorkerIdentity,
 )
-from workers.conversation.states import TABLE, State
+from workers.conversation.worker_states import TABLE, WorkerState
 from workers.exit_codes import EXIT_UNSUITABLE
 
 M = TypeVar("M")
 
-WHO = Identity("w0", "host", 7, 77, "fake 1")
+WHO = WorkerIdentity("w0", "host", 7, 77, "fake 1")
 RUN = run_spec(lanes=4)  # heartbeat_s 1, learner_timeout_s 6
 SESSION = 11
 JOIN_S, REJOIN_S = 60.0, 600.0
@@ -72,9 +72,9 @@ EVALUATE = Evaluate(SESSION, 8, 0, (1, 2), True, 100, False, False)
 FIRST = WHO.process_nonce + 1  # number of the first attempt to join
 
 
-def sent(effects: Sequence[Effect], kind: type[M]) -> list[M]:
+def sent(effects: Sequence[WorkerEffect], kind: type[M]) -> list[M]:
     """The messages of this kind among the effects."""
-    return [effect.message for effect in effects if isinstance(effect, Send) and isinstance(effect.message, kind)]
+    return [effect.message for effect in effects if isinstance(effect, SendMessage) and isinstance(effect.message, kind)]
 
 
 def weights(version: int) -> Weights:
@@ -136,7 +136,7 @@ def collected(session: Session) -> list[Rollout]:
     return sent(session.work_ended(fake_rollouts(task_of(session))), Rollout)
 
 
-def hello_attempt(effects: Sequence[Effect]) -> int:
+def hello_attempt(effects: Sequence[WorkerEffect]) -> int:
     (hello,) = sent(effects, Hello)
     return hello.attempt
 
@@ -180,14 +180,14 @@ def test_welcome_starts_a_session() -> None:
     session = joining()
     session.tick(0.0)
     assert session.handle(Welcome(SESSION, FIRST, RUN), 0.1) == [StartSession(RUN)]
-    assert (session.state, session.session, session.run) == (State.READY, SESSION, RUN)
+    assert (session.state, session.session, session.run) == (WorkerState.READY, SESSION, RUN)
 
 
 def test_welcome_for_an_older_attempt_is_ignored() -> None:
     session = ready()
     session.handle(Rejoin(SESSION), 1.0)
     assert session.handle(Welcome(12, FIRST, RUN), 1.1) == []
-    assert session.state is State.JOINING
+    assert session.state is WorkerState.JOINING
     assert session.handle(Welcome(13, FIRST + 1, RUN), 1.2) == [StartSession(RUN)]
 
 
@@ -198,7 +198,7 @@ def test_welcome_for_a_process_that_has_ended_is_ignored() -> None:
     session = joining()
     session.tick(0.0)
     assert session.handle(Welcome(12, late.attempt, RUN), 0.1) == []
-    assert session.state is State.JOINING
+    assert session.state is WorkerState.JOINING
 
 
 def test_a_repeated_welcome_is_ignored() -> None:
@@ -219,7 +219,7 @@ def test_every_other_message_while_joining_is_ignored() -> None:
     session.tick(0.0)
     for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneIncarnation(0, 0),)), Rejoin(0)):
         assert session.handle(message, 0.1) == []
-    assert (session.state, held_count(session)) == (State.JOINING, 0)
+    assert (session.state, held_count(session)) == (WorkerState.JOINING, 0)
 
 
 def test_a_worker_gives_up_joining_with_exit_code_1() -> None:
@@ -353,7 +353,7 @@ def test_an_evaluation_comes_before_rollouts() -> None:
     assert isinstance(task, EvaluationTask)
     assert session.next_work() is None
     answer = fake_evaluated(task)
-    assert session.work_ended([answer]) == [Send(answer)]
+    assert session.work_ended([answer]) == [SendMessage(answer)]
     assert task_of(session).assignments[0].ticket == 0
 
 
@@ -521,7 +521,7 @@ def test_a_description_is_sent_at_once_and_with_every_heartbeat_of_its_session()
     session.tick(0.0)
     session.handle(Welcome(SESSION, FIRST, DescribeSpec(EnvSpec("Fake-v0"))), 0.0)
     assert sent(session.tick(session.due_s), Described) == []
-    assert session.described(said.description) == [Send(said)]
+    assert session.described(said.description) == [SendMessage(said)]
     for _ in range(2):
         effects = session.tick(session.due_s)
         assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [said])
@@ -648,14 +648,14 @@ def test_a_message_of_another_session_is_ignored() -> None:
         Rejoin(other),
     ):
         assert session.handle(message, 1.0) == []
-    assert (session.state, held_count(session)) == (State.READY, 1)
+    assert (session.state, held_count(session)) == (WorkerState.READY, 1)
     assert sent(session.tick(1.0), Heartbeat)[0].replies == 0
 
 
 def test_rejoin_is_answered_by_hello_at_once() -> None:
     session = ready(collect((0, 0)))
     effects = session.handle(Rejoin(SESSION), 3.0)
-    assert session.state is State.JOINING
+    assert session.state is WorkerState.JOINING
     assert effects[0] == CloseLanes((LaneIncarnation(0, 0),))
     assert hello_attempt(effects) == FIRST + 1
 
@@ -665,7 +665,7 @@ def test_a_worker_joins_a_silent_learner_again() -> None:
     assert sent(session.tick(1.0), Heartbeat)
     assert sent(session.tick(7.0), Heartbeat)
     assert hello_attempt(session.tick(7.1)) == FIRST + 1
-    assert (session.state, held_count(session)) == (State.JOINING, 0)
+    assert (session.state, held_count(session)) == (WorkerState.JOINING, 0)
 
 
 def test_a_learner_that_was_not_spoken_to_is_not_silent() -> None:
@@ -697,11 +697,11 @@ def test_stop_finishes_the_rollout_in_progress_and_returns_the_other_tickets_in_
     session = ready(collect((0, 0), (1, 0), (2, 1)))
     task = task_of(session)  # tickets 0 and 2
     assert session.stop() == []
-    assert session.state is State.DRAINING
+    assert session.state is WorkerState.DRAINING
     assert not session.is_unwanted(task)
     *rollouts, goodbye, leave = session.work_ended(fake_rollouts(task))
     assert [rollout.ticket for rollout in sent(rollouts, Rollout)] == [0, 2]
-    assert goodbye == Send(Goodbye(SESSION, "told to stop", (1,)))
+    assert goodbye == SendMessage(Goodbye(SESSION, "told to stop", (1,)))
     assert leave == Leave(0, "told to stop")
 
 
@@ -712,13 +712,13 @@ def test_an_evaluation_in_progress_is_not_finished_by_a_worker_that_drains() -> 
     assert not session.is_unwanted(task)
     session.stop()
     assert session.is_unwanted(task)
-    assert session.work_ended([]) == [Send(Goodbye(SESSION, "told to stop", (8,))), Leave(0, "told to stop")]
+    assert session.work_ended([]) == [SendMessage(Goodbye(SESSION, "told to stop", (8,))), Leave(0, "told to stop")]
 
 
 def test_stop_without_work_in_progress_leaves_at_once() -> None:
     session = ready(collect((0, 0)))
-    assert session.stop() == [Send(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
-    assert session.state is State.LEFT
+    assert session.stop() == [SendMessage(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
+    assert session.state is WorkerState.LEFT
 
 
 def test_stop_while_joining_leaves_at_once() -> None:
@@ -742,12 +742,12 @@ def test_drain_finishes_the_rollout_in_progress_and_then_leaves() -> None:
     assert session.next_work() is None
     effects = session.work_ended(fake_rollouts(task))
     assert len(sent(effects, Rollout)) == 1
-    assert effects[-2:] == [Send(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
+    assert effects[-2:] == [SendMessage(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
 
 
 def test_drain_without_work_in_progress_leaves_at_once() -> None:
     session = ready()
-    assert session.handle(Drain("finished"), 0.1) == [Send(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
+    assert session.handle(Drain("finished"), 0.1) == [SendMessage(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
 
 
 def test_drain_while_joining_leaves_with_exit_code_0() -> None:
@@ -800,11 +800,11 @@ def test_rejoin_while_draining_leaves() -> None:
     assert isinstance(leave, Leave)
 
 
-@pytest.mark.parametrize("state", [State.JOINING, State.READY, State.DRAINING])
-def test_refuse_leaves_with_exit_code_2_in_every_state(state: State) -> None:
+@pytest.mark.parametrize("state", [WorkerState.JOINING, WorkerState.READY, WorkerState.DRAINING])
+def test_refuse_leaves_with_exit_code_2_in_every_state(state: WorkerState) -> None:
     session = in_state(state)
     assert session.handle(Refuse("another protocol"), 0.1) == [Leave(2, "another protocol")]
-    assert session.state is State.LEFT
+    assert session.state is WorkerState.LEFT
 
 
 def test_a_failure_is_reported_with_its_traceback_and_leaves_with_exit_code_1() -> None:
@@ -812,7 +812,7 @@ def test_a_failure_is_reported_with_its_traceback_and_leaves_with_exit_code_1() 
     task_of(session)
     effects = session.fail("ValueError: bad action", "Traceback: …", 3)
     assert effects == [
-        Send(Failure(SESSION, "ValueError: bad action", "Traceback: …", 3)),
+        SendMessage(Failure(SESSION, "ValueError: bad action", "Traceback: …", 3)),
         Leave(1, "ValueError: bad action"),
     ]
 
@@ -821,7 +821,7 @@ def test_a_failure_of_the_users_policy_says_so() -> None:
     session = ready(collect((0, 3)))
     task_of(session)
     sent, _ = session.fail("policy Mine: act raised KeyError", "Traceback: …", None, of_policy=True)
-    assert sent == Send(Failure(SESSION, "policy Mine: act raised KeyError", "Traceback: …", None, True))
+    assert sent == SendMessage(Failure(SESSION, "policy Mine: act raised KeyError", "Traceback: …", None, True))
 
 
 def test_a_failure_before_any_session_is_not_reported() -> None:
@@ -829,19 +829,19 @@ def test_a_failure_before_any_session_is_not_reported() -> None:
 
 
 def test_a_declined_run_is_left_with_an_exit_code_of_its_own_and_a_goodbye() -> None:
-    assert ready().decline("no code") == [Send(Goodbye(SESSION, "no code", ())), Leave(EXIT_UNSUITABLE, "no code")]
+    assert ready().decline("no code") == [SendMessage(Goodbye(SESSION, "no code", ())), Leave(EXIT_UNSUITABLE, "no code")]
 
 
 def test_a_worker_whose_key_is_refused_leaves_with_exit_code_2_in_every_state() -> None:
-    for state in (State.JOINING, State.READY, State.DRAINING):
+    for state in (WorkerState.JOINING, WorkerState.READY, WorkerState.DRAINING):
         session = in_state(state)
         assert session.refused("refused") == [Leave(2, "refused")]
-        assert session.state is State.LEFT
+        assert session.state is WorkerState.LEFT
         assert session.refused("refused") == []
 
 
 def test_a_worker_that_has_left_sends_nothing() -> None:
-    session = in_state(State.LEFT)
+    session = in_state(WorkerState.LEFT)
     for message in EVERY_MESSAGE:
         assert session.handle(message, 1.0) == []
     assert session.tick(1e6) == session.stop() == session.fail("x", "", None) == []
@@ -866,15 +866,15 @@ EVERY_MESSAGE: list[ToWorker] = [
 ]
 
 
-def in_state(state: State) -> Session:
+def in_state(state: WorkerState) -> Session:
     """A session in this state; DRAINING with ticket 0 in hand."""
-    if state is State.JOINING:
+    if state is WorkerState.JOINING:
         return joining()
     session = ready(collect((0, 0)))
     task_of(session)
-    if state in (State.DRAINING, State.LEFT):
+    if state in (WorkerState.DRAINING, WorkerState.LEFT):
         session.stop()
-    if state is State.LEFT:
+    if state is WorkerState.LEFT:
         session.stop()
     assert session.state is state
     return session
@@ -884,9 +884,9 @@ def test_every_message_to_a_worker_is_tried() -> None:
     assert {type(message) for message in EVERY_MESSAGE} == set(ToWorker.__args__)
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", WorkerState)
 @pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
-def test_a_message_that_the_table_does_not_list_changes_nothing(state: State, message: ToWorker) -> None:
+def test_a_message_that_the_table_does_not_list_changes_nothing(state: WorkerState, message: ToWorker) -> None:
     session = in_state(state)
     held = held_count(session)
     effects = session.handle(message, 0.1)
@@ -894,9 +894,9 @@ def test_a_message_that_the_table_does_not_list_changes_nothing(state: State, me
         assert (effects, session.state, held_count(session)) == ([], state, held)
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", WorkerState)
 @pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
-def test_the_table_names_the_state_that_follows(state: State, message: ToWorker) -> None:
+def test_the_table_names_the_state_that_follows(state: WorkerState, message: ToWorker) -> None:
     session = in_state(state)
     session.handle(message, 0.1)
     assert session.state is TABLE[state].get(type(message), state)
@@ -906,7 +906,7 @@ def test_a_worker_sends_only_messages_for_a_learner() -> None:
     kinds = set(ToLearner.__args__)
     session = ready(collect((0, 0)))
     effects = session.work_ended(fake_rollouts(task_of(session))) + session.tick(1.0) + session.stop()
-    assert {type(effect.message) for effect in effects if isinstance(effect, Send)} <= kinds
+    assert {type(effect.message) for effect in effects if isinstance(effect, SendMessage)} <= kinds
 
 
 def test_weights_are_held_and_not_copied() -> None:

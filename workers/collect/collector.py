@@ -21,8 +21,8 @@ from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_converter_of
 from protocol.envs.vectorized import make_native
 from protocol.errors import EnvironmentFailed, PolicyFailed
+from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.masks import stored_leaves
-from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
@@ -37,7 +37,7 @@ from workers.copies.envpool_copies import EnvpoolCopies
 from workers.copies.open_lanes import OpenLanes
 from workers.copies.row_writers import write_numbers
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
-from workers.env_copy import make_copy
+from workers.made_copies import make_copy
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""
@@ -63,7 +63,7 @@ def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
     """Do nothing: each lane steps its own copies."""
 
 
-class _Rows(NamedTuple):
+class _CollectedRows(NamedTuple):
     """Arrays of the rollouts of L lanes while they are collected."""
 
     obs: tuple[Array, ...]  # [L, T+1, N, *leaf] each; in a masked run the last one is the mask
@@ -80,7 +80,7 @@ class Collector:
     def __init__(
         self,
         run: RunSpec,
-        policy: Policy | OwnPolicy,
+        policy: Policy | CalledPolicy,
         open_copies: OpenEnvCopies = open_env_copies,
         step_all: StepAll = no_step_for_all,
     ) -> None:
@@ -158,13 +158,13 @@ class Collector:
         self.stages["open"] += perf_counter() - began
         return lane
 
-    def _new_rows(self, lanes: Sequence[CollectedLane]) -> _Rows:
+    def _new_rows(self, lanes: Sequence[CollectedLane]) -> _CollectedRows:
         L, T, N = len(lanes), self._run.rollout_steps, self._run.copies
         obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in self._stored)
         for i, lane in enumerate(lanes):
             for array, leaf in zip(obs, lane.obs, strict=True):
                 array[i, 0] = leaf
-        return _Rows(
+        return _CollectedRows(
             obs=obs,
             state=np.stack([lane.state for lane in lanes]),
             reward=np.empty((L, T, N)),
@@ -173,7 +173,9 @@ class Collector:
             step_end_s=[],
         )
 
-    def _act_and_step(self, rows: _Rows, actions: RolloutActions, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
+    def _act_and_step(
+        self, rows: _CollectedRows, actions: RolloutActions, lanes: Sequence[CollectedLane], pulse: Pulse
+    ) -> None:
         """Step all lanes T times."""
         is_recurrent = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
@@ -211,7 +213,7 @@ class Collector:
 
     def _rollout(
         self,
-        rows: _Rows,
+        rows: _CollectedRows,
         actions: RolloutActions,
         i: int,
         lane: CollectedLane,
@@ -250,7 +252,7 @@ class Collector:
         )
 
 
-def _truncate_lost(rows: _Rows, i: int, lane: CollectedLane, t: int, lost: npt.NDArray[np.bool_]) -> None:
+def _truncate_lost(rows: _CollectedRows, i: int, lane: CollectedLane, t: int, lost: npt.NDArray[np.bool_]) -> None:
     """Lane `i` lost these copies [N] in step `t`: their episodes are truncated at the last step that was made.
 
     Rows `t` and `t + 1` are then not valid, because step `t` was not made.

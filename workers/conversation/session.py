@@ -45,7 +45,7 @@ from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from workers.conversation.connection_rules import REJOIN_TIMEOUT_S
 from workers.conversation.held import Assignment, HeldEvaluations, HeldOrders, HeldRollouts
-from workers.conversation.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
+from workers.conversation.worker_states import TABLE, LearnerSilent, StopRequested, WorkerFailed, WorkerState, WorkFinished
 from workers.exit_codes import EXIT_UNSUITABLE
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
@@ -53,35 +53,35 @@ NO_LEARNER = "no learner answered"
 
 
 @dataclass(frozen=True)
-class Send:
-    """Effect: send this message."""
+class SendMessage:
+    """WorkerEffect: send this message."""
 
     message: ToLearner
 
 
 @dataclass(frozen=True)
 class StartSession:
-    """Effect: a new session starts; close every env copy of the last one."""
+    """WorkerEffect: a new session starts; close every env copy of the last one."""
 
     run: DescribeSpec | RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
 class CloseLanes:
-    """Effect: close the env copies of these lanes."""
+    """WorkerEffect: close the env copies of these lanes."""
 
     lanes: tuple[LaneIncarnation, ...]
 
 
 @dataclass(frozen=True)
 class Leave:
-    """Effect: the conversation is over; end with this exit code."""
+    """WorkerEffect: the conversation is over; end with this exit code."""
 
     exit_code: int
     reason: str
 
 
-Effect = Send | StartSession | CloseLanes | Leave
+WorkerEffect = SendMessage | StartSession | CloseLanes | Leave
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ Work = RolloutTask | EvaluationTask | Order
 
 
 @dataclass(frozen=True)
-class Identity:
+class WorkerIdentity:
     """The identity of this worker: its name, host and process."""
 
     worker: str
@@ -193,7 +193,7 @@ class _SessionState:
                 return self.evaluations.keep(answer)
         return self.orders.keep(answer)
 
-    def release(self, lanes: Sequence[LaneIncarnation]) -> list[Effect]:
+    def release(self, lanes: Sequence[LaneIncarnation]) -> list[WorkerEffect]:
         """Drop these lanes."""
         released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
         if not released:
@@ -201,7 +201,7 @@ class _SessionState:
         self.drop_weights()
         return [CloseLanes(released)]
 
-    def release_unlisted(self, received: Sequence[Received]) -> list[Effect]:
+    def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:
         """Drop the lanes that the learner does not list: their Release was lost.
 
         Only a new HeartbeatReply may do so: a copy of an old message does not list the lanes that came after it.
@@ -214,10 +214,15 @@ class Session:
     """State machine of one worker, from its first Hello until it leaves. Call `tick` at `due_s`, at the latest."""
 
     def __init__(
-        self, identity: Identity, now: float, *, join_timeout_s: float = 60.0, rejoin_timeout_s: float = REJOIN_TIMEOUT_S
+        self,
+        identity: WorkerIdentity,
+        now: float,
+        *,
+        join_timeout_s: float = 60.0,
+        rejoin_timeout_s: float = REJOIN_TIMEOUT_S,
     ) -> None:
         self.identity = identity
-        self.state = State.JOINING
+        self.state = WorkerState.JOINING
         self.run: DescribeSpec | RunSpec | StepSpec | None = None
         self.session = 0
         self._statistics = Statistics()
@@ -233,7 +238,7 @@ class Session:
 
     # ---------------------------------------------------------------- messages and time
 
-    def handle(self, message: ToWorker, now: float) -> list[Effect]:
+    def handle(self, message: ToWorker, now: float) -> list[WorkerEffect]:
         """Handle a message of the learner."""
         if isinstance(message, Drain):  # a Drain also answers the heartbeats of a worker that drains already
             self._unanswered_s = math.inf
@@ -270,29 +275,29 @@ class Session:
                 current.replies = number
                 current.rollouts.forget_received(received)
                 return current.release_unlisted(received)
-        return [Send(answer) for answer in again if answer is not None]
+        return [SendMessage(answer) for answer in again if answer is not None]
 
-    def tick(self, now: float) -> list[Effect]:
+    def tick(self, now: float) -> list[WorkerEffect]:
         """Do what is due: Hello, Heartbeat, or giving up on a silent learner."""
         match self.state:
-            case State.LEFT:
+            case WorkerState.LEFT:
                 return []
-            case State.JOINING:
+            case WorkerState.JOINING:
                 if now - self._joining_s > self._join_timeout_s:
                     return self._leave(LearnerSilent(), 1, f"{NO_LEARNER} for {self._join_timeout_s:g} s")
                 if now < self.due_s:
                     return []
                 self.due_s = now + self._backoff_s
                 self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
-                return [Send(self.identity.hello(self._attempt))]
+                return [SendMessage(self.identity.hello(self._attempt))]
         assert self.run is not None
         if now - self._unanswered_s > self.run.learner_timeout_s:
             return self._rejoin(LearnerSilent(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
         return self.heartbeat_if_due(now)
 
-    def heartbeat_if_due(self, now: float) -> list[Effect]:
+    def heartbeat_if_due(self, now: float) -> list[WorkerEffect]:
         """A Heartbeat, if one is due. It changes nothing else, so it may be sent at any moment."""
-        if self.run is None or self.state not in (State.READY, State.DRAINING) or now < self.due_s:
+        if self.run is None or self.state not in (WorkerState.READY, WorkerState.DRAINING) or now < self.due_s:
             return []
         self.due_s = now + self.run.heartbeat_s
         self._unanswered_s = min(self._unanswered_s, now)
@@ -306,7 +311,7 @@ class Session:
             stages=dict(statistics.stages),
             resident_bytes=statistics.resident_bytes,
         )
-        return [Send(each) for each in (heartbeat, current.described) if each is not None]
+        return [SendMessage(each) for each in (heartbeat, current.described) if each is not None]
 
     def update_statistics(self, statistics: Statistics) -> None:
         """The next Heartbeat reports these."""
@@ -314,55 +319,55 @@ class Session:
 
     # ---------------------------------------------------------------- leaving
 
-    def stop(self) -> list[Effect]:
+    def stop(self) -> list[WorkerEffect]:
         """Leave: after the work in progress, or at once when called twice."""
-        return [] if self.state is State.LEFT else self._drain(StopRequested(), TOLD_TO_STOP)
+        return [] if self.state is WorkerState.LEFT else self._drain(StopRequested(), TOLD_TO_STOP)
 
-    def fail(self, error: str, traceback: str, lane: int | None, *, of_policy: bool = False) -> list[Effect]:
+    def fail(self, error: str, traceback: str, lane: int | None, *, of_policy: bool = False) -> list[WorkerEffect]:
         """The environment, the user's policy (`of_policy`), or this worker raised: report it to the learner, and leave."""
         error = one_line(error)
         failure = Failure(self.session, error, last_text(traceback), lane, of_policy)
         return self._leave(WorkerFailed(), 1, error, failure)
 
-    def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[Effect]:
+    def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:
         """Leave a run in which this worker cannot take part, or (with another exit code) not now."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
-    def refused(self, reason: str) -> list[Effect]:
+    def refused(self, reason: str) -> list[WorkerEffect]:
         """Leave, because the learner, or its endpoint, rejects this worker for good."""
         return self._leave(Refuse(reason), 2, reason)
 
     # ---------------------------------------------------------------- describing
 
-    def described(self, description: EnvDescription) -> list[Effect]:
+    def described(self, description: EnvDescription) -> list[WorkerEffect]:
         """The environment of the `DescribeSpec` is described."""
-        if self.state not in (State.READY, State.DRAINING):
+        if self.state not in (WorkerState.READY, WorkerState.DRAINING):
             return []
         self._current.described = Described(self.session, description)
-        return [Send(self._current.described)]
+        return [SendMessage(self._current.described)]
 
     # ---------------------------------------------------------------- working
 
     def next_work(self) -> Work | None:
         """The next piece of work, which is in progress until `work_ended`. None if there is none, or one is in progress."""
-        if self.state is not State.READY or self._current.in_progress:
+        if self.state is not WorkerState.READY or self._current.in_progress:
             return None
         work = self._current.next_work(self.session)
         self._current.in_progress = work is not None
         return work
 
-    def work_ended(self, answers: Sequence[Rollout | Evaluated | Answer]) -> list[Effect]:
+    def work_ended(self, answers: Sequence[Rollout | Evaluated | Answer]) -> list[WorkerEffect]:
         """The work in progress has ended with these answers; with none, it was abandoned. A worker that drains leaves."""
         current = self._current
         # The session may have ended, or the lane may have been released, in the meantime.
         kept = [each for each in answers if each.session == self.session and current.keep(each)]
         current.drop_weights()
         current.in_progress = False
-        return [*map(Send, kept), *self._leave_if_drained()]
+        return [*map(SendMessage, kept), *self._leave_if_drained()]
 
     def is_unwanted(self, work: Work | SharedOrders) -> bool:
         """True when this work is no longer wanted. A worker that drains finishes a rollout, but not an evaluation."""
-        goes_on = (State.READY,) if isinstance(work, EvaluationTask) else (State.READY, State.DRAINING)
+        goes_on = (WorkerState.READY,) if isinstance(work, EvaluationTask) else (WorkerState.READY, WorkerState.DRAINING)
         return self.state not in goes_on or work.session != self.session
 
     # ---------------------------------------------------------------- inside
@@ -374,8 +379,8 @@ class Session:
         self._backoff_s = HELLO_FIRST_S
         self._current = _SessionState()
 
-    def _welcome(self, message: Welcome, now: float) -> list[Effect]:
-        if message.attempt != self._attempt or (self.state is State.READY and message.session == self.session):
+    def _welcome(self, message: Welcome, now: float) -> list[WorkerEffect]:
+        if message.attempt != self._attempt or (self.state is WorkerState.READY and message.session == self.session):
             return []  # the answer to an earlier Hello, or a repeat
         self._transition(message)
         self._current = _SessionState()
@@ -385,30 +390,30 @@ class Session:
         self._join_timeout_s = self._rejoin_timeout_s
         return [StartSession(message.run)]
 
-    def _rejoin(self, event: object, reason: str, now: float) -> list[Effect]:
+    def _rejoin(self, event: object, reason: str, now: float) -> list[WorkerEffect]:
         self._transition(event)
-        if self.state is State.LEFT:
+        if self.state is WorkerState.LEFT:
             return [Leave(1, reason)]
         lanes = self._current.lanes()
         self._join(now)
         return [CloseLanes(lanes), *self.tick(now)]
 
-    def _drain(self, event: object, reason: str) -> list[Effect]:
+    def _drain(self, event: object, reason: str) -> list[WorkerEffect]:
         self._transition(event)
         self._reason = reason
-        return [Leave(0, reason)] if self.state is State.LEFT else self._leave_if_drained()
+        return [Leave(0, reason)] if self.state is WorkerState.LEFT else self._leave_if_drained()
 
-    def _leave_if_drained(self) -> list[Effect]:
-        if self.state is not State.DRAINING or self._current.in_progress:
+    def _leave_if_drained(self) -> list[WorkerEffect]:
+        if self.state is not WorkerState.DRAINING or self._current.in_progress:
             return []
         goodbye = Goodbye(self.session, one_line(self._reason), self._current.unfinished())
         return self._leave(WorkFinished(), 0, self._reason, goodbye)
 
-    def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[Effect]:
+    def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[WorkerEffect]:
         """Leave, once. The last message is said only within a session."""
-        if self.state is State.LEFT:
+        if self.state is WorkerState.LEFT:
             return []
-        said = [] if last is None or self.state is State.JOINING else [Send(last)]
+        said = [] if last is None or self.state is WorkerState.JOINING else [SendMessage(last)]
         self._transition(event)
         return [*said, Leave(exit_code, reason)]
 

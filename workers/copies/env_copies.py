@@ -28,12 +28,12 @@ from protocol.specs import RunSpec
 from protocol.wire.plain_values import unpack
 from workers.activity import EVALUATING, RESETTING, STEPPING, activity
 from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import Autoreset, EnvLoop, Infos, Pulse
+from workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.copies.mask_reader import MaskReader
 from workers.copies.row_writers import missing_leaf, read_leaves
-from workers.env_copy import close_copy
 from workers.envs.reset_ahead import ResetAhead
+from workers.made_copies import close_copy
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]
@@ -159,7 +159,7 @@ class LoopedCopies:
         except BaseException as error:
             raise CopyFailed(copy, "render") from error
 
-    def _read_masks(self, masks: MaskReader, infos: Infos, copies: Sequence[int] | None) -> Leaves:
+    def _read_masks(self, masks: MaskReader, infos: CopyInfos, copies: Sequence[int] | None) -> Leaves:
         return masks.read_loop(self._observations, infos, self._loop.terminated, self._loop.truncated, copies)
 
     def _leaves(self) -> Leaves:

@@ -30,10 +30,10 @@ from workers.activity import (
     activity,
 )
 from workers.copies.env_errors import CopyFailed
-from workers.env_copy import close_copy, make_copy
+from workers.made_copies import close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
-Infos = list[tuple[int, dict[str, Any]]]
+CopyInfos = list[tuple[int, dict[str, Any]]]
 """(number of the copy, its info), where the info is not empty; a copy of its dicts and arrays, see `_kept`"""
 Pulse = Callable[[], None]
 """Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
@@ -91,9 +91,9 @@ class EnvLoop:
         into: list[Any],
         pulse: Pulse,
         options: Sequence[Any] = (),
-    ) -> Infos:
+    ) -> CopyInfos:
         """Start episodes in these copies, with a seed for each, and options for each if any are given."""
-        infos: Infos = []
+        infos: CopyInfos = []
         keywords: Iterable[Mapping[str, Any]] = [{"options": each} for each in options] or repeat({}, len(seeds))
         for n, seed, further in zip(copies, seeds, keywords, strict=True):
             pulse()
@@ -107,7 +107,7 @@ class EnvLoop:
                 infos.append((n, _kept(info)))
         return infos
 
-    def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse, copies: Sequence[int] | None = None) -> Infos:
+    def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse, copies: Sequence[int] | None = None) -> CopyInfos:
         """Step every copy, or these alone, each with its action, or reset it.
 
         The rest of the result is in `reward`, `terminated`, `truncated`.
@@ -119,7 +119,7 @@ class EnvLoop:
         stepping = self._stepping
         reward, terminated, truncated = self.reward, self.terminated, self.truncated
         next_step, same_step = self._next_step, self._same_step
-        infos: Infos = []
+        infos: CopyInfos = []
         # What the worker does is written here in full, because this loop must be fast: once per step of the lane, when a
         # copy is reset, and every `PULSE_S`.
         numbers, seconds, begin, counted = self._activity.numbers, self._activity.seconds, self._activity.begin, 0

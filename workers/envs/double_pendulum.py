@@ -24,7 +24,9 @@ from gymnasium.error import ResetNeeded
 from protocol.arrays import Doubles, Floats
 from workers.envs.double_pendulum_screen import Screen
 
-State = tuple[float, float, float, float, float, float]  # x_m, theta_rad, phi_rad, and their derivatives, each per second
+PendulumState = tuple[
+    float, float, float, float, float, float
+]  # x_m, theta_rad, phi_rad, and their derivatives, each per second
 Accelerations = Callable[[float, float, float, float, float, float], tuple[float, float, float]]
 
 DT_S = 0.02
@@ -124,7 +126,7 @@ def linear_accelerations(physics: Physics) -> Accelerations:
     return solve
 
 
-def advance(solve: Accelerations, state: State, force: float, h: float) -> State:
+def advance(solve: Accelerations, state: PendulumState, force: float, h: float) -> PendulumState:
     """One Runge–Kutta step of fourth order, `h` seconds long: k₁ to k₄ are (speeds, accelerations) at its four points."""
     x, t, p, u1, v1, w1 = state
     half = h / 2
@@ -191,7 +193,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         self._high = np.array([2 * track_m, *[2 * angle_limit_rad] * 2, *[SPEED_LIMIT] * 3], np.float32)
         self.observation_space = spaces.Box(-self._high, self._high, dtype=np.float32)
         self.action_space = spaces.Box(-1, 1, (1,), np.float32)
-        self.state: State | None = None
+        self.state: PendulumState | None = None
         self.push = 0.0  # last action, clipped
         self._solve = (linear_accelerations if linearised else accelerations)(self.physics)
         self._x_cost, self._angle_cost = 0.3 / track_m**2, 0.15 / angle_limit_rad**2

@@ -17,7 +17,7 @@ import gymnasium
 from protocol.envs.env_copy import FIRST_COPY, being_made
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
-from workers.env_copy import give_back, make_copy
+from workers.made_copies import give_back, make_copy
 
 Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, its first observation and its first info
 

@@ -17,13 +17,13 @@ from protocol.specs import PolicySpec
 
 CHUNK_BYTES = 8 * 2**20
 
-Send = Callable[[EpisodeRows], None]
+SendRows = Callable[[EpisodeRows], None]
 
 
 class RowSender:
     """Collects the rows of one episode and sends them."""
 
-    def __init__(self, order: Evaluate, episode: int, policy: PolicySpec, send: Send) -> None:
+    def __init__(self, order: Evaluate, episode: int, policy: PolicySpec, send: SendRows) -> None:
         """`episode` is the index of its seed."""
         self._order, self._episode, self._policy, self._send = order, episode, policy, send
         self._first_step = 0

@@ -21,8 +21,8 @@ from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError
 from protocol.messages import Evaluate, Evaluated
+from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.masks import stored_leaves
-from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
@@ -34,7 +34,7 @@ from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.row_writers import ObservationWriter, write_numbers
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
-from workers.evaluate.episode_rows import RowSender, Send, as_frame
+from workers.evaluate.episode_rows import RowSender, SendRows, as_frame
 
 
 class EvaluationCopies(EnvCopies, Protocol):
@@ -73,7 +73,7 @@ class Evaluator:
     """Plays whole episodes. It opens env copies when they are first needed."""
 
     def __init__(
-        self, run: RunSpec, policy: Policy | OwnPolicy, open_copies: OpenEvaluationCopies = open_looped_copies
+        self, run: RunSpec, policy: Policy | CalledPolicy, open_copies: OpenEvaluationCopies = open_looped_copies
     ) -> None:
         """`policy` must hold the weights to evaluate when `play` is called."""
         self.steps = 0
@@ -87,7 +87,7 @@ class Evaluator:
         self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
-    def play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:
+    def play(self, order: Evaluate, send: SendRows, pulse: Pulse) -> Evaluated:
         """Play one episode for each seed. `send` gets the rows, if the order asks for them.
 
         `pulse` is called at every step and may raise. If it raises, or the environment does (`EnvironmentFailed`), all
@@ -112,7 +112,7 @@ class Evaluator:
         while self._copies:
             self._copies.popitem()[1].close()
 
-    def _play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated | None:
+    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse) -> Evaluated | None:
         """The answer; None if a worker was lost, and with it copies whose episodes had not ended."""
         k, policy = len(order.seeds), self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)

@@ -22,11 +22,11 @@ from protocol.errors import UsageError
 from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
 from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import EnvLoop, Infos, Pulse
+from workers.copies.env_loop import CopyInfos, EnvLoop, Pulse
 from workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
 
 
-class Rows(NamedTuple):
+class LaneArrays(NamedTuple):
     """Arrays into which a lane writes the results of its copies: its own, or a part of shared memory."""
 
     obs: tuple[Array, ...]  # [N, *leaf] each
@@ -35,17 +35,17 @@ class Rows(NamedTuple):
     truncated: Array  # [N] bool
 
 
-def new_rows(spec: StepSpec, lane: int) -> Rows:
+def new_rows(spec: StepSpec, lane: int) -> LaneArrays:
     """New arrays for this lane."""
     N = spec.lanes[lane]
     obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.observation)
-    return Rows(obs, np.zeros(N), np.zeros(N, bool), np.zeros(N, bool))
+    return LaneArrays(obs, np.zeros(N), np.zeros(N, bool), np.zeros(N, bool))
 
 
 class SteppedLane:
     """N env copies that are stepped together."""
 
-    def __init__(self, spec: StepSpec, lane: int, incarnation: int, rows: Rows, pulse: Pulse) -> None:
+    def __init__(self, spec: StepSpec, lane: int, incarnation: int, rows: LaneArrays, pulse: Pulse) -> None:
         """Make the copies, and reset none. Raises `UsageError` when their spaces are not the vector environment's."""
         self.incarnation = incarnation
         self.rows = rows
@@ -64,7 +64,7 @@ class SteppedLane:
         self._writer = ObservationWriter(spec.observation, len(self._loop.envs))
         self._joined = self._writer.joined(array[None] for array in rows.obs)
 
-    def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> Infos:
+    def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> CopyInfos:
         """Start episodes in these copies, with a seed for each. `options`: a list with those of each, or those of all."""
         each = options if isinstance(options, list) else [options] * len(copies)
         infos = self._loop.reset(copies, seeds, self._observations, pulse, each)
@@ -74,7 +74,7 @@ class SteppedLane:
         self._write_numbers()
         return infos
 
-    def step(self, actions: Sequence[Array], pulse: Pulse) -> Infos:
+    def step(self, actions: Sequence[Array], pulse: Pulse) -> CopyInfos:
         """Step each copy with its row of the actions, which are [N, *leaf] for each leaf."""
         each: Iterable[Any] = map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
         step = self._loop.steps

@@ -25,9 +25,9 @@ from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
 from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
 from workers.activity import STEPPING, activity
 from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.env_loop import Infos, Pulse
+from workers.copies.env_loop import CopyInfos, Pulse
 from workers.copies.open_lanes import OpenLanes
-from workers.vector_env.stepped_lane import Rows, SteppedLane, new_rows
+from workers.vector_env.stepped_lane import LaneArrays, SteppedLane, new_rows
 
 
 class Stepper:
@@ -131,7 +131,7 @@ class Stepper:
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True
 
-    def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> Infos:
+    def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> CopyInfos:
         began = perf_counter()
         # A copy of the actions, because an environment may keep its action, or change it.
         infos = lane.step([array.copy() for array in actions], pulse)
@@ -150,14 +150,14 @@ class Stepper:
         self.stages["open"] += perf_counter() - began
         return lane
 
-    def _rows(self, lane: int) -> Rows:
+    def _rows(self, lane: int) -> LaneArrays:
         if self._memory is None:
             return new_rows(self._spec, lane)
         memory = self._memory.lanes[lane]
-        return Rows(memory.obs, memory.reward, memory.terminated, memory.truncated)
+        return LaneArrays(memory.obs, memory.reward, memory.terminated, memory.truncated)
 
 
-def pack_infos(infos: Infos) -> bytes:
+def pack_infos(infos: CopyInfos) -> bytes:
     """The infos as bytes; no bytes if there are none."""
     return pack(infos, use_repr=True) if infos else b""
 
@@ -166,7 +166,7 @@ def _array(data: bytes) -> npt.NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8)
 
 
-def _stepped(order: Reset | Step, rows: Rows, infos: bytes) -> Stepped:
+def _stepped(order: Reset | Step, rows: LaneArrays, infos: bytes) -> Stepped:
     """The answer, with its own copies of the arrays, because it may be sent again."""
     return Stepped(
         session=order.session,

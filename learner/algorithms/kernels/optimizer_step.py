@@ -27,7 +27,7 @@ from torch.optim import Adam, AdamW, Optimizer, RMSprop
 
 COMPILER_MARK = "__dynamo_disable"
 
-State = dict[str, Tensor]
+OptimizerState = dict[str, Tensor]
 Kernel = Callable[..., Any]
 
 
@@ -97,7 +97,7 @@ def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
             raise ValueError(f"optimizer: expected {', '.join(own)} of {len(flat)} numbers, got {', '.join(kept)}")
 
 
-def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], State], None] | None:
+def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
     """The step of this kind of optimizer. None if the kind is not known here, or this version of torch lacks its kernel."""
     match optimizer:
         case AdamW():  # before Adam: in newer versions of torch AdamW is a subclass of it
@@ -110,7 +110,7 @@ def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], State], 
             return None
 
 
-def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], State], None] | None:
+def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
     """The step by a private function of torch, if torch has one of this name and it does what this file expects."""
     kernel = getattr(torch, name, None)
     return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
@@ -134,7 +134,7 @@ def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
     return abs(flat.item() - decayed_parameter) < 1e-5
 
 
-def _initial_state(optimizer: Optimizer, flat: Tensor, group: dict[str, Any]) -> State:
+def _initial_state(optimizer: Optimizer, flat: Tensor, group: dict[str, Any]) -> OptimizerState:
     """The optimizer's state before its first step, with torch's own names."""
     if isinstance(optimizer, RMSprop):
         names = ["square_avg"]
@@ -143,7 +143,7 @@ def _initial_state(optimizer: Optimizer, flat: Tensor, group: dict[str, Any]) ->
     return {"step": torch.zeros(())} | {name: torch.zeros_like(flat) for name in names}
 
 
-def _adam(kernel: Kernel, flat: Tensor, group: dict[str, Any], state: State) -> None:
+def _adam(kernel: Kernel, flat: Tensor, group: dict[str, Any], state: OptimizerState) -> None:
     beta1, beta2 = group["betas"]
     state["step"] += 1
     kernel(
@@ -163,7 +163,7 @@ def _adam(kernel: Kernel, flat: Tensor, group: dict[str, Any], state: State) -> 
     )
 
 
-def _rmsprop(flat: Tensor, group: dict[str, Any], state: State) -> None:
+def _rmsprop(flat: Tensor, group: dict[str, Any], state: OptimizerState) -> None:
     gradient = flat.grad
     assert gradient is not None
     state["step"] += 1

@@ -19,9 +19,9 @@ from torch import Tensor
 from learner.algorithms.algorithm import Start
 from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.gradient_descent import Metrics
-from learner.algorithms.kernels.networks import actor_and_critics
+from learner.algorithms.gradient_descent import UpdateMetrics
 from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
+from learner.algorithms.kernels.trained_networks import actor_and_critics
 from learner.algorithms.replay.off_policy import OffPolicy, Transitions
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import ContinuousConfig
@@ -79,7 +79,7 @@ class Continuous(Clones, OffPolicy):
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
         self.optimizers = {name: make_optimizer("adam", part, config.learning_rate) for name, part in trained.items()}
 
-    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> Metrics:
+    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> UpdateMetrics:
         """See `Clones`: the actor alone. It acts from the first env step."""
         found = super().clone(episodes, pulse)
         self.target.actor.copy_(self.net.actor)
@@ -106,7 +106,7 @@ class Continuous(Clones, OffPolicy):
         rows = super().transitions(sample)
         return rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
 
-    def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> Metrics:
+    def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
         """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss.
 
         Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the numbers and the gradient's

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor
 
-from learner.algorithms.gradient_descent import GradientDescent, Metrics
+from learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics
 from learner.algorithms.replay.mixed_replay import MixedReplay
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
@@ -83,13 +83,13 @@ class OffPolicy(GradientDescent):
         """The number of gradient steps of this update, whose batch is in the buffer and counted in `env_steps`."""
 
     @abstractmethod
-    def step(self, rows: Transitions) -> tuple[Metrics, Tensor]:
+    def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
         """One gradient step on a minibatch. Adds 1 to `gradient_steps`. Returns what it measured, and the TD errors [B].
 
         Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
         """
 
-    def update(self, batch: Batch, pulse: Callable[[], None]) -> Metrics:
+    def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
         """Add a batch to the replay buffer and learn from it, calling `pulse` between gradient steps. Returns metrics.
 
         Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
@@ -112,7 +112,7 @@ class OffPolicy(GradientDescent):
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
 
-    def steps(self, number: int, pulse: Callable[[], None], beta: float = 1.0) -> Iterator[Metrics]:
+    def steps(self, number: int, pulse: Callable[[], None], beta: float = 1.0) -> Iterator[UpdateMetrics]:
         """Gradient steps on minibatches of the replay buffer and of prior data. `beta`: see `ReplayBuffer.sample`."""
         for sample in self.replay.samples(number, self.config.batch_size, beta):
             metrics, error = self.step(self.transitions(sample))

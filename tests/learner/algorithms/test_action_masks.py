@@ -15,7 +15,7 @@ from torch import Tensor
 from learner.algorithms.actor_critic import ActorCritic
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
-from learner.algorithms.kernels import networks
+from learner.algorithms.kernels import trained_networks
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.algorithms.replay import replay_buffer
@@ -148,7 +148,7 @@ def test_a_choice_for_each_entry() -> None:
 def test_a_choice_that_is_always_forbidden_gets_no_gradient(
     action: str, small: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(networks, "is_small", lambda *_: small)
+    monkeypatch.setattr(trained_networks, "is_small", lambda *_: small)
     algorithm = ppo(action)
     rows = masked_batch(algorithm, 0)
     assert rows.mask is not None
@@ -169,7 +169,7 @@ def test_one_update_is_that_of_maskable_ppo(action: str, small: bool, monkeypatc
     pytest.importorskip("sb3_contrib")
     from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 
-    monkeypatch.setattr(networks, "is_small", lambda *_: small)
+    monkeypatch.setattr(trained_networks, "is_small", lambda *_: small)
     algorithm = ppo(action, vf_coef=0.5, normalize_advantage=True)
     rows = minibatch_of(algorithm, masked_batch(algorithm, 0))
     torch.manual_seed(0)
@@ -261,7 +261,7 @@ def values(net: Any, obs: Array) -> Array:
 def test_targets_are_the_best_of_the_allowed_actions_of_the_next_observation(
     n_step: int, double: bool, replay: Any, small: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(networks, "is_small", lambda *_: small)
+    monkeypatch.setattr(trained_networks, "is_small", lambda *_: small)
     algorithm = dqn(n_step=n_step, double=double, replay=replay)
     for seed in range(3):
         algorithm.replay.add(true_masks(masked_batch(algorithm, seed)))

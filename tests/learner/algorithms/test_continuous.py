@@ -17,7 +17,7 @@ import torch
 import learner.algorithms
 import millrace.algorithms
 from learner.algorithms import algorithm_class
-from learner.algorithms.kernels import networks
+from learner.algorithms.kernels import trained_networks
 from learner.algorithms.replay.continuous import Continuous
 from learner.algorithms.replay.off_policy import Transitions
 from learner.algorithms.replay.replay_buffer import Sample
@@ -415,7 +415,7 @@ def their_model(algo: str, algorithm: Any) -> Any:
 @pytest.mark.usefixtures("_float64")
 def test_updates_are_those_of_stable_baselines3(algo: str, small: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six gradient steps: losses, both networks, their targets and the temperature, for the same batches and noise."""
-    monkeypatch.setattr(networks, "is_small", lambda *_: small)
+    monkeypatch.setattr(trained_networks, "is_small", lambda *_: small)
     algorithm = made(algo, learning_rate=1e-3)
     assert algorithm.net.flat.dtype == torch.float64
     model = their_model(algo, algorithm)

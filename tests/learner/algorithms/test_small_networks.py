@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from learner.algorithms.kernels import mlp as layers
-from learner.algorithms.kernels import networks
-from learner.algorithms.kernels.networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
+from learner.algorithms.kernels import trained_networks
+from learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
 from protocol.arrays import Array
 from protocol.policy.layout import hidden_names
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
@@ -356,13 +356,15 @@ def test_a_network_that_is_not_small_has_no_second_derivative_either(network: An
     ],
 )
 def test_small_is_a_matter_of_shape_and_device(spec: PolicySpec, device: str, expected: bool) -> None:
-    assert networks.is_small(spec, device) == expected
+    assert trained_networks.is_small(spec, device) == expected
 
 
 def test_critics_without_a_hidden_layer_are_not_small() -> None:
     spec = PolicySpec((BOX,), BOUNDED, (), head="squashed")
-    assert type(networks.actor_and_critics(spec, "cpu", 0)) is ActorAndCritics
-    assert type(networks.actor_and_critics(msgspec.structs.replace(spec, net=(4,)), "cpu", 0)) is SmallActorAndCritics
+    assert type(trained_networks.actor_and_critics(spec, "cpu", 0)) is ActorAndCritics
+    assert (
+        type(trained_networks.actor_and_critics(msgspec.structs.replace(spec, net=(4,)), "cpu", 0)) is SmallActorAndCritics
+    )
 
 
 def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,8 @@ import pytest
 from learner.members.member_server import AWAY_S, MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import OrderCoordinator
-from learner.vector_env.status import status
 from learner.vector_env.step_hub import StepHub
+from learner.vector_env.vector_env_status import status
 from protocol.alive import WorkerActivity, WorkerExit
 from protocol.errors import NoWorkers
 from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello

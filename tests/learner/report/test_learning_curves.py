@@ -11,7 +11,7 @@ from learner.config.layers import resolve
 from learner.report.curve import Curve, common_grid
 from learner.report.learning_curves import curves, plot, read_curve
 from learner.report.page import page
-from learner.report.runs import group_runs, read_run
+from learner.report.reported_runs import group_runs, read_run
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Summary

@@ -21,7 +21,7 @@ from learner.report import sections
 from learner.report.charts import MINUS, Series, chart, ticks, with_si_prefix
 from learner.report.html_parts import time_text
 from learner.report.page import page, write_page
-from learner.report.runs import ReportData, group_runs, read_run
+from learner.report.reported_runs import ReportData, group_runs, read_run
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation, Summary

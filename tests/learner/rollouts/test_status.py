@@ -15,7 +15,7 @@ import zmq
 from learner.members.events import Event, RejoinRequested, WorkerLeft, describe
 from learner.members.membership import MAX_LATE_ACTIONS
 from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.status import status
+from learner.rollouts.run_status import status
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
 from millrace.cli.status import as_table, ask, in_json, observer_name
@@ -244,7 +244,7 @@ def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event(
 
 EVENTS: list[tuple[Event, dict[str, Any]]] = [
     (WorkerLeft("w0", "was killed", 2, False), {"event": "left", "worker": "w0", "why": "was killed", "tickets": 2}),
-    (RejoinRequested("w0", 7, 640), {"event": "told", "worker": "w0", "session": 7, "late": 640}),
+    (RejoinRequested("w0", 7, 640), {"event": "asked_to_rejoin", "worker": "w0", "session": 7, "late": 640}),
 ]
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from learner.config.validation import MOST_TICKETS
 from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, WorkerRefused
+from learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.members.membership import Outgoing
-from learner.members.states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.lanes import TicketedLane
 from learner.rollouts.ledger import Ledger

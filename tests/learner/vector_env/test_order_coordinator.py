@@ -11,7 +11,7 @@ import pytest
 
 from learner.members.events import WorkerLeft, WorkerRefused
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
-from learner.vector_env.status import status
+from learner.vector_env.vector_env_status import status
 from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,

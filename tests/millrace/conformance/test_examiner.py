@@ -22,17 +22,17 @@ from millrace.conformance.report import as_data, explanation, line_of, summary
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import (
     Broken,
-    Effect,
     EndClient,
     Ended,
     Heard,
+    LearnerEffect,
     Script,
-    Send,
+    SendFrames,
     Skipped,
     StartClient,
     Wait,
 )
-from millrace.conformance.watch import Watch, check_stepped
+from millrace.conformance.watch import WatchedSession, check_stepped
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.keys.keys import Key, Token
@@ -99,7 +99,7 @@ def in_a_session(learner: Learner) -> Script[None]:
     yield Wait(30.0)
 
 
-def run(test: Examiner, until_s: float, step_s: float = 0.1) -> list[Effect]:
+def run(test: Examiner, until_s: float, step_s: float = 0.1) -> list[LearnerEffect]:
     """Let the time pass; the client says nothing."""
     effects, now = [], 0.0
     while now < until_s and not test.done:
@@ -149,7 +149,7 @@ def welcomed(script: Callable[[Learner], Script[None]] = in_a_session) -> tuple[
     test = examiner(script)
     test.tick(0.0)
     sent, *_ = test.handle(Heard(b"w", HELLO), 0.1)
-    assert isinstance(sent, Send)
+    assert isinstance(sent, SendFrames)
     welcome = decode_to_worker(list(sent.frames))
     assert isinstance(welcome, Welcome)
     return test, welcome.session
@@ -204,10 +204,10 @@ def test_a_rollout_that_answers_the_last_word_of_a_check_at_once_is_heard(monkey
         return collect_checks.Collecting(learner, run_spec())
 
     monkeypatch.setattr(collect_checks, "collecting", in_a_run)
-    monkeypatch.setattr(Watch, "see", lambda *seen: None)  # what is in the rollout does not matter here
+    monkeypatch.setattr(WatchedSession, "see", lambda *seen: None)  # what is in the rollout does not matter here
     test, session = welcomed(collect_checks.ignores_a_late_reply)
     collect = test.handle(Heard(b"w", beat(session)), 0.2)[1]
-    assert isinstance(collect, Send)
+    assert isinstance(collect, SendFrames)
     dealt = decode_to_worker(list(collect.frames))
     assert isinstance(dealt, Collect)
     test.tick(0.6)
@@ -223,9 +223,9 @@ def test_a_client_may_end_at_once_when_it_is_refused() -> None:
     assert [each.outcome for each in test.results] == ["passed"]
 
 
-def watch_of(*versions: int) -> Watch:
+def watch_of(*versions: int) -> WatchedSession:
     """The watch over a session in which these weights were sent."""
-    watch = Watch(Welcome(1, 71, run_spec()), 0.0)
+    watch = WatchedSession(Welcome(1, 71, run_spec()), 0.0)
     for version in versions:
         watch.sent(Weights(version, np.zeros(1, np.float32), np.zeros(0, np.float32)))
     return watch
@@ -294,7 +294,7 @@ def test_a_lane_is_listed_with_what_has_arrived_until_it_is_released() -> None:
 
 @pytest.mark.parametrize("kind", ["order", "permit", "evaluation"])
 def test_a_ticket_is_listed_from_the_reply_after_it_until_it_is_answered(kind: str) -> None:
-    watch = Watch(Welcome(1, 71, STEPPED), 0.0) if kind == "order" else watch_of(3)
+    watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0) if kind == "order" else watch_of(3)
     sent: dict[str, ToWorker] = {
         "order": Step(1, 7, 0, 0, ()),
         "permit": Collect(1, 3, (Permit(7, 0, 0, 1),), ()),
@@ -314,7 +314,7 @@ def test_a_ticket_is_listed_from_the_reply_after_it_until_it_is_answered(kind: s
 
 @pytest.mark.parametrize("why", ["answered", "lost", "drained", "superseded", "of a released lane"])
 def test_a_ticket_need_not_be_listed(why: str) -> None:
-    watch = Watch(Welcome(1, 71, STEPPED), 0.0)
+    watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0)
     if why == "drained":
         watch.sent(Drain(""))
     watch.sent(Step(1, 7, 0, 0, ()))
@@ -342,7 +342,7 @@ def test_with_keys_a_routing_id_is_the_name_and_the_tag_of_the_client() -> None:
 
 
 def test_an_answer_that_is_sent_again_is_the_same() -> None:
-    watch = Watch(Welcome(1, 71, STEPPED), 0.0)
+    watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0)
     order = Step(1, 7, 0, 0, ())
     for _ in range(3):
         watch.sent(order)
@@ -354,7 +354,7 @@ def test_an_answer_that_is_sent_again_is_the_same() -> None:
 
 
 def test_a_description_that_is_sent_again_is_the_same() -> None:
-    watch = Watch(Welcome(1, 71, DescribeSpec(EnvSpec("own"))), 0.0)
+    watch = WatchedSession(Welcome(1, 71, DescribeSpec(EnvSpec("own"))), 0.0)
     description: Any
     for description in ("one", "one"):
         watch.see(Described(1, description), 0.1)

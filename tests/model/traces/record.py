@@ -19,7 +19,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from protocol.arrays import Array
 from protocol.messages import Rollout, ToLearner, ToWorker, Weights
 from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
-from workers.conversation.session import CloseLanes, EvaluationTask, Leave, RolloutTask, Send, StartSession
+from workers.conversation.session import CloseLanes, EvaluationTask, Leave, RolloutTask, SendMessage, StartSession
 
 SUFFIX = ".trace"
 KEPT_WEIGHTS = 64  # digests of weights: the learner of a soak must not grow by them
@@ -105,7 +105,7 @@ class Digests:
     def result(self, value: Any) -> Any:
         """What is written of the result of a call."""
         match value:
-            case Send(message):
+            case SendMessage(message):
                 return type(message).__name__, self.of(message)
             case StartSession():
                 return "StartSession"

@@ -21,7 +21,7 @@ from tests.model.vector_env import learner_half, worker_half
 from tests.model.vector_env.learner_half import Learner
 from tests.model.vector_env.order_content import content_of, step_spec
 from tests.model.vector_env.worker_half import Worker
-from workers.conversation.states import State as SessionState
+from workers.conversation.worker_states import WorkerState as SessionState
 
 
 @dataclass(frozen=True)

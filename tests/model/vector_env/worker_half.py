@@ -26,8 +26,17 @@ from tests.model.vector_env.order_content import (
 )
 from tests.model.worker_part import PAUSE_S
 from workers.conversation.held import OrderLane
-from workers.conversation.session import CloseLanes, Effect, Identity, Leave, Send, Session, SharedOrders, StartSession
-from workers.conversation.states import State
+from workers.conversation.session import (
+    CloseLanes,
+    Leave,
+    SendMessage,
+    Session,
+    SharedOrders,
+    StartSession,
+    WorkerEffect,
+    WorkerIdentity,
+)
+from workers.conversation.worker_states import WorkerState
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping
@@ -65,7 +74,7 @@ class Worker:
             case ("start",):
                 self.nonce += ATTEMPTS
                 self.shut_out = False
-                who = Identity(f"w{self.number}", "host", 1, self.nonce, "model")
+                who = WorkerIdentity(f"w{self.number}", "host", 1, self.nonce, "model")
                 self.session = Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
                 return self._turn([], now)
             case ("finish",):
@@ -90,7 +99,7 @@ class Worker:
         self.session = self.work = None
         self.copies, self.newest, self.frozen = {}, (-1, -1), False
 
-    def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
+    def _turn(self, effects: list[WorkerEffect], now: float) -> list[ToLearner]:
         """Do what the program does after each event."""
         current = self.session
         assert current is not None
@@ -110,11 +119,11 @@ class Worker:
             self.work = answer(order, state)
         return sent + self._do(current.tick(now))
 
-    def _do(self, effects: list[Effect]) -> list[ToLearner]:
+    def _do(self, effects: list[WorkerEffect]) -> list[ToLearner]:
         sent: list[ToLearner] = []
         for effect in effects:
             match effect:
-                case Send(message):
+                case SendMessage(message):
                     sent.append(message)
                 case StartSession():
                     self.copies.clear()
@@ -166,10 +175,10 @@ def loaded(content: Content, number: int, run: Stepping) -> Worker:
     if fields is None:
         return worker
     state, of_session, attempt, heard, due, lanes, in_progress, replies, copies, newest = fields
-    who = Identity(f"w{number}", "host", 1, nonce.value, "model")
+    who = WorkerIdentity(f"w{number}", "host", 1, nonce.value, "model")
     current = worker.session = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
-    current.state, current._attempt = State(state), attempt.value
+    current.state, current._attempt = WorkerState(state), attempt.value
     current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
     held.in_progress = in_progress

@@ -18,7 +18,7 @@ from protocol.arrays import Array
 from protocol.policy.distributions import distribution
 from protocol.policy.features import features, normalize
 from protocol.policy.layout import buffer_size, convolutions, parameter_layout, total_size
-from protocol.policy.networks import MLP, ActorCriticNetwork
+from protocol.policy.networks import ActorCriticNetwork, MLPNode
 from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
@@ -179,7 +179,7 @@ def test_the_mlps_derivative_is_exact(relu: bool) -> None:
     generator = torch.Generator().manual_seed(0)
     shapes = [(4, 3), (4,), (5, 4), (5,), (2, 5), (2,)]
     x, *layers = (torch.randn(s, dtype=torch.float64, generator=generator).requires_grad_() for s in [(6, 3), *shapes])
-    assert torch.autograd.gradcheck(lambda x, *layers: MLP.apply(x, relu, *layers), (x, *layers))  # type: ignore[no-untyped-call]
+    assert torch.autograd.gradcheck(lambda x, *layers: MLPNode.apply(x, relu, *layers), (x, *layers))  # type: ignore[no-untyped-call]
 
 
 def test_every_parameter_and_gradient_is_a_view_of_one_flat_tensor() -> None:

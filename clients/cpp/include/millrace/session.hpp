@@ -75,7 +75,7 @@ class Session {
       : description_(std::move(description)), options_(std::move(options)), token_(token_of(options_)),
         link_(options_.address, options_.name, token_), join_timeout_s_(options_.join_timeout_s) {
     std::random_device random;
-    life_ = attempt_ = (std::uint64_t(random()) << 32 | random()) >> 16;
+    process_nonce_ = attempt_ = (std::uint64_t(random()) << 32 | random()) >> 16;
     gethostname(host_, sizeof host_ - 1);
     begin_to_join();
     beat_ = std::thread([this] { beat(); });
@@ -215,7 +215,7 @@ class Session {
   void hello() {
     head_.bytes.clear();
     head_.map(8).text("type").text("Hello").text("protocol").natural(PROTOCOL_VERSION).text("worker").text(options_.name)
-        .text("host").text(host_).text("pid").natural(static_cast<std::uint64_t>(getpid())).text("life").natural(life_)
+        .text("host").text(host_).text("pid").natural(static_cast<std::uint64_t>(getpid())).text("process_nonce").natural(process_nonce_)
         .text("software").text("millrace C++ client").text("attempt").natural(attempt_);
     link_.send(head_);
   }
@@ -233,7 +233,7 @@ class Session {
         .natural(late_actions_);
     link_.send(beat_head_);
     if (run_.type == "DescribeSpec") return describe();  // it may have been lost
-    beat_head_.begin("Alive", 2).array(1).array(5).text(options_.name).natural(life_).text(doing_)
+    beat_head_.begin("Alive", 2).array(1).array(5).text(options_.name).natural(process_nonce_).text(doing_)
         .real(std::max(0.0, now - since_s_)).natural(env_calls_).array(0);
     link_.send(beat_head_);
   }
@@ -338,7 +338,7 @@ class Session {
   Message message_;
   Writer beat_head_;
   double join_timeout_s_, joining_s_ = 0, due_s_ = 0, backoff_s_ = 0, heard_s_ = 0, heard_wire_s_ = 0, since_s_ = now_s(), began_s_ = now_s();
-  std::uint64_t life_, attempt_, replies_ = 0, env_calls_ = 0;
+  std::uint64_t process_nonce_, attempt_, replies_ = 0, env_calls_ = 0;
   const char* doing_ = "starting";
   char host_[256] = "";
   int exit_code_ = 0, stops_ = 0, unreadable_ = 0;

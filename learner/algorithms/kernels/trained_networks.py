@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from learner.algorithms.kernels.distributions import Evaluation, SquashedSample, distribution
+from learner.algorithms.kernels.distribution_kernels import EvaluatedActions, SquashedSample, distribution_kernel
 from learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
 from protocol.arrays import Array
 from protocol.policy.features import feature_size
@@ -46,15 +46,17 @@ def actor_and_critics(spec: PolicySpec, device: str, seed: int) -> ActorAndCriti
 
 
 class SmallActorCritic(ActorCriticNetwork):
-    """A small actor and critic: one pass for both, and for the distribution on top."""
+    """A small actor and critic: one pass for both, and for the distribution_kernel on top."""
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
         leaf, relu, actor = trainable(self.flat, self.flat_grad), spec.activation == "relu", hidden_names(spec)
         trunks = [actor] if spec.shared_net else [actor, hidden_names(spec, "critic")]
 
-        def evaluation(values: Mapping[str, Array], gradients: Mapping[str, Array]) -> Evaluation:
-            return Evaluation(distribution(spec.action, values.get("actor.log_std"), gradients.get("actor.log_std")))
+        def evaluation(values: Mapping[str, Array], gradients: Mapping[str, Array]) -> EvaluatedActions:
+            return EvaluatedActions(
+                distribution_kernel(spec.action, values.get("actor.log_std"), gradients.get("actor.log_std"))
+            )
 
         critic, value = ("critic.out", len(trunks) - 1), ("critic.out", 0)
         self._both = SmallMLP(leaf, self.fields, Trunks(trunks, [("actor.out", 0), critic]), relu, evaluation)

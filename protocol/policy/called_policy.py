@@ -47,7 +47,7 @@ class Acted(NamedTuple):
     """in the order in which they were declared; last the log-probabilities, if the policy has them"""
 
 
-class OwnPolicy:
+class CalledPolicy:
     """The user's policy. Everything that goes wrong in it is raised as `PolicyFailed`."""
 
     def __init__(self, spec: PolicySpec, extras: tuple[ExtraArray, ...]) -> None:

@@ -22,16 +22,16 @@ from protocol.specs import ActionSpec
 LOG_2 = math.log(2)
 
 
-class Evaluation:
+class EvaluatedActions:
     """Of an actor and a critic: log π(action), the entropy of π, V, [B] each."""
 
-    def __init__(self, distribution: Distribution) -> None:
-        self._distribution = distribution
+    def __init__(self, distribution_kernel: DistributionKernel) -> None:
+        self._distribution = distribution_kernel
 
     def forward(self, outputs: Sequence[Array], action: Array, mask: Bools | None) -> tuple[Array, ...]:
         """Given: actions [B, *action], and [B, choices] which of them are allowed.
 
-        A logit that the mask forbids has probability 0, so the factor p makes its gradient 0 in `Distribution.backward`.
+        A logit that the mask forbids has probability 0, so the factor p makes its gradient 0 in `backward`.
         """
         params, value = outputs
         if mask is not None:
@@ -73,8 +73,8 @@ class SquashedSample:
         return [np.concatenate((by_latent, (by_latent * self._spread - by_log_prob) * self._inside))]
 
 
-class Distribution(Protocol):
-    """A distribution over actions, with the gradients of its log-probability and entropy."""
+class DistributionKernel(Protocol):
+    """A distribution_kernel over actions, with the gradients of its log-probability and entropy."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         """Parameters [P, B] and actions [B, k] -> log π(action) [B], entropy [B]."""
@@ -85,7 +85,7 @@ class Distribution(Protocol):
         ...
 
 
-class _Categorical:
+class _CategoricalKernel:
     """∂log π(a)/∂logits = 1ₐ − p;  ∂H/∂logits = −p (log p + H)."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
@@ -110,12 +110,12 @@ class _Categorical:
         return g
 
 
-class _MultiCategorical:
+class _MultiCategoricalKernel:
     """A product of independent categorical distributions: log π and H are sums, so each part has its own gradient."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         self._ends = np.cumsum(sizes)[:-1]
-        self._parts = [_Categorical() for _ in sizes]
+        self._parts = [_CategoricalKernel() for _ in sizes]
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         choices = np.split(action, action.shape[1], -1)
@@ -128,7 +128,7 @@ class _MultiCategorical:
         return np.concatenate([part.backward(by_log_prob, by_entropy) for part in self._parts])
 
 
-class _Bernoulli:
+class _BernoulliKernel:
     """Independent bits with logits l: ∂log π/∂l = bit − σ(l);  ∂H/∂l = −l σ(l) (1 − σ(l))."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
@@ -143,7 +143,7 @@ class _Bernoulli:
         return found
 
 
-class _Gaussian:
+class _GaussianKernel:
     """z = (a − μ) / σ: ∂log π/∂μ = z / σ;  ∂log π/∂log σ = z² − 1;  ∂H/∂log σ = 1. log σ does not depend on the state."""
 
     def __init__(self, log_std: Array, by_log_std: Array) -> None:
@@ -165,16 +165,16 @@ class _Gaussian:
         return found
 
 
-def distribution(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> Distribution:
-    """The distribution of this action space. `log_std`, `by_log_std`: [k], for Box actions only; the latter is written."""
+def distribution_kernel(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> DistributionKernel:
+    """That of this action space. `log_std`, `by_log_std`: [k], for Box actions only; the latter is written."""
     match spec.kind:
         case "discrete":
-            return _Categorical()
+            return _CategoricalKernel()
         case "multidiscrete":
-            return _MultiCategorical(spec.sizes)
+            return _MultiCategoricalKernel(spec.sizes)
         case "multibinary":
-            return _Bernoulli()
+            return _BernoulliKernel()
         case "box":
             assert log_std is not None
             assert by_log_std is not None
-            return _Gaussian(log_std, by_log_std)
+            return _GaussianKernel(log_std, by_log_std)

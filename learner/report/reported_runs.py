@@ -53,7 +53,7 @@ class RunResults(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Run:
+class ReportedRun:
     """One run."""
 
     path: Path
@@ -84,7 +84,7 @@ class RunGroup:
     """Settings that distinguish this group from those groups; empty if there are none."""
     color: int
     """number of its color; groups of the same environment have different ones"""
-    runs: tuple[Run, ...]
+    runs: tuple[ReportedRun, ...]
 
     @property
     def curves(self) -> list[Curve]:
@@ -126,7 +126,7 @@ class ReportData:
     """groups of the same environment follow each other"""
 
     @property
-    def runs(self) -> list[tuple[RunGroup, Run]]:
+    def runs(self) -> list[tuple[RunGroup, ReportedRun]]:
         """Every run with its group."""
         return [(group, run) for group in self.groups for run in group.runs]
 
@@ -146,11 +146,11 @@ class ReportData:
         return [f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
-def read_run(path: Path) -> Run:
+def read_run(path: Path) -> ReportedRun:
     """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
     files = read_run_files(path)
     of_algorithm = files.config.get(files.algo)
-    return Run(
+    return ReportedRun(
         path=path,
         env=files.env,
         algo=files.algo,
@@ -165,11 +165,11 @@ def read_run(path: Path) -> Run:
     )
 
 
-def group_runs(runs: Sequence[Run]) -> ReportData:
+def group_runs(runs: Sequence[ReportedRun]) -> ReportData:
     """Put runs into groups. Environments stay in the order of their first run; the runs of a group are sorted by seed."""
     groups = []
     for env in dict.fromkeys(run.env for run in runs):
-        by_settings: dict[tuple[tuple[str, str], ...], list[Run]] = {}
+        by_settings: dict[tuple[tuple[str, str], ...], list[ReportedRun]] = {}
         for run in runs:
             if run.env == env:
                 key = tuple(sorted((k, v) for k, v in run.settings.items() if k not in MAY_DIFFER_IN_A_GROUP))
@@ -181,13 +181,13 @@ def group_runs(runs: Sequence[Run]) -> ReportData:
     return ReportData(tuple(groups))
 
 
-def differing_settings(runs: Sequence[Run], ignore: Iterable[str] = ()) -> list[str]:
+def differing_settings(runs: Sequence[ReportedRun], ignore: Iterable[str] = ()) -> list[str]:
     """Names of the settings that are not the same in all of these runs, in the order of the configuration."""
     names = dict.fromkeys(name for run in runs for name in run.settings)
     return [name for name in names if name not in ignore and len({run.settings.get(name) for run in runs}) > 1]
 
 
-def _name(run: Run, firsts: Sequence[Run]) -> tuple[str, str]:
+def _name(run: ReportedRun, firsts: Sequence[ReportedRun]) -> tuple[str, str]:
     """Name and differences of the group whose first run this is. `firsts`: the first runs of all groups of its algorithm."""
     if len(firsts) == 1:
         return algorithm_label(run.algo), ""
@@ -201,7 +201,7 @@ def _name(run: Run, firsts: Sequence[Run]) -> tuple[str, str]:
     return f"{algorithm_label(run.algo)} {_letters(firsts.index(run))}", ", ".join(texts)
 
 
-def _distinguishing(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
+def _distinguishing(runs: Sequence[ReportedRun], names: Sequence[str]) -> list[str]:
     """A few of these settings, the earliest that will do, whose values together differ between any two of the runs."""
     chosen: list[str] = []
 

@@ -22,7 +22,7 @@ from protocol.errors import EnvironmentFailed, UsageError, first_line
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec
 from workers.activity import DESCRIBING, activity
-from workers.env_copy import close_copy, make_copy
+from workers.made_copies import close_copy, make_copy
 
 
 @contextmanager

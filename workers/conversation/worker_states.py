@@ -1,0 +1,86 @@
+"""WorkerState machine of a worker, as a table: the next state for each state and each message or event. Plain data."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from protocol.messages import (
+    Call,
+    Collect,
+    Drain,
+    Evaluate,
+    HeartbeatReply,
+    Refuse,
+    Rejoin,
+    Release,
+    Reset,
+    Step,
+    Weights,
+    Welcome,
+)
+
+
+class WorkerState(Enum):
+    """WorkerState of a worker in the conversation."""
+
+    JOINING = "joining"
+    READY = "ready"
+    DRAINING = "draining"
+    LEFT = "left"
+
+
+class LearnerSilent:
+    """Event: no message of the learner followed a Heartbeat for `learner_timeout_s` (or, while joining, for too long)."""
+
+
+class StopRequested:
+    """Event: this worker was asked to leave, for example by SIGTERM."""
+
+
+class WorkFinished:
+    """Event: a draining worker has finished its work in progress."""
+
+
+class WorkerFailed:
+    """Event: the environment, or this worker, raised."""
+
+
+# The next state. A message that is not listed is ignored in that state.
+TABLE: dict[WorkerState, dict[type, WorkerState]] = {
+    WorkerState.JOINING: {
+        Welcome: WorkerState.READY,
+        Refuse: WorkerState.LEFT,
+        Drain: WorkerState.LEFT,
+        LearnerSilent: WorkerState.LEFT,
+        StopRequested: WorkerState.LEFT,
+        WorkerFailed: WorkerState.LEFT,
+    },
+    WorkerState.READY: {
+        Weights: WorkerState.READY,
+        Collect: WorkerState.READY,
+        Evaluate: WorkerState.READY,
+        Reset: WorkerState.READY,
+        Step: WorkerState.READY,
+        Call: WorkerState.READY,
+        Release: WorkerState.READY,
+        HeartbeatReply: WorkerState.READY,
+        Welcome: WorkerState.READY,
+        Rejoin: WorkerState.JOINING,
+        Refuse: WorkerState.LEFT,
+        Drain: WorkerState.DRAINING,
+        LearnerSilent: WorkerState.JOINING,
+        StopRequested: WorkerState.DRAINING,
+        WorkerFailed: WorkerState.LEFT,
+    },
+    WorkerState.DRAINING: {
+        Weights: WorkerState.DRAINING,
+        HeartbeatReply: WorkerState.DRAINING,
+        Rejoin: WorkerState.LEFT,
+        Refuse: WorkerState.LEFT,
+        LearnerSilent: WorkerState.LEFT,
+        StopRequested: WorkerState.LEFT,
+        WorkFinished: WorkerState.LEFT,
+        WorkerFailed: WorkerState.LEFT,
+    },
+    WorkerState.LEFT: {},
+}
