@@ -747,7 +747,7 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
             return
         case Ended(code):
             raise Broken(rules.DRAINING_LEAVES, f"exit code {codes[0]} or {codes[1]} after {after}", f"exit code {code}")
-        case Heard(_, Hello(process_nonce=life)) if life != before.process_nonce:
+        case Heard(_, Hello(process_nonce=nonce)) if nonce != before.process_nonce:
             return
         case Heard(_, Goodbye()):
             yield from learner.left(rules.DRAINING_LEAVES, after, codes)

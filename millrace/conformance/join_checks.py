@@ -105,7 +105,7 @@ def says_hello(learner: Learner) -> Script[None]:
     if found != (expected := routing_id(hello.worker, token)):
         raise Broken(rules.ROUTING_ID, f"the routing id {expected!r}", f"{found!r}")
     if hello.attempt != hello.process_nonce + 1:
-        raise Broken(rules.HELLO, f"attempt {hello.process_nonce + 1} (life + 1)", f"attempt {hello.attempt}")
+        raise Broken(rules.HELLO, f"attempt {hello.process_nonce + 1} (process_nonce + 1)", f"attempt {hello.attempt}")
 
 
 def repeats_hello(learner: Learner) -> Script[None]:

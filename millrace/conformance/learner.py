@@ -290,8 +290,8 @@ class Learner:
         self.may_leave = True
         hello = yield from self.expect(Hello, rule, expected, within_s=within_s)
         if hello.process_nonce != before.process_nonce or hello.attempt <= before.attempt:
-            expected = f"an attempt later than {before.attempt}, in life {before.process_nonce}"
-            raise Broken(rule, expected, f"attempt {hello.attempt}, in life {hello.process_nonce}")
+            expected = f"an attempt later than {before.attempt}, under process_nonce {before.process_nonce}"
+            raise Broken(rule, expected, f"attempt {hello.attempt}, under process_nonce {hello.process_nonce}")
         return hello
 
 
