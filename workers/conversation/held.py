@@ -19,24 +19,24 @@ from protocol.messages import Answer, Evaluate, Evaluated, LaneIncarnation, Orde
 
 KEPT_RESULTS = 8  # a learner gives a worker at most two evaluations at a time, so only the last two results can be missing
 
-Asked = TypeVar("Asked")
-Answered = TypeVar("Answered", bound=Rollout | Evaluated | Answer)
+AskedT = TypeVar("AskedT")
+AnsweredT = TypeVar("AnsweredT", bound=Rollout | Evaluated | Answer)
 
 
 @dataclass
-class Held(Generic[Asked, Answered]):
+class Held(Generic[AskedT, AnsweredT]):
     """What is asked and not yet done, and the answers that are kept, by ticket."""
 
-    asked: dict[int, Asked] = field(default_factory=dict, init=False)
-    answered: dict[int, Answered] = field(default_factory=dict, init=False)  # oldest first
+    asked: dict[int, AskedT] = field(default_factory=dict, init=False)
+    answered: dict[int, AnsweredT] = field(default_factory=dict, init=False)  # oldest first
 
-    def take(self, ticket: int, asked: Asked) -> Answered | None:
+    def take(self, ticket: int, asked: AskedT) -> AnsweredT | None:
         """Take what is asked. Returns an answer to send again, if any."""
         if ticket not in self.answered:
             self.asked.setdefault(ticket, asked)
         return self.answered.get(ticket)
 
-    def keep(self, answer: Answered) -> bool:
+    def keep(self, answer: AnsweredT) -> bool:
         """Keep an answer; False if it is no longer asked for."""
         if self.asked.pop(answer.ticket, None) is None:
             return False
@@ -66,22 +66,22 @@ class HeldEvaluations(Held[Evaluate, Evaluated]):
 
 
 @dataclass
-class _HeldLane(Held[Asked, Answered]):
+class _HeldLane(Held[AskedT, AnsweredT]):
     incarnation: int
 
 
-Lane = TypeVar("Lane", bound=_HeldLane[Any, Any])
+LaneT = TypeVar("LaneT", bound=_HeldLane[Any, Any])
 
 
-class _HeldLanes(Generic[Lane]):
+class _HeldLanes(Generic[LaneT]):
     """What is held in one session, lane by lane. A later incarnation of a lane begins with nothing."""
 
-    _kind: type[Lane]
+    _kind: type[LaneT]
 
     def __init__(self) -> None:
-        self._lanes: dict[int, Lane] = {}
+        self._lanes: dict[int, LaneT] = {}
 
-    def _opened(self, number: int, incarnation: int) -> Lane | None:
+    def _opened(self, number: int, incarnation: int) -> LaneT | None:
         """The lane in this incarnation; None if it has a later one."""
         lane = self._lanes.get(number)
         if lane is None or incarnation > lane.incarnation:

@@ -26,7 +26,7 @@ from workers.copies.env_loop import CopyInfos, EnvLoop, Pulse
 from workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
 
 
-class LaneArrays(NamedTuple):
+class ResultRows(NamedTuple):
     """Arrays into which a lane writes the results of its copies: its own, or a part of shared memory."""
 
     obs: tuple[Array, ...]  # [N, *leaf] each
@@ -35,17 +35,17 @@ class LaneArrays(NamedTuple):
     truncated: Array  # [N] bool
 
 
-def new_rows(spec: StepSpec, lane: int) -> LaneArrays:
+def new_rows(spec: StepSpec, lane: int) -> ResultRows:
     """New arrays for this lane."""
     N = spec.lanes[lane]
     obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.observation)
-    return LaneArrays(obs, np.zeros(N), np.zeros(N, bool), np.zeros(N, bool))
+    return ResultRows(obs, np.zeros(N), np.zeros(N, bool), np.zeros(N, bool))
 
 
 class SteppedLane:
     """N env copies that are stepped together."""
 
-    def __init__(self, spec: StepSpec, lane: int, incarnation: int, rows: LaneArrays, pulse: Pulse) -> None:
+    def __init__(self, spec: StepSpec, lane: int, incarnation: int, rows: ResultRows, pulse: Pulse) -> None:
         """Make the copies, and reset none. Raises `UsageError` when their spaces are not the vector environment's."""
         self.incarnation = incarnation
         self.rows = rows

@@ -27,7 +27,7 @@ from workers.activity import STEPPING, activity
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import CopyInfos, Pulse
 from workers.copies.open_lanes import OpenLanes
-from workers.vector_env.stepped_lane import LaneArrays, SteppedLane, new_rows
+from workers.vector_env.stepped_lane import ResultRows, SteppedLane, new_rows
 
 
 class Stepper:
@@ -150,11 +150,11 @@ class Stepper:
         self.stages["open"] += perf_counter() - began
         return lane
 
-    def _rows(self, lane: int) -> LaneArrays:
+    def _rows(self, lane: int) -> ResultRows:
         if self._memory is None:
             return new_rows(self._spec, lane)
         memory = self._memory.lanes[lane]
-        return LaneArrays(memory.obs, memory.reward, memory.terminated, memory.truncated)
+        return ResultRows(memory.obs, memory.reward, memory.terminated, memory.truncated)
 
 
 def pack_infos(infos: CopyInfos) -> bytes:
@@ -166,7 +166,7 @@ def _array(data: bytes) -> npt.NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8)
 
 
-def _stepped(order: Reset | Step, rows: LaneArrays, infos: bytes) -> Stepped:
+def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:
     """The answer, with its own copies of the arrays, because it may be sent again."""
     return Stepped(
         session=order.session,

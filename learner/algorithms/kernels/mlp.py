@@ -27,7 +27,7 @@ from torch import Tensor
 from protocol.arrays import Array
 from protocol.policy.layout import Field, named_views
 
-Call = Callable[[], object]
+MLPPass = Callable[[], object]
 
 CHUNK_ROWS = 512  # rows of a chunk, at most
 THREADED_PRODUCT_SIZE = 64 * 64 * 128  # multiplications of a matrix product that torch's threads make faster
@@ -282,7 +282,7 @@ class _MinibatchPlan:
         self.head_outputs = [workspace.outputs(head.layer, rows) for head in heads]
         self.head_gradients = [workspace.outputs(head.layer, rows) for head in heads]
         self.input_gradient = workspace.take((*hidden, heads[0].layer)[0].weight.shape[2], rows)
-        self.gather: list[Call] = []
+        self.gather: list[MLPPass] = []
         trunk = [self._for_each(layer, count) for layer in hidden]
         head_layers = [self._for_each(head.layer, count) for head in heads]
         # All chunks share these arrays, so that they stay in the cache.
@@ -317,11 +317,11 @@ class _Chunk:
         self._dh: Array | None = None  # ∂L/∂output of the last hidden layers
         self._networks_with_gradient: set[int] = set()  # those whose part of `_dh` a head has written
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
-        self.forward: list[Call] = []
-        self.back_from_heads: list[Call] = []
-        self.back_through_hidden: list[Call] = []
-        self.heads_to_input: list[Call] = []  # the backward pass without the gradients of weights and biases
-        self.hidden_to_input: list[Call] = []
+        self.forward: list[MLPPass] = []
+        self.back_from_heads: list[MLPPass] = []
+        self.back_through_hidden: list[MLPPass] = []
+        self.heads_to_input: list[MLPPass] = []  # the backward pass without the gradients of weights and biases
+        self.hidden_to_input: list[MLPPass] = []
         self.dx = workspace.take(first.weight.shape[0], *self.x.shape[1:])  # ∂L/∂x through each network
 
     def add_hidden(self, layer: Linear, dy: Array, relu: bool) -> None:
@@ -348,26 +348,26 @@ class _Chunk:
             self.heads_to_input += [_back_to_input(layer, dy, more), add]
         self._networks_with_gradient.add(network)
 
-    def _back(self, layer: Linear, x: Array, dy: Array, dx: Array | None) -> list[Call]:
+    def _back(self, layer: Linear, x: Array, dy: Array, dx: Array | None) -> list[MLPPass]:
         """The calls that compute the gradients of a layer from `dy`, and `dx` if it is needed."""
-        calls: list[Call] = [
+        calls: list[MLPPass] = [
             _product(dy, x.swapaxes(1, 2), layer.weight_grad),
             partial(np.matmul, dy, self._ones, out=layer.bias_grad),
         ]
         return calls if dx is None else [*calls, _back_to_input(layer, dy, dx)]
 
 
-def _back_to_input(layer: Linear, dy: Array, dx: Array) -> Call:
+def _back_to_input(layer: Linear, dy: Array, dx: Array) -> MLPPass:
     """The call that computes `dx`, ∂L/∂input of a layer."""
     return _product(layer.weight.swapaxes(1, 2), dy, dx)
 
 
-def _linear(layer: Linear, x: Array, y: Array) -> list[Call]:
+def _linear(layer: Linear, x: Array, y: Array) -> list[MLPPass]:
     out = torch.from_numpy(y)
     return [_product(layer.weight, x, y), partial(torch.add, out, torch.from_numpy(layer.bias), out=out)]
 
 
-def _activation(y: Array, relu: bool) -> Call:
+def _activation(y: Array, relu: bool) -> MLPPass:
     """The call that applies the activation in place."""
     if relu:  # numpy's maximum takes several times as long
         output = torch.from_numpy(y)
@@ -375,7 +375,7 @@ def _activation(y: Array, relu: bool) -> Call:
     return partial(np.tanh, y, out=y)
 
 
-def _activation_gradient(dy: Array, y: Array, relu: bool) -> Call:
+def _activation_gradient(dy: Array, y: Array, relu: bool) -> MLPPass:
     """The call that replaces ∂L/∂output of the activation by ∂L/∂input, in place."""
     gradient, output = torch.from_numpy(dy), torch.from_numpy(y)
     if relu:
@@ -391,7 +391,7 @@ def uses_torch(multiplications: int) -> bool:
     return torch.get_num_threads() > 1 and multiplications >= THREADED_PRODUCT_SIZE
 
 
-def _product(a: Array, b: Array, out: Array) -> Call:
+def _product(a: Array, b: Array, out: Array) -> MLPPass:
     """The call that computes `out` = a b, [S, n, k] by [S, k, m]."""
     networks, n, k = out.shape[0], *a.shape[1:]
     if k > 1 and not uses_torch(n * k * b.shape[2]):
