@@ -434,13 +434,6 @@ def test_no_type_is_written_in_python() -> None:
     assert named <= set(re.findall(r"`(\w+)`", explained))
 
 
-def test_a_field_is_named_as_on_the_wire() -> None:
-    """No text calls it by a name that only the code has."""
-    renamed = {field.name: field.encode_name for field in msgspec.structs.fields(Hello) if field.name != field.encode_name}
-    assert renamed
-    assert not [name for name in renamed if re.search(rf"`{name}`", record(Hello))]
-
-
 def test_every_record_that_travels_is_described() -> None:
     """Whatever a field's type names, the document has a heading for."""
     described = {*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS, *RECORDS}
