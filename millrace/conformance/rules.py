@@ -36,9 +36,9 @@ LIMITS = Rule(
 )
 HELLO = Rule(
     "Hello",
-    "the worker's name; also its routing id … `life` + 1 when the process first joins, and one more each time that "
+    "the worker's name; also its routing id … `process_nonce` + 1 when the process first joins, and one more each time that "
     "it starts to join again",
-    "set the DEALER's routing id to the name before connecting; draw `life` once for each process; send Hello "
+    "set the DEALER's routing id to the name before connecting; draw `process_nonce` once for each process; send Hello "
     "before all else",
 )
 ROUTING_ID = Rule(
@@ -454,7 +454,7 @@ EVALUATE_VERSION = Rule(
 REAPPEARS = Rule(
     "Hello",
     "drawn at random for each process, for pids repeat in containers",
-    "draw `life` at start from a random source, not from the time or the process id",
+    "draw `process_nonce` at start from a random source, not from the time or the process id",
 )
 DECLINED = Rule(
     "What a worker does in a session",
