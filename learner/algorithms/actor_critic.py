@@ -8,7 +8,7 @@ bits, also after `load_state_dict`. No sockets, no files, no clock.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
 from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from learner.algorithms.kernels.trained_networks import actor_critic_network
-from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, flat_tensor
+from learner.algorithms.minibatches import LossInput, Minibatch, Observations, flat_tensor
 from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from protocol.arrays import Bools, Floats
@@ -151,8 +151,10 @@ class ActorCritic(Clones):
         ended = False
         while len(epochs) < self.n_epochs and not ended:
             if not estimates or self.estimates_each_epoch:
-                estimates.append(self.estimate(batch, observations, reward, pulse))
-                minibatches = self._minibatches(batch, observations, estimates[-1])
+                estimates.append(found := self.estimate(batch, observations, reward, pulse))
+                rows = Minibatch.of(batch, observations, found.advantage, found.target)
+                count = self.minibatch_count(int(np.count_nonzero(found.used)))
+                minibatches = rows.epochs(found.used, count, self.generator)
             epochs.append([])
             for minibatch in next(minibatches):
                 measured, ended = self.step(minibatch)
@@ -160,17 +162,9 @@ class ActorCritic(Clones):
                 pulse()
                 if ended:
                     break
-        self._check_spread_of_actions()
+        _check_spread_of_actions(self.net, self.version)
         self.count_update(batch, len(epochs))
         return self.metrics(epochs, estimates)
-
-    def _minibatches(self, batch: Batch, observations: Observations, estimates: Estimates) -> Iterator[Iterable[Minibatch]]:
-        """The minibatches of each epoch, without end. A single minibatch is made once, with its rows in order."""
-        rows = Minibatch.of(batch, observations, estimates.advantage, estimates.target)
-        count = self.minibatch_count(int(np.count_nonzero(estimates.used)))
-        single = tuple(rows.shuffled(estimates.used, 1, None)) if count == 1 else ()
-        while True:
-            yield single or rows.shuffled(estimates.used, count, self.generator)
 
     def step(self, minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
         """One gradient step on a minibatch. Returns what was measured before it, and whether that ends the update instead.
@@ -179,7 +173,7 @@ class ActorCritic(Clones):
         gradient's norm are finite, scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer.
         """
         optimizer = self.optimizers["optimizer"]
-        loss, numbers = self._checked(self.loss(self.evaluate(minibatch)))
+        loss, numbers = _checked(self.loss(self.evaluate(minibatch)), type(self).__name__)
         metrics = self.differentiate(loss, optimizer, {**numbers, "loss": loss})
         clip_norm(self.net.flat, metrics["grad_norm"], self.config.max_grad_norm)
         ends = self.stops(metrics)
@@ -197,24 +191,6 @@ class ActorCritic(Clones):
         outputs = self.net.evaluate(features, images, recurrent, action, mask)
         advantage = losses.standardized(raw) if self.standardizes_advantages() else raw
         return LossInput(action, log_prob, advantage, raw, target, *outputs)
-
-    def _checked(self, found: Any) -> tuple[Tensor, Mapping[str, Tensor | float]]:
-        match found:
-            case (Tensor() as loss, Mapping() as numbers) if loss.dim() == 0 and loss.requires_grad:
-                return loss, numbers
-        raise UsageError(
-            f"{type(self).__name__}.loss: expected a tensor of no dimension that depends on log_prob_now, entropy or value "
-            "of its rows, and a dict of numbers to log"
-        )
-
-    def _check_spread_of_actions(self) -> None:
-        """Raise `RunError` before Box actions overflow: workers would be refused for them, one after the other."""
-        log_std = self.net.parameters.get("actor.log_std")
-        if log_std is not None and (largest := log_std.detach().max().item()) > MAX_LOG_STD:
-            raise RunError(
-                f"learner: update {self.version}: logarithm of the standard deviation of actions: expected at most "
-                f"{MAX_LOG_STD:g}, got {largest:.3g}; try a lower ent_coef, or a lower learning_rate"
-            )
 
     def count_update(self, batch: Batch, epochs: int) -> None:
         """Count an update of `epochs` epochs with this batch: steps and versions. Its observation statistics take effect."""
@@ -251,15 +227,6 @@ class ActorCritic(Clones):
         """V(obs) [T+1, ΣN] under the present weights."""
         return observations.evaluate(observations.shape[0], lambda inputs, _: self.net.value(*inputs), pulse)
 
-    def log_probs(self, observations: Observations, batch: Batch, pulse: Pulse) -> Floats:
-        """Log π(action) [T, ΣN] under the present weights."""
-        rows = Minibatch.of(batch, observations, batch.reward, batch.reward)
-
-        def log_prob(inputs: NetworkInput, at: Index) -> Tensor:
-            return self.net.evaluate(*inputs, rows.action[at], None if rows.mask is None else rows.mask[at])[0]
-
-        return observations.evaluate(len(batch.valid), log_prob, pulse)
-
     def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
         """See `Clones`."""
         params, value = self.net.forward(*self.inputs(rows.obs(rows.at)))
@@ -283,6 +250,27 @@ class ActorCritic(Clones):
         """See `GradientDescent`."""
         super().load_other_state(state)
         self.generator.set_state(state["generator"])
+
+
+def _checked(found: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor | float]]:
+    """What `loss` returned. Raises `UsageError` for anything but a loss and numbers."""
+    match found:
+        case (Tensor() as loss, Mapping() as numbers) if loss.dim() == 0 and loss.requires_grad:
+            return loss, numbers
+    raise UsageError(
+        f"{algorithm}.loss: expected a tensor of no dimension that depends on log_prob_now, entropy or value of its "
+        "rows, and a dict of numbers to log"
+    )
+
+
+def _check_spread_of_actions(net: ActorCriticNetwork, version: int) -> None:
+    """Raise `RunError` before Box actions overflow: workers would be refused for them, one after the other."""
+    log_std = net.parameters.get("actor.log_std")
+    if log_std is not None and (largest := log_std.detach().max().item()) > MAX_LOG_STD:
+        raise RunError(
+            f"learner: update {version}: logarithm of the standard deviation of actions: expected at most "
+            f"{MAX_LOG_STD:g}, got {largest:.3g}; try a lower ent_coef, or a lower learning_rate"
+        )
 
 
 def _explained_variance(estimates: Estimates) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
-from learner.algorithms.minibatches import Observations
+from learner.algorithms.minibatches import Observations, log_probs
 from learner.algorithms.returns import EpisodeEnds, vtrace
 from learner.config.hyperparameters import ImpalaConfig
 from protocol.arrays import Floats
@@ -34,7 +34,7 @@ class Impala(ActorCritic):
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
         """V-trace advantages and targets under the newest weights; `rho` is the mean ratio clipped at 1; 1 on new rows."""
         config, values = self.config, self.values(observations, pulse)
-        log_ratio = self.log_probs(observations, batch, pulse) - batch.log_prob
+        log_ratio = log_probs(self.net, observations, batch, pulse) - batch.log_prob
         target, advantage = vtrace(
             reward,
             values,

@@ -9,7 +9,7 @@ time order. B is the number of rows of a minibatch, and C the number of its colu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from protocol.arrays import Array, Bools, Floats
-from protocol.policy.networks import RecurrentInput
+from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
 from protocol.rollout import Batch
 
 Index = Tensor | slice
@@ -145,6 +145,12 @@ class Minibatch(NamedTuple):
         for chosen in index.to(device).tensor_split(min(count, len(index))):
             yield self.select(chosen) if of_columns is None else self.select_columns(chosen, of_columns)
 
+    def epochs(self, used: Bools, count: int, generator: torch.Generator) -> Iterator[Iterable[Minibatch]]:
+        """The minibatches of each epoch, without end. A single minibatch is made once, with its rows in order."""
+        single = tuple(self.shuffled(used, 1, None)) if count == 1 else ()
+        while True:
+            yield single or self.shuffled(used, count, generator)
+
 
 class LossInput(NamedTuple):
     """Input of a loss: B rows of a minibatch, and the network's present outputs for them. Every row is valid.
@@ -178,3 +184,13 @@ def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
     """The numbers of all rows of the chosen columns, in time order, where there are `steps` times `columns` rows."""
     return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()
+
+
+def log_probs(net: ActorCriticNetwork, observations: Observations, batch: Batch, pulse: Callable[[], None]) -> Floats:
+    """Log π(action) [T, ΣN] under the weights of `net`."""
+    rows = Minibatch.of(batch, observations, batch.reward, batch.reward)
+
+    def log_prob(inputs: NetworkInput, at: Index) -> Tensor:
+        return net.evaluate(*inputs, rows.action[at], None if rows.mask is None else rows.mask[at])[0]
+
+    return observations.evaluate(len(batch.valid), log_prob, pulse)

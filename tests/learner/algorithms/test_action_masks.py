@@ -16,7 +16,7 @@ from learner.algorithms.actor_critic import ActorCritic
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.kernels import trained_networks
-from learner.algorithms.minibatches import Minibatch
+from learner.algorithms.minibatches import Minibatch, log_probs
 from learner.algorithms.ppo import PPO
 from learner.algorithms.replay import replay_buffer
 from learner.config.hyperparameters import DQNConfig, ImpalaConfig, PPOConfig
@@ -221,10 +221,10 @@ def _theirs(name: str) -> str:
 def test_the_ratio_of_impala_is_1_under_the_policy_that_acted() -> None:
     algorithm = Impala(ImpalaConfig(), spec_of("multidiscrete"), total_steps=10_000, seed=0)
     rows = masked_batch(algorithm, 1)
-    found = algorithm.log_probs(algorithm.observations(rows), rows, no_pulse)
+    found = log_probs(algorithm.net, algorithm.observations(rows), rows, no_pulse)
     np.testing.assert_allclose(found[rows.valid], rows.log_prob[rows.valid], atol=1e-5)
     without = msgspec.structs.replace(rows, mask=None)
-    assert np.abs(algorithm.log_probs(algorithm.observations(rows), without, no_pulse) - rows.log_prob).max() > 0.1
+    assert np.abs(log_probs(algorithm.net, algorithm.observations(rows), without, no_pulse) - rows.log_prob).max() > 0.1
 
 
 # -------------------------------------------------------------------- DQN

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from learner.algorithms.minibatches import log_probs
 from learner.algorithms.normalization import ObservationNormalizer
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
@@ -154,6 +155,6 @@ def test_learner_and_worker_see_the_same_numbers_of_float64_observations() -> No
         assert k == 0 or len(np.unique(worker[..., 0])) > 95  # else the digits were lost on both sides
         mask = batch.valid
         np.testing.assert_array_equal(
-            np.exp(learner.log_probs(seen, batch, lambda: None)[mask] - batch.log_prob[mask]).round(6), 1
+            np.exp(log_probs(learner.net, seen, batch, lambda: None)[mask] - batch.log_prob[mask]).round(6), 1
         )
         learner.update(batch, lambda: None)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from learner.algorithms import algorithm_class
-from learner.algorithms.minibatches import Minibatch
+from learner.algorithms.minibatches import Minibatch, log_probs
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.torch_setup import one_thread
@@ -243,9 +243,9 @@ def test_what_a_copy_did_before_its_episode_changes_nothing(name: str, core: Cor
     values, others = (algorithm.values(algorithm.observations(each), no_pulse) for each in (rows, other))
     assert (values[: t + 1, n] != others[: t + 1, n]).any()
     np.testing.assert_array_equal(values[t + 1 :, n], others[t + 1 :, n])
-    log_probs, others = (algorithm.log_probs(algorithm.observations(each), each, no_pulse) for each in (rows, other))
-    np.testing.assert_array_equal(log_probs[t + 1 :, n], others[t + 1 :, n])
-    np.testing.assert_array_equal(np.delete(log_probs, n, 1), np.delete(others, n, 1))
+    found, others = (log_probs(algorithm.net, algorithm.observations(each), each, no_pulse) for each in (rows, other))
+    np.testing.assert_array_equal(found[t + 1 :, n], others[t + 1 :, n])
+    np.testing.assert_array_equal(np.delete(found, n, 1), np.delete(others, n, 1))
 
 
 def test_values_are_the_same_however_many_columns_are_evaluated_together(monkeypatch: pytest.MonkeyPatch) -> None:
