@@ -25,7 +25,7 @@ from rich.table import Table
 from benchmarks.writing import write
 from learner.config.layers import resolve
 from learner.run_folder.progress import Progress
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.env_spec import EnvSpec
 
 WARM_UP = 2  # updates that are not counted: env copies are opened and torch is imported meanwhile

@@ -256,7 +256,7 @@ def train(
     >>> run.summary.updates
     2
     """
-    from millrace.launch import local_run
+    from millrace.launch import training
 
     name = remembered_name(env)
     if wrappers is not None:
@@ -276,7 +276,7 @@ def train(
             settings.env if isinstance(env, str) else env, settings.env_kwargs, outer, settings.eval_env_kwargs
         )
     with shown_progress(watch, show=progress) as both:
-        folder = local_run.train(settings, run, Callbacks(callbacks, both), given)
+        folder = training.train(settings, run, Callbacks(callbacks, both), given)
     return Run._trained(folder, objects)
 
 

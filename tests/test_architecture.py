@@ -92,7 +92,7 @@ IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `lea
     "learner.report.learning_curves": "21 ms, for plots only",
     "millrace.cli.main": "a signal waits until it is imported",
     "millrace.launch.learner_inference": "it is for --inference learner only",
-    "millrace.launch.local_run": "120 ms, after the flags are known to be right",
+    "millrace.launch.training": "120 ms, after the flags are known to be right",
     "millrace.playing": "160 ms, after the flags are known to be right",
     "workers.program": "98 ms, after the flags are known to be right",
 }

@@ -28,6 +28,17 @@ from workers.worker_thread import WorkerThread
 NEVER_S = 1e9  # the timeout of an order that may take any time
 
 
+def lanes_of(
+    env: ZmqVectorEnv, lanes: int, facts: Sequence[str], workers: int, no_workers_timeout_s: float, *, masked: bool
+) -> SplitVectorEnv:
+    """The copies of `env` as lanes. The first wait for them is until this number of `workers` has joined.
+
+    `facts`: names of the facts that are read; `masked`: whether masks of the allowed actions are.
+    """
+    before_wait = _BeforeWaits(env, workers, no_workers_timeout_s)
+    return SplitVectorEnv(env, lanes, before_wait, partial(_step_lanes, env), facts, masked=masked)
+
+
 def acting_thread(
     endpoint: Endpoint, lanes: SplitVectorEnv, evaluation_copies: SplitLane, device: Callable[[], str]
 ) -> Supervisor:
@@ -59,7 +70,7 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
     return processes
 
 
-def step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> StepResult:
+def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> StepResult:
     """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
     env.step_async(actions, lanes)
     return env.step_wait()
@@ -77,7 +88,7 @@ def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
     return TorchPolicy(spec, device, together=True, images=images)
 
 
-class BeforeWaits:
+class _BeforeWaits:
     """Call it before each wait for `env`: it calls the pulse during the wait. The first wait is for workers to join.
 
     Rule: a wait raises `NoWorkers` once no worker has been there for `timeout_s`, however long an order may take.

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 
 from learner.callbacks.callbacks import Watch
@@ -25,14 +24,13 @@ from learner.resume_checks import Resumption
 from learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from learner.torch_setup import one_thread, torch_device
 from learner.vector_env.settings import VectorEnvSettings
-from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread, step_lanes
+from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import worker_flags
 from millrace.launch.vector import listen
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.specs import DescribeSpec
-from workers.copies.split_vector_env import SplitVectorEnv
 from workers.supervise.supervisor import STOP_WITHIN_S
 
 
@@ -64,10 +62,8 @@ def train(
         known = known_environment(config, env_spec, resume, describe)
         env = started.vector_env(known.described)
         stack.callback(env.close)
-        before_wait = BeforeWaits(env, workers, config.no_workers_timeout_s)
-        lanes = SplitVectorEnv(
-            env, config.lanes, before_wait, partial(step_lanes, env), config.fact_names(), masked=known.spaces.masked
-        )
+        masked, timeout_s = known.spaces.masked, config.no_workers_timeout_s
+        lanes = lanes_of(env, config.lanes, config.fact_names(), workers, timeout_s, masked=masked)
         thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(config.eval_copies), lambda: torch_device(config))
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))

@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -20,11 +19,10 @@ from learner.members.bind_settings import BindSettings
 from learner.policy_player import PolicyPlayer, SavedPolicy
 from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings
-from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread, step_lanes
+from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import WorkerFlags
 from millrace.launch.vector import listen
-from workers.copies.split_vector_env import SplitVectorEnv
 
 
 @dataclass(frozen=True)
@@ -110,8 +108,7 @@ def _acting_player(
     described = started.describe(describe_settings(settings), check_interrupt)
     env = started.vector_env(described)
     stack.callback(env.close)
-    before_wait = BeforeWaits(env, workers or 1, settings.no_workers_timeout_s)
-    lanes = SplitVectorEnv(env, 0, before_wait, partial(step_lanes, env), policy.facts, masked=policy.masked)
+    lanes = lanes_of(env, 0, policy.facts, workers or 1, settings.no_workers_timeout_s, masked=policy.masked)
     thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(which.copies), lambda: "cpu")
     stack.callback(thread.stop, 2.0)
     processes = acting_processes(thread, lanes, env, workers or 0)

@@ -19,8 +19,8 @@ from learner.config.command_line import read_config
 from learner.members.bind_settings import keyring_for
 from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
-from millrace.launch.local_run import train
 from millrace.launch.ray_worker import WorkerHost
+from millrace.launch.training import train
 from protocol.errors import UsageError, first_line
 from protocol.keys.key_folder import Keyring, read_token
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from learner.config.layers import resolve
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, last_line, learner, loopback, millrace
 from tests.system.processes import START_S, Learner, Stage
 

@@ -29,7 +29,7 @@ from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
 from learner.run_setup import prometheus_observer
-from millrace.launch import local_run
+from millrace.launch import training
 from protocol.bounds import MAX_FACTS, Stage
 from protocol.errors import UsageError
 from protocol.messages import Drain
@@ -266,7 +266,7 @@ def test_it_is_scraped_while_a_run_goes_on_and_is_gone_with_it(
             urls.extend(line.split()[2] for line in caplog.messages if line.startswith("metrics at "))
         scrapes.append(parsed(get(urls[0])))
 
-    run = local_run.train(resolve("CartPole-v1", run_dir=str(tmp_path), metrics_bind="127.0.0.1:*", **RUN), None, watch)
+    run = training.train(resolve("CartPole-v1", run_dir=str(tmp_path), metrics_bind="127.0.0.1:*", **RUN), None, watch)
     assert run.is_dir()
     assert len(scrapes) >= 512 / 64
     assert [by(found, "millrace_workers", "state")["active"] for found in (scrapes[0], scrapes[-1])] == [1, 0]
@@ -306,7 +306,7 @@ def test_a_port_in_use_is_one_line_and_no_run_folder_is_made(tmp_path: Path) -> 
         with pytest.raises(
             UsageError, match=rf"metrics_bind {bind}: cannot listen there \(Address already in use\)"
         ) as found:
-            local_run.train(
+            training.train(
                 resolve("CartPole-v1", run_dir=str(tmp_path / "runs"), metrics_bind=bind, **RUN), None, lambda _: None
             )
     assert found.value.exit_code == 2

@@ -12,7 +12,7 @@ import pytest
 
 from learner.config.layers import resolve
 from learner.run_folder.run_folder import RunFolder
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 
 pytestmark = [pytest.mark.learning, pytest.mark.timeout(3600)]
 

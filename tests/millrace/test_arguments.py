@@ -22,7 +22,7 @@ from learner.config.hyperparameters import PPOConfig
 from learner.config.rollout_config import RolloutConfig
 from learner.members.bound import bind
 from millrace.arguments import plain
-from millrace.launch import learner_inference, local_run, policy_workers, rollouts, vector
+from millrace.launch import learner_inference, policy_workers, rollouts, training, vector
 from millrace.launch.local_worker_options import private_address
 from millrace.playing import EvaluateKeywords, RecordKeywords
 from tests.support import own_policies
@@ -41,7 +41,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def started(*arguments: object) -> None:
         raise Started
 
-    for module in (learner_inference, local_run, policy_workers, rollouts, vector):
+    for module in (learner_inference, training, policy_workers, rollouts, vector):
         monkeypatch.setattr(module, "open_endpoint", started)
     monkeypatch.chdir(tmp_path)
 

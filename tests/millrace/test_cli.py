@@ -59,7 +59,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         Callbacks.of(watch).on_update(Progress(env_steps=5, total_steps=10))
         return Path("runs/a-run")
 
-    monkeypatch.setattr("millrace.launch.local_run.train", train)
+    monkeypatch.setattr("millrace.launch.training.train", train)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     return calls
@@ -286,7 +286,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def train(*_: Any, **__: Any) -> Path:
         raise error
 
-    monkeypatch.setattr("millrace.launch.local_run.train", train)
+    monkeypatch.setattr("millrace.launch.training.train", train)
 
 
 def test_errors_of_ours_are_one_line_with_their_exit_code(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -520,7 +520,7 @@ def test_what_a_worker_says_cannot_control_the_terminal(capsys: Captured, monkey
     def train(*_: Any, **__: Any) -> Path:
         raise EnvironmentFailed("got \x1b[31mred\u202e", "its\x1b[2Jtraceback")
 
-    monkeypatch.setattr("millrace.launch.local_run.train", train)
+    monkeypatch.setattr("millrace.launch.training.train", train)
     assert main(["train", "CartPole-v1"]) == 1
     said = capsys.readouterr().err
     assert "got \\x1b[31mred\\u202e" in said

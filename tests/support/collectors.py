@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from learner.config.layers import resolve
 from learner.rollouts.evaluation_tickets import episode_seeds
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves

@@ -46,7 +46,7 @@ LEARNER = (
     "learner.algorithms.ppo",
     "learner.algorithms.reinforce",
     "millrace.launch.learner_inference",
-    "millrace.launch.local_run",
+    "millrace.launch.training",
     "millrace.terminal",
     "safetensors.numpy",
 )

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 IMPORTED = (
-    "millrace.cli.main", "millrace.launch.local_run", "millrace.launch.learner_inference",
+    "millrace.cli.main", "millrace.launch.training", "millrace.launch.learner_inference",
     "learner.train", "learner.run_spec", "learner.run_state", "learner.torch_setup", "learner.algorithms.ppo",
     "learner.algorithms.dqn", "learner.algorithms.a2c", "learner.algorithms.impala", "learner.algorithms.reinforce",
     "tensorboard.compat.proto.event_pb2", "tensorboard.summary.writer.record_writer", "safetensors.numpy",

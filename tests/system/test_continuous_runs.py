@@ -15,7 +15,7 @@ import pytest
 import millrace
 from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from tests.support.preloaded import workers_of
 from tests.system.processes import START_S, Learner, Stage
 

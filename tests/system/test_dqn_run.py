@@ -10,7 +10,7 @@ import pytest
 
 from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.errors import UsageError
 
 SMALL: dict[str, Any] = {

@@ -23,7 +23,7 @@ from learner.config.layers import resolve
 from learner.run_folder import atomic_write, checkpoint
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.errors import RunError, UsageError
 from tests.system.run_folders import folder_of, saved, summary
 from tests.system.runs import accounted

@@ -17,8 +17,8 @@ from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.metrics_log import read_rows
-from millrace.launch.local_run import train
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from millrace.launch.training import train
 from protocol.errors import EnvironmentFailed, UserFacingError
 from tests.support.collectors import TOY, random_weights, run_of
 from tests.system.processes import START_S, Stage, crowding, wait_for

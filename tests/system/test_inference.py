@@ -19,7 +19,7 @@ import millrace
 from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 from tests.support import preloaded
 from tests.system.processes import Learner, Stage, free_port, wait_for

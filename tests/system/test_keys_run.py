@@ -16,7 +16,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 import millrace
 from learner.config.layers import resolve
 from learner.run_folder.run_format import check_format
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.wire import compression as packing
 from tests.support import preloaded
 from tests.system.processes import START_S, Learner, Stage, crowding

@@ -28,7 +28,7 @@ from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_format import check_format
 from millrace.launch import learner_inference
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support import preloaded
 from tests.support.saved_policies import load_policy

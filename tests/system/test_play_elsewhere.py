@@ -18,8 +18,8 @@ import millrace
 from learner.config.layers import resolve
 from learner.policy_player import saved_policy
 from learner.rollouts.evaluation_tickets import EvaluationPlan
-from millrace.launch.local_run import train
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from millrace.launch.training import train
 from protocol.errors import UsageError
 from tests.system.processes import START_S, Running, Stage, crowding, free_port
 from tests.system.test_local_run import worker_processes

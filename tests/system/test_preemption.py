@@ -28,7 +28,7 @@ from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from tests.system.processes import START_S, Stage, crowding
 from tests.system.run_folders import folder_of, summary
 

@@ -22,7 +22,7 @@ from learner.recording.prior_dataset import PriorDataset
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import Interrupted
 from millrace.cli.main import main
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 

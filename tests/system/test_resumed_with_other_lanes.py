@@ -13,7 +13,7 @@ import pytest
 from learner.config.layers import resolve
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from tests.learner.config.test_resume_rules import content

@@ -19,7 +19,7 @@ import pytest
 from learner.config.layers import resolve
 from learner.run_folder.lease import Owner
 from learner.run_folder.run_lock import LOCK_FILE
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from tests.learner.config.test_resume_rules import content
 from tests.system.processes import SMALL, START_S, TOY, Learner, Stage, free_port
 

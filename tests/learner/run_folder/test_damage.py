@@ -46,7 +46,7 @@ from learner.run_folder.run_format import END, HEAD
 from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_of_run
 from learner.run_spec import run_spec
 from learner.run_state import RunState, restore
-from millrace.launch.local_run import train
+from millrace.launch.training import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError, UserFacingError
 from tests.support.described import described

@@ -12,7 +12,7 @@ from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.run_folder.newest_run import newest_run
 from learner.run_folder.run_folder import RunFolder
-from millrace.launch import local_run
+from millrace.launch import training
 from protocol.errors import UsageError
 
 HOURS = 3_600.0
@@ -88,7 +88,7 @@ def test_in_python_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         asked.append((config, resume))
         return tmp_path
 
-    monkeypatch.setattr(local_run, "train", train)
+    monkeypatch.setattr(training, "train", train)
     millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path), gamma=0.5)
     run = a_run(asked[0][0], HOURS)
     millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path))
