@@ -53,11 +53,11 @@ test-versions:  ## all tests on other Pythons, and with the lowest versions that
 	$(PYTHON) -m tests.versions $(VERSIONS)
 
 test-kill: .venv/installed-dev  ## small runs, each killed at random times and resumed until it is done; half an hour
-	$(BIN)/python -m tests.system.killed_runs --runs $(RUNS)
+	$(BIN)/python -m tests.system.random_faults.killed_runs --runs $(RUNS)
 
 soak: export TESTS_EXEC := 1
 soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
-	$(BIN)/python -m tests.system.soak --minutes $(MINUTES)
+	$(BIN)/python -m tests.system.random_faults.soak --minutes $(MINUTES)
 	$(BIN)/python -m pytest -m soak tests
 
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md

@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from tests.system.network import Network, why_not
-from tests.system.processes import START_S, TOY, Stage, free_port
+from tests.system.stage.network import Network, why_not
+from tests.system.stage.processes import START_S, TOY, Stage, free_port
 
 PROCESSES = 4
 DELAY_S = 0.005  # one way
@@ -52,7 +52,7 @@ def _rate(stage: Stage, network: Network, env: str, way: str, max_lag: int, seco
     to = port
     if way.endswith("ms"):
         to = free_port()
-        proxy = [sys.executable, "-m", "tests.system.proxy", str(port), host, str(to)]
+        proxy = [sys.executable, "-m", "tests.system.stage.proxy", str(port), host, str(to)]
         stage.start([*before, *proxy], "proxy", told=True).tell(f"delay {DELAY_S}")
     command = [sys.executable, "-m", "millrace", "worker", f"tcp://{host}:{to}", "--token", str(token)]
     stage.start([*(here.before if before else ()), *command, "--processes", str(PROCESSES)], "workers")

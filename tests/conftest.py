@@ -28,7 +28,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.support import preloaded
+from tests.system.stage import preloaded
 from workers import slots
 from workers.slots import FILE_VARIABLE
 from workers.supervise import worker_process

@@ -10,7 +10,7 @@ import re
 from typing import NamedTuple
 
 from tests.docs.pages import blocks
-from tests.system.processes import ROOT
+from tests.system.stage.processes import ROOT
 
 PAGE = ROOT / "docs" / "how-to" / "write_a_client.md"
 CHECK = re.compile(r"^- `([^`]+)`$", re.MULTILINE)

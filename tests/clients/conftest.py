@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.clients.programs import Clients, no_warning
-from tests.system.processes import ROOT, Stage
+from tests.system.stage.processes import ROOT, Stage
 
 CPP, JS = ROOT / "clients" / "cpp", ROOT / "clients" / "js"
 PROBE = "#include <zmq.h>\n#include <sodium.h>\n"

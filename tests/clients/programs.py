@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.processes import START_S, Learner, Running, Stage, free_port
+from tests.system.stage.processes import START_S, Learner, Running, Stage, free_port
 
 IN_LEARNER = ("--inference", "learner")
 

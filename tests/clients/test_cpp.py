@@ -20,7 +20,7 @@ from learner.run_folder.metrics_log import read_rows
 from protocol.messages import PROTOCOL_VERSION, Drain, Hello, Refuse
 from protocol.wire.codec import decode_to_learner, encode
 from tests.clients.messages_to_clients import corpus
-from tests.system.processes import START_S, Running, Stage, free_port, wait_for
+from tests.system.stage.processes import START_S, Running, Stage, free_port, wait_for
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]  # the first test also waits for the compiler
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zmq
 
-from tests.system.processes import START_S, Learner, Running, Stage, free_port
+from tests.system.stage.processes import START_S, Learner, Running, Stage, free_port
 
 pytestmark = pytest.mark.clients
 MESSAGES = 100_000  # hostile ones

@@ -9,7 +9,7 @@ import pytest
 
 import millrace as millrace_package
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, last_line, learner, loopback, millrace, resumed
-from tests.system.processes import START_S, Stage
+from tests.system.stage.processes import START_S, Stage
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]
 

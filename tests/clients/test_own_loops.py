@@ -13,7 +13,7 @@ import pytest
 import millrace
 from protocol.errors import NoWorkers
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, learner, loopback
-from tests.system.processes import START_S, Stage
+from tests.system.stage.processes import START_S, Stage
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]
 

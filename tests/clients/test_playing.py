@@ -12,7 +12,7 @@ import pytest
 from learner.config.layers import resolve
 from millrace.launch.training import train
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, last_line, learner, loopback, millrace
-from tests.system.processes import START_S, Learner, Stage
+from tests.system.stage.processes import START_S, Learner, Stage
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]
 

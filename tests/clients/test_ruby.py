@@ -11,7 +11,7 @@ import pytest
 
 from millrace.conformance.profiles import PROFILES
 from tests.clients.client_page import Step, steps
-from tests.system.processes import ROOT, START_S, Learner, Running, Stage, free_port
+from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(400)]
 RUBY = ROOT / "clients" / "ruby"

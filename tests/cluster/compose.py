@@ -15,7 +15,7 @@ from typing import Any
 
 from tests.cluster import stock
 from tests.cluster.engine import Engine, run
-from tests.system.processes import ROOT, wait_for
+from tests.system.stage.processes import ROOT, wait_for
 
 log = logging.getLogger("millrace.cluster")
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import psutil
 
-from tests.system.processes import wait_for
+from tests.system.stage.processes import wait_for
 
 log = logging.getLogger("millrace.cluster")
 

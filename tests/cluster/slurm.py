@@ -14,7 +14,7 @@ from types import TracebackType
 
 import psutil
 
-from tests.system.processes import ROOT, Running, Stage, free_port, wait_for
+from tests.system.stage.processes import ROOT, Running, Stage, free_port, wait_for
 
 DAEMONS = ("munged", "slurmctld", "slurmd")
 NODES = ("n1", "n2")

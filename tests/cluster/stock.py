@@ -14,7 +14,7 @@ import tomllib
 from pathlib import Path
 
 from tests.cluster.engine import run
-from tests.system.processes import ROOT
+from tests.system.stage.processes import ROOT
 
 STOCK = Path(os.environ.get("MILLRACE_CLUSTER", ROOT / ".cluster"))
 SUITE, PYTHON = "bookworm", "3.11"

@@ -18,7 +18,7 @@ import pytest
 from learner.run_folder.metrics_log import read_rows
 from tests.cluster.compose import BASE, LOOK_EVERY_S, USER, Cluster, Program, prepare, program
 from tests.cluster.engine import TOOLS, Engine, why_not
-from tests.system.processes import ROOT, wait_for
+from tests.system.stage.processes import ROOT, wait_for
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3_600)]
 

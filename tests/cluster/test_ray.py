@@ -14,8 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.system.processes import SMALL, START_S, TOY, Learner, Running, Stage, free_port, wait_for
-from tests.system.runs import accounted
+from tests.system.stage.processes import SMALL, START_S, TOY, Learner, Running, Stage, free_port, wait_for
+from tests.system.stage.runs import accounted
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 CORES = {"head": 1, "second": 2}

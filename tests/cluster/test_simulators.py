@@ -1,6 +1,6 @@
 """The recipes of docs/how-to/simulators.md: each block of Python, and each command as it is written, with stand-ins.
 
-`tests/system/simulators.py` plays the simulators; MPI (Open MPI, mpi4py) and the X server (Xvfb) are real.
+`tests/system/environments/simulators.py` plays the simulators; MPI (Open MPI, mpi4py) and the X server (Xvfb) are real.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import pytest
 
 from tests.docs.pages import blocks
 from tests.docs.test_code import FILE_NAME
-from tests.system import simulators
-from tests.system.processes import ROOT, wait_for
+from tests.system.environments import simulators
+from tests.system.stage.processes import ROOT, wait_for
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 

@@ -14,8 +14,8 @@ import pytest
 from learner.run_folder.metrics_log import read_rows
 from millrace.cli.main import main
 from tests.cluster.slurm import Slurm, why_not
-from tests.system.processes import SMALL, START_S, TOY, Stage, wait_for
-from tests.system.runs import accounted
+from tests.system.stage.processes import SMALL, START_S, TOY, Stage, wait_for
+from tests.system.stage.runs import accounted
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 WORKERS = 3  # two nodes of two cores: one for the learner, so all are taken

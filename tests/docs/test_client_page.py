@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from millrace.conformance.profiles import PROFILES
 from tests.clients.client_page import shown_files, steps
-from tests.system.processes import ROOT
+from tests.system.stage.processes import ROOT
 
 RUBY = ROOT / "clients" / "ruby"
 MOST_LINES = 150

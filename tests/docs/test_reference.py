@@ -19,7 +19,7 @@ from learner.run_folder import run_folder
 from millrace.cli.commands import COMMANDS
 from protocol import errors
 from protocol.errors import UserFacingError
-from tests.learner.algorithms.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
+from tests.learner.algorithms.cloning.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
 from website import commands_page, python_page, settings_page
 from website.doctest_fences import with_fences
 from website.pages import ROOT

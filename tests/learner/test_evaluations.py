@@ -22,7 +22,7 @@ from learner.run_state import RunState
 from millrace.cli.flags import EvaluateFlags
 from protocol.bounds import LARGEST
 from protocol.rollout import Episode
-from tests.support.fake_ends import run_spec
+from tests.support.conversation.fake_ends import run_spec
 
 
 class Fakes:

@@ -25,9 +25,9 @@ from protocol.rollout import Episode
 from protocol.specs import PolicySpec
 from protocol.wire.codec import Buffer, decode_to_worker
 from protocol.wire.learner_link import LearnerLink
-from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
-from tests.support.fake_link import FakeLink
-from tests.support.saved_policies import load_policy
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.saved_policies import load_policy
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])

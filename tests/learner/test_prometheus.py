@@ -37,7 +37,7 @@ from protocol.policy.policy import make_policy
 from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import A, B, C, Learner
-from tests.support.fake_ends import process_ends, run_spec
+from tests.support.conversation.fake_ends import process_ends, run_spec
 from workers.collect.collector import Collector
 
 Labels = tuple[tuple[str, str], ...]

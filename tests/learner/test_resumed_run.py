@@ -28,8 +28,8 @@ from protocol.errors import CheckpointError
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack_rollouts
 from protocol.specs import RunSpec
-from tests.support.described import run_spec
-from tests.support.fake_ends import fake_rollout
+from tests.support.conversation.fake_ends import fake_rollout
+from tests.support.in_process.described import run_spec
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 

@@ -24,7 +24,7 @@ from protocol.errors import UserFacingError
 from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
-from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
 
 SMALL: dict[str, Any] = {"net": (16,), "normalize_observations": True, "normalize_rewards": True, "rollout_steps": 20}
 OFF_POLICY = SMALL | {"batch_size": 16, "replay_size": 1000}

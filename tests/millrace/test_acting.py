@@ -20,7 +20,7 @@ from protocol.arrays import Array
 from protocol.envs.spaces import make_action_converter, make_unflatten
 from protocol.messages import EpisodeRows
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, random_weights, run_of
+from tests.support.in_process.collectors import TOY, random_weights, run_of
 
 STEPS = 30
 

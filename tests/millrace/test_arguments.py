@@ -25,7 +25,7 @@ from millrace.arguments import plain
 from millrace.launch import learner_inference, policy_workers, rollouts, training, vector
 from millrace.launch.local_worker_options import private_address
 from millrace.playing import EvaluateKeywords, RecordKeywords
-from tests.support import own_policies
+from tests.support.users_code import own_policies
 
 CALLS = 500
 Door = tuple[Callable[..., Any], set[str], dict[str, Any]]

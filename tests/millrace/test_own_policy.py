@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import millrace
-from tests.support.own_policies import ARRAYS, EXTRAS, Broken, Linear
+from tests.support.users_code.own_policies import ARRAYS, EXTRAS, Broken, Linear
 
 SMALL: dict[str, Any] = {"envs": 8, "lanes": 4, "rollout_steps": 16, "transport": "inproc"}
 WEIGHTS = {"w": np.random.default_rng(0).normal(0, 0.3, (4, 2)), "b": np.zeros(2)}
@@ -42,7 +42,7 @@ def as_bytes(batch: millrace.RolloutBatch) -> dict[str, bytes]:
 def test_one_two_and_four_workers_and_every_transport_give_the_same_bits() -> None:
     reference = [as_bytes(batch) for batch in batches()]
     assert reference[0] != reference[1]
-    named = millrace.OwnPolicy("tests.support.own_policies:Linear", ARRAYS, EXTRAS, state_size=1)
+    named = millrace.OwnPolicy("tests.support.users_code.own_policies:Linear", ARRAYS, EXTRAS, state_size=1)
     for settings in ({"workers": 2}, {"workers": 4}, {"workers": 2, "transport": "ipc"}, {"policy": named}):
         assert [as_bytes(batch) for batch in batches(**settings)] == reference
 
@@ -177,7 +177,7 @@ def test_declarations_that_cannot_be_used_are_refused(wrong: millrace.OwnPolicy,
         millrace.RolloutService("CartPole-v1", wrong, workers=1, **SMALL)
 
 
-@pytest.mark.parametrize("factory", [OWN.factory, "tests.support.own_policies:Linear"])
+@pytest.mark.parametrize("factory", [OWN.factory, "tests.support.users_code.own_policies:Linear"])
 def test_a_factory_does_not_travel_over_tcp_without_keys(factory: Any) -> None:
     own = dataclasses.replace(OWN, factory=factory)
     with pytest.raises(millrace.UsageError, match="a policy's factory is code: it travels over ipc or inproc only"):

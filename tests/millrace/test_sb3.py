@@ -13,7 +13,7 @@ from gymnasium.envs.classic_control import CartPoleEnv
 
 import millrace
 from protocol.errors import UsageError
-from tests.support.bit_equality import bit_equal
+from tests.support.numbers.bit_equality import bit_equal
 
 sb3 = pytest.importorskip("stable_baselines3")
 

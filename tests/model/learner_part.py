@@ -33,7 +33,7 @@ from tests.model.message_content import (
 )
 from tests.model.names import Kind, Name, name
 from tests.model.settings import TIMEOUT_S, Settings
-from tests.support.fake_ends import BUFFERS, PARAMETERS
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
 
 SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},

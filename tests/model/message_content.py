@@ -34,9 +34,9 @@ from protocol.rollout import Episode
 from protocol.specs import RunSpec, StepSpec
 from tests.model.conversation import Content
 from tests.model.names import Kind, Name, name
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
 
-EPISODE_STEPS = 2  # of each episode of an evaluation, as `tests.support.fake_ends` plays them
+EPISODE_STEPS = 2  # of each episode of an evaluation, as `tests.support.conversation.fake_ends` plays them
 
 
 def worker_of(peer: bytes) -> int:

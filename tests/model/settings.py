@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from protocol.specs import RunSpec
-from tests.support.fake_ends import run_spec
+from tests.support.conversation.fake_ends import run_spec
 
 TICK_S = 1.0
 TIMEOUT_S = 2.0

@@ -13,7 +13,7 @@ from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
-from tests.support.fake_ends import fake_evaluated, fake_rollouts, held_count
+from tests.support.conversation.fake_ends import fake_evaluated, fake_rollouts, held_count
 from workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
 from workers.conversation.session import (
     EvaluationTask,

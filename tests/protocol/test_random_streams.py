@@ -26,8 +26,8 @@ from protocol.policy.encoder import describe_encoder
 from protocol.policy.policy import make_policy
 from protocol.random_streams import Purpose, env_seed, generator, torch_seed
 from protocol.specs import PolicySpec
-from tests.support.batches import BOX, DISCRETE, GAUSSIAN
-from tests.support.collectors import no_pulse, run_around, with_env
+from tests.support.in_process.collectors import no_pulse, run_around, with_env
+from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 from workers.evaluate.evaluator import Evaluator

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from protocol.errors import UsageError
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
+from tests.support.in_process.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
 from workers.collect.collector import OpenEnvCopies
 from workers.copies.env_copies import VectorCopies
 from workers.envs.toy import Scripted

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.network import Network, why_not
-from tests.system.processes import Stage
+from tests.system.stage.network import Network, why_not
+from tests.system.stage.processes import Stage
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, enc
 from protocol.wire.compression import Packing
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
-from tests.support.collectors import TOY, bits, collect, random_collector, run_of
+from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of
 from workers import slots as slot_file
 from workers.activity import ActivityReader, activity
 from workers.collect.collector import Collector

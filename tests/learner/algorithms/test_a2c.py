@@ -18,8 +18,8 @@ from learner.config.hyperparameters import A2CConfig, PPOConfig, REINFORCEConfig
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows, gae_tolerance
-from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
-from tests.support.steps import Errors, only_step
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
+from tests.support.numbers.steps import Errors, only_step
 
 FREE: dict[str, Any] = {"max_grad_norm": 1e9, "gamma": 0.9, "ent_coef": 0.01, "normalize_rewards": False}
 

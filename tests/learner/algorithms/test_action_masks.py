@@ -29,7 +29,7 @@ from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
-from tests.support.batches import batch, no_pulse
+from tests.support.numbers.batches import batch, no_pulse
 
 OBSERVATION = spaces.Box(-np.inf, np.inf, (4,))
 ACTIONS: dict[str, Any] = {"discrete": spaces.Discrete(5), "multidiscrete": spaces.MultiDiscrete([2, 4, 3])}

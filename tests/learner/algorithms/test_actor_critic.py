@@ -19,7 +19,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.errors import RunError
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
-from tests.support.batches import (
+from tests.support.numbers.batches import (
     COPIES,
     DISCRETE,
     GAUSSIAN,
@@ -31,9 +31,9 @@ from tests.support.batches import (
     normal,
     shared,
 )
-from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, tolerance_of
-from tests.support.sampled_rounding import SAMPLES
-from tests.support.steps import gradient_tolerance, usual_rows
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, tolerance_of
+from tests.support.numbers.sampled_rounding import SAMPLES
+from tests.support.numbers.steps import gradient_tolerance, usual_rows
 
 NAMES = ["a2c", "impala", "reinforce"]
 

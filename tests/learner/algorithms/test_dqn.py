@@ -22,9 +22,9 @@ from protocol.policy.layout import hidden_names, named_views
 from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
-from tests.support.batches import BOX, COPIES, LANES, no_pulse
-from tests.support.batches import batch as noise_batch
-from tests.support.rounding import (
+from tests.support.numbers.batches import BOX, COPIES, LANES, no_pulse
+from tests.support.numbers.batches import batch as noise_batch
+from tests.support.numbers.rounding import (
     ELEMENTWISE,
     UNIT,
     assert_within,

@@ -16,7 +16,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS
 from protocol.errors import RunError
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_action_masks import masked_batch, spec_of
-from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, T, batch, no_pulse, normal, recurrent, shared
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, T, batch, no_pulse, normal, recurrent, shared
 
 ALL: dict[str, Any] = {"normalize_rewards": True, "learning_rate_schedule": "linear"}
 EPOCHS: dict[str, dict[str, Any]] = {

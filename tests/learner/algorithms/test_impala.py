@@ -19,9 +19,9 @@ from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows
 from tests.learner.algorithms.test_vtrace import OffPolicy, on_policy, slow_vtrace, vtrace_tolerances
-from tests.support.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
-from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, log_prob_variance, tolerance_of, value_tolerance
-from tests.support.steps import Errors, only_step, usual_distribution
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, log_prob_variance, tolerance_of, value_tolerance
+from tests.support.numbers.steps import Errors, only_step, usual_distribution
 
 GAMMA = 0.9
 

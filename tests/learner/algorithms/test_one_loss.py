@@ -16,7 +16,7 @@ from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms import algorithm_class, dqn, losses
 from learner.algorithms.replay.off_policy import CriticLoss
 from learner.config.hyperparameters import HYPERPARAMETERS
-from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
 
 SETTINGS: dict[str, dict[str, Any]] = {
     # Adam's first moment shows a factor of the gradient that its step hides; a longest norm would hide it there, too.

@@ -13,7 +13,7 @@ from learner.rollouts.lanes import TicketedLane
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack_rollouts
 from protocol.specs import RunSpec
-from tests.support.collectors import random_weights, run_of
+from tests.support.in_process.collectors import random_weights, run_of
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 

@@ -13,7 +13,7 @@ from learner.config.hyperparameters import PPOConfig
 from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
-from tests.support.batches import (
+from tests.support.numbers.batches import (
     DISCRETE,
     GAUSSIAN,
     batch,
@@ -21,8 +21,8 @@ from tests.support.batches import (
     no_pulse,
     normal,
 )
-from tests.support.rounding import ELEMENTWISE, UNIT, assert_within
-from tests.support.steps import Errors, gradient_tolerance, usual_rows
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within
+from tests.support.numbers.steps import Errors, gradient_tolerance, usual_rows
 
 
 def ppo(config: PPOConfig | None = None, spec: PolicySpec = DISCRETE, seed: int = 0) -> PPO:

@@ -19,9 +19,9 @@ from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows, gae_tolerance, sum_tolerance
-from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse
-from tests.support.described import run_spec
-from tests.support.rounding import ELEMENTWISE, UNIT, assert_within
+from tests.support.in_process.described import run_spec
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within
 
 GAMMA = 0.9
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from learner.algorithms.returns import EpisodeEnds, discounted_return, gae
 from protocol.arrays import Array
-from tests.support.rounding import UNIT, assert_within
+from tests.support.numbers.rounding import UNIT, assert_within
 
 GAMMA, LAMBDA = 0.9, 0.8
 

@@ -30,7 +30,7 @@ from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.policy import make_policy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import PolicySpec
-from tests.support.batches import batch, no_pulse
+from tests.support.numbers.batches import batch, no_pulse
 
 pytest.importorskip("stable_baselines3")
 

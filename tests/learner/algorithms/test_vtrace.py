@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from learner.algorithms.returns import complete, vtrace
 from protocol.arrays import Array
 from tests.learner.algorithms.test_returns import GAMMA, Rows, lawful, rows, sum_tolerance
-from tests.support.rounding import ELEMENTWISE, assert_within
+from tests.support.numbers.rounding import ELEMENTWISE, assert_within
 
 BARS = st.floats(0.1, 1.5)
 

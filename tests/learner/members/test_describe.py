@@ -41,7 +41,7 @@ from protocol.specs import DescribeSpec
 from protocol.wire.codec import decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.plain_values import pack
-from tests.support.fake_link import FakeLink
+from tests.support.conversation.fake_link import FakeLink
 
 SPEC = DescribeSpec(EnvSpec("Fake-v0"))
 A, B = b"w0", b"w1"

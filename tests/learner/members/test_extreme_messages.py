@@ -50,11 +50,11 @@ from protocol.rollout import rollout_bytes
 from protocol.wire.codec import Buffer, decode_to_learner, decode_to_observer, decode_to_worker, encode
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC, step, stepped
-from tests.support.extreme_messages import MARK, SESSION, extremes, of_session
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
-from tests.support.fake_link import FakeLink
-from tests.support.hostile_messages import hostile, real
-from tests.support.local_workers import NO_LOCAL_WORKERS
+from tests.support.conversation.extreme_messages import MARK, SESSION, extremes, of_session
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.conversation.fake_link import FakeLink
+from tests.support.conversation.hostile_messages import hostile, real
+from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 HOSTILE = "spare"
 SECRET_NONCE = 0x5EC2E7_5EC2E7  # of honest workers: nobody but a worker's supervisor and the learner knows it

@@ -37,8 +37,8 @@ from protocol.token_bucket import TokenBucket
 from protocol.wire.codec import decode_to_learner, decode_to_observer, decode_to_worker, encode
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
-from tests.support.fake_link import FakeLink
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.conversation.fake_link import FakeLink
 from workers.copies.env_errors import CopyFailed, environment_failed
 
 

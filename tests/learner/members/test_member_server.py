@@ -16,8 +16,8 @@ from protocol.errors import NoWorkers
 from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
-from tests.support.fake_link import FakeLink
-from tests.support.local_workers import NO_LOCAL_WORKERS
+from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 TIMEOUT_S, POLL_S = 5.0, 0.1
 

@@ -12,7 +12,7 @@ import pytest
 from learner.members.key_revocation import KeyRevocation
 from protocol.messages import Heartbeat
 from tests.learner.rollouts.test_ticket_coordinator import Learner
-from tests.support.fake_ends import process_ends
+from tests.support.conversation.fake_ends import process_ends
 
 FEW, MANY = 8, 512
 

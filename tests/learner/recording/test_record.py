@@ -36,9 +36,9 @@ from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Rollout
 from protocol.specs import PolicySpec
-from tests.support.collectors import TOY, no_pulse, random_policy, run_of
-from tests.support.described import described
-from tests.support.saved_policies import load_policy
+from tests.support.in_process.collectors import TOY, no_pulse, random_policy, run_of
+from tests.support.in_process.described import described
+from tests.support.in_process.saved_policies import load_policy
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from tests.support.fake_ends import Faults, World
+from tests.support.conversation.fake_ends import Faults, World
 
 BLOCKS, CASES = 8, 250
 

@@ -18,7 +18,7 @@ from protocol.rollout import Episode
 from protocol.rows.played import reason_to_reject
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of
-from tests.support.fake_ends import fake_rows
+from tests.support.conversation.fake_ends import fake_rows
 
 A, B = b"a", b"b"
 MOST_STEPS = 2_000

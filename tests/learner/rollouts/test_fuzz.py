@@ -8,8 +8,8 @@ import psutil
 
 from protocol.errors import BadMessage
 from protocol.wire.codec import decode_to_learner
-from tests.support.fake_ends import fake_rollout
-from tests.support.hostile_messages import Frames, hostile, real
+from tests.support.conversation.fake_ends import fake_rollout
+from tests.support.conversation.hostile_messages import Frames, hostile, real
 
 MESSAGES = 100_000
 ROOM = 100_000

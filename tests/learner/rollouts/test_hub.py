@@ -21,8 +21,8 @@ from protocol.rollout import rollout_bytes
 from protocol.wire.codec import decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32
-from tests.support.fake_ends import fake_rollout, run_spec
-from tests.support.fake_link import FakeLink
+from tests.support.conversation.fake_ends import fake_rollout, run_spec
+from tests.support.conversation.fake_link import FakeLink
 
 WORKER_TIMEOUT_S = 3.0
 

@@ -26,7 +26,7 @@ from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.worker_link import WorkerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
-from tests.support.fake_ends import process_ends
+from tests.support.conversation.fake_ends import process_ends
 
 PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)
 

@@ -18,8 +18,8 @@ from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExi
 from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
-from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
-from tests.support.fake_link import FakeLink
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.conversation.fake_link import FakeLink
 
 A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
 NONCE = 1000 * len("host") + 1  # as `Learner.joins` makes it

@@ -46,7 +46,7 @@ from protocol.messages import (
 )
 from protocol.space_spec import EnvDescription, MultiBinarySpace
 from protocol.wire.codec import decode_to_worker, encode
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
 
 M = TypeVar("M")
 A, B, C = b"a", b"b", b"c"

@@ -12,8 +12,8 @@ from protocol.alive import Alive, WorkerExit
 from protocol.errors import EnvironmentFailed
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
 from protocol.wire.learner_link import LearnerLink
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
-from tests.support.fake_link import FakeLink
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.conversation.fake_link import FakeLink
 
 COPIES = 16
 HOUR_S = 3600.0

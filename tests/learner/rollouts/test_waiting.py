@@ -12,7 +12,7 @@ from protocol.alive import Alive, Doing, WorkerActivity
 from protocol.messages import Goodbye, Heartbeat
 from protocol.random_streams import Purpose
 from tests.learner.rollouts.test_ticket_coordinator import Learner
-from tests.support.fake_ends import BUFFERS, PARAMETERS
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
 
 A, B = b"a", b"b"
 NO_WORKER = "a worker to join at tcp://box:5555 (the last one was killed by SIGKILL)"

@@ -49,8 +49,8 @@ from learner.run_state import RunState, restore
 from millrace.launch.training import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError, UserFacingError
-from tests.support.described import described
-from tests.support.saved_policies import load_policy
+from tests.support.in_process.described import described
+from tests.support.in_process.saved_policies import load_policy
 
 ENV = "workers.envs.toy:Identity-v0"
 SETTINGS: dict[str, Any] = {

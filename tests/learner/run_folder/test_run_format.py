@@ -22,7 +22,7 @@ from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
-from tests.support.saved_policies import load_policy
+from tests.support.in_process.saved_policies import load_policy
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from gymnasium.vector.utils import batch_space
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from protocol.errors import EnvironmentFailed, UsageError
-from tests.support.bit_equality import bit_equal
-from tests.support.described import with_spaces
+from tests.support.in_process.described import with_spaces
+from tests.support.numbers.bit_equality import bit_equal
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
 SPACES = "workers.envs.toy:Spaces-v0"

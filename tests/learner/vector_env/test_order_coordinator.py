@@ -31,7 +31,7 @@ from protocol.messages import (
 )
 from protocol.specs import Leaf, StepSpec
 from protocol.wire.plain_values import pack
-from tests.support.fake_ends import process_ends
+from tests.support.conversation.fake_ends import process_ends
 
 A, B = b"a", b"b"
 TIMEOUT_S = 5.0

@@ -23,9 +23,9 @@ from learner.vector_env.settings import VectorEnvSettings
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
 from protocol.messages import Reset, Step
 from protocol.wire.wake_up import WakeReason
-from tests.support.any_order import AnyOrder, any_order
-from tests.support.bit_equality import bit_equal
-from tests.support.rows_of_copies import Row, info_of, of_copies, received
+from tests.support.in_process.any_order import AnyOrder, any_order
+from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
+from tests.support.numbers.bit_equality import bit_equal
 
 INFORMS = "workers.envs.toy:Informs-v0"
 COUNTDOWN = "workers.envs.toy:Countdown-v0"

@@ -23,8 +23,8 @@ from learner.vector_env.env import ZmqVectorEnv
 from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.worker_link import WorkerLink
-from tests.support.bit_equality import bit_equal
-from tests.support.rows_of_copies import Row, info_of, of_copies, received
+from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
+from tests.support.numbers.bit_equality import bit_equal
 
 MODES = tuple(AutoresetMode)
 TRANSPORTS: dict[str, dict[str, Any]] = {

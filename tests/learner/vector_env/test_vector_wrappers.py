@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import vector as wrappers
 
 import millrace
-from tests.support.bit_equality import bit_equal
+from tests.support.numbers.bit_equality import bit_equal
 
 Env = VectorEnv[Any, Any, Any]
 

@@ -59,7 +59,7 @@ from protocol.messages import (
 from protocol.specs import DescribeSpec, Leaf, StepSpec
 from protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
-from tests.support.fake_ends import fake_rollout, run_spec
+from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 SETTINGS = Settings(EnvSpec("CartPole-v1"))
 STEPPED = StepSpec((EnvSpec("own"),), (0, 0), (2,), (Leaf("", "multibinary", (), "int8"),), ())

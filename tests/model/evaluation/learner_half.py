@@ -17,7 +17,7 @@ from tests.model.conversation import Content
 from tests.model.learner_part import Learner
 from tests.model.message_content import EPISODE_STEPS, evaluated, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, name
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rows
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rows
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating

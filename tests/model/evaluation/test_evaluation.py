@@ -16,7 +16,7 @@ from tests.model.evaluation.evaluating import Evaluating
 from tests.model.evaluation.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
 from tests.model.mutations import check_that_they_fit, find
 from tests.model.search import explore
-from tests.support.fake_ends import run_spec
+from tests.support.conversation.fake_ends import run_spec
 from workers.conversation.held import HeldEvaluations
 
 LIST = "tests.model.evaluation.mutations"

@@ -14,7 +14,7 @@ from tests.model import worker_part
 from tests.model.conversation import Content
 from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
 from tests.model.worker_part import Worker
-from tests.support.fake_ends import fake_rows
+from tests.support.conversation.fake_ends import fake_rows
 from workers.conversation.session import EvaluationTask, RolloutTask
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from tests.model.traces.accept import Acceptance, LearnerTrace, Moment, WorkerTr
 from tests.model.traces.record import Record, SaidRollout, read
 from tests.model.traces.recorder import FOLDER
 from tests.model.traces.replay import NotAccepted
-from tests.system.processes import ROOT, SMALL, TOY, Stage, free_port
+from tests.system.stage.processes import ROOT, SMALL, TOY, Stage, free_port
 
 ADDRESS = "tcp://127.0.0.1:{}"
 UPDATES = 4

@@ -29,8 +29,8 @@ from protocol.messages import Answer, LaneIncarnation
 from protocol.wire.learner_link import LearnerLink
 from tests.model.settings import TICK_S
 from tests.model.vector_env.order_content import NEW, Copy, executed, make_order, state_in
-from tests.support.fake_link import FakeLink
-from tests.support.local_workers import NO_LOCAL_WORKERS
+from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping

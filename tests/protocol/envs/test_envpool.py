@@ -20,8 +20,8 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.envpool import envpool_spec
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
-from tests.support.described import run_spec
+from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
+from tests.support.in_process.described import run_spec
 from workers.copies.env_copies import LoopedCopies, StepResult, copy_seeds
 from workers.copies.envpool_copies import EnvpoolCopies
 from workers.envs.toy import Countdown

@@ -30,8 +30,8 @@ from protocol.space_spec import (
 )
 from protocol.wire.codec import decode_to_learner, encode
 from protocol.wire.plain_values import pack
-from tests.support.bit_equality import bit_equal
-from tests.support.described import with_spaces
+from tests.support.in_process.described import with_spaces
+from tests.support.numbers.bit_equality import bit_equal
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
 
 FLOATS, WHOLE = ("float16", "float32", "float64"), ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")

@@ -17,7 +17,7 @@ from protocol.envs.spaces import action_spec, make_action_converter, make_flatte
 from protocol.errors import BadRollout, UsageError
 from protocol.rollout import Episode, Rollout, validate, wrong_facts
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
+from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
 SEEN = sorted(OBSERVATIONS.keys() - UNSUPPORTED_OBSERVATIONS)

@@ -18,8 +18,8 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
-from tests.support.described import run_spec
+from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
+from tests.support.in_process.described import run_spec
 from workers.copies.env_copies import LoopedCopies, VectorCopies, copy_seeds
 from workers.envs.toy import Countdown
 

@@ -38,7 +38,7 @@ from protocol.messages import (
 from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.worker_link import WorkerLink
-from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 
 DEADLINE_S = 5.0  # within so long both sides must have said what is wrong
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)

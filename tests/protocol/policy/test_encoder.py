@@ -23,12 +23,12 @@ from protocol.policy.networks import ActorCriticNetwork, QNetwork
 from protocol.policy.policy import make_policy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import NamedShape, PolicySpec
-from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
-from tests.support.described import run_spec
-from tests.support.sampled_rounding import in_float64, sampled
-from tests.support.saved_policies import load_policy
+from tests.support.in_process.described import run_spec
+from tests.support.in_process.saved_policies import load_policy
+from tests.support.numbers.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
+from tests.support.numbers.sampled_rounding import in_float64, sampled
 
-HERE = "tests.support.custom_encoders"
+HERE = "tests.support.users_code.custom_encoders"
 
 
 def encoded(spec: PolicySpec, name: str = "mixer") -> PolicySpec:
@@ -108,7 +108,7 @@ def test_one_that_is_different_here_is_refused() -> None:
     [
         ("nowhere", "encoder nowhere: expected module:factory, as in my_package.networks:encoder"),
         ("no.such:one", "no module named no; is it installed, or its folder on PYTHONPATH?"),
-        (f"{HERE}:one", "module tests.support.custom_encoders has no one"),
+        (f"{HERE}:one", "module tests.support.users_code.custom_encoders has no one"),
         (f"{HERE}:not_a_module", "expected it to return a torch.nn.Module, got int"),
         (f"{HERE}:with_statistics", "expected parameters alone, got the buffer 1.running_mean; use LayerNorm, say"),
         (f"{HERE}:of_doubles", "expected float32 parameters, got another dtype in weight"),

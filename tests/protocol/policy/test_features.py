@@ -20,7 +20,7 @@ from protocol.policy.layout import acting_size, convolutions
 from protocol.policy.policy import make_policy
 from protocol.rollout import stack_rollouts
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-from tests.support.collectors import collect, loop_over, random_collector, run_around
+from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around
 from workers.envs.toy import Countdown
 
 TWO = ActionSpec("discrete", (), "int64", (2,), (0,))

@@ -23,8 +23,8 @@ from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-from tests.support.rounding import assert_within, log_prob_tolerance, params_variance, tolerance_of
-from tests.support.sampled_rounding import in_float64, sampled
+from tests.support.numbers.rounding import assert_within, log_prob_tolerance, params_variance, tolerance_of
+from tests.support.numbers.sampled_rounding import in_float64, sampled
 
 BOX = Leaf("x", "box", (2, 3), "float32")
 OBSERVATIONS = {

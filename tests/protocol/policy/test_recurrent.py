@@ -28,10 +28,10 @@ from protocol.policy.recurrent import advance, zero_state
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.rollout import Rollout, stack_rollouts, validate
 from protocol.specs import PolicySpec, RunSpec
-from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
-from tests.support.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
-from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, core_tolerance, log_prob_tolerance
-from tests.support.sampled_rounding import in_float64, sampled
+from tests.support.in_process.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, core_tolerance, log_prob_tolerance
+from tests.support.numbers.sampled_rounding import in_float64, sampled
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 from workers.envs.toy import Scripted

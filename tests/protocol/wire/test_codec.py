@@ -36,7 +36,7 @@ from protocol.messages import (
 )
 from protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
 from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
-from tests.support.fake_ends import fake_rollout, run_spec
+from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 KINDS = [*typing.get_args(ToLearner), *typing.get_args(ToWorker)]
 BY_NAME = (Hello, Refuse)

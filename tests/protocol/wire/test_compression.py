@@ -26,7 +26,7 @@ from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing, pack_stack, unpack_array, unpack_stack, why_no_zstd
 from protocol.wire.socket_options import MAX_FRAME_BYTES
-from tests.support.collectors import collect, loop_over, random_collector, run_around, run_of
+from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around, run_of
 
 U1 = np.dtype(np.uint8)
 

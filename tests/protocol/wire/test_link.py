@@ -59,7 +59,7 @@ from protocol.wire.learner_link import LearnerLink
 from protocol.wire.plain_values import pack
 from protocol.wire.sockets import COPY_BELOW_BYTES
 from protocol.wire.worker_link import WorkerLink
-from tests.support.fake_ends import fake_rollout, run_spec
+from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 Context = zmq.Context[zmq.Socket[bytes]]
 

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.errors import BadMessage
 from protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
-from tests.support.bit_equality import bit_equal
+from tests.support.numbers.bit_equality import bit_equal
 
 scalars = hnp.arrays(
     st.one_of(hnp.scalar_dtypes(), hnp.byte_string_dtypes(), hnp.unicode_string_dtypes()).filter(

@@ -10,7 +10,7 @@ import pytest
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
 from protocol.wire.wake_up import CAN_SPIN, SpinWait, WakePipe, WakeReason
-from tests.support.described import step_spec
+from tests.support.in_process.described import step_spec
 
 pytestmark = pytest.mark.skipif(not SUPPORTED, reason="needs Linux")
 

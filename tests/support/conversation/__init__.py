@@ -1,0 +1,1 @@
+"""Messages without sockets: fakes of both ends, and messages that nobody should send."""

@@ -1,0 +1,1 @@
+"""Parts of a run that a test plays in its own process."""

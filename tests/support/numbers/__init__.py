@@ -1,0 +1,1 @@
+"""Batches to learn from, and how far two computations of the same numbers may differ."""

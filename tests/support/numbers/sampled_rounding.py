@@ -1,0 +1,148 @@
+"""How far two float32 computations of any function in torch may differ, on any processor: found by sampling in float64.
+
+The function is computed in float64, once as it is and `SAMPLES` times with noise added to the result of each operation. The
+noise is uniform, and its standard deviation is the bound of `rounding`: √n u s for a sum of n terms, where s is the sum of
+their absolute values, and ELEMENTWISE u s for an operation on single elements. So the errors go through the function
+itself, its gradient included, and no derivative is written down here ("Monte Carlo arithmetic", Parker 1997). The mean of
+the squared deviations is the variance of each result, and `tolerance_of` gives the tolerance.
+
+The bound of a sum is several times its true deviation, because its partial sums are smaller than s. This outweighs by far
+that a variance found with this number of samples may be too small.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from protocol.arrays import Array
+from protocol.policy.networks import FlatNetwork
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, tolerance_of
+
+SAMPLES = 16
+
+EXACT = (
+    *("_to_copy", "_unsafe_view", "cat", "clone", "new_ones", "ones_like", "relu", "relu_"),
+    *("select_backward", "slice_backward", "threshold_backward", "unsafe_split"),
+)
+# How large the terms are whose roundings make up the error of one element, by the arguments and the result.
+ELEMENTWISE_SIZES: dict[str, Callable[[Sequence[Any], Tensor], Tensor]] = {
+    "add": lambda args, out: _magnitude(args[0]) + _magnitude(args[1]),
+    "sub": lambda args, out: _magnitude(args[0]) + _magnitude(args[1]),
+    "sigmoid": lambda args, out: torch.ones_like(out),  # by tanh, its errors are relative to 1
+    "sin": lambda args, out: torch.ones_like(out),
+    "cos": lambda args, out: torch.ones_like(out),
+    "silu": lambda args, out: _magnitude(args[0]),
+    "tanh_backward": lambda args, out: _magnitude(args[0]),  # g (1 - y²)
+} | {name: lambda args, out: out.abs() for name in ("tanh", "mul", "div", "pow")}
+# The number of terms of a sum, by the arguments. On absolute values the operation gives the sum of their absolute values.
+TERMS: dict[str, Callable[[Sequence[Any], Tensor], int]] = {
+    "mm": lambda args, out: args[0].shape[1],
+    "addmm": lambda args, out: args[1].shape[1] + 1,
+    "sum": lambda args, out: args[0].numel() // out.numel(),
+    "convolution": lambda args, out: args[1][0].numel() + 1,
+    "convolution_backward": lambda args, out: max(args[2].shape[0], len(args[0])) * args[0][0, 0].numel(),
+}
+
+Network = TypeVar("Network", bound=FlatNetwork)
+
+
+class Sampled(NamedTuple):
+    """Results in float64, and how far two float32 computations of them may differ."""
+
+    exact: Array
+    tolerance: Array
+
+    def assert_is(self, *found: Array) -> None:
+        """Assert that these float32 results are those of the function, and of each other, except for rounding."""
+        for each in found:
+            assert_within(each, self.exact, self.tolerance)
+            assert_within(each, found[0], self.tolerance)
+
+
+def sampled(function: Callable[[], Sequence[Tensor]]) -> list[Sampled]:
+    """The float64 results of `function` and their tolerances."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # arrays are small
+    try:
+        exact = [each.detach().numpy().copy() for each in function()]
+        squares = [np.zeros(each.shape) for each in exact]
+        with _Noise(np.random.default_rng(0)):
+            for _ in range(SAMPLES):
+                for total, each, noisy in zip(squares, exact, function(), strict=True):
+                    total += (noisy.detach().numpy() - each) ** 2
+    finally:
+        torch.set_num_threads(threads)
+    return [Sampled(each, tolerance_of(total / SAMPLES)) for each, total in zip(exact, squares, strict=True)]
+
+
+def in_float64(net: Network) -> Network:
+    """A copy of a network without its flat tensors: the parameters are float64, each by itself."""
+    made = type(net)(net.spec)
+    for name, parameter in made.parameters.items():
+        parameter.grad = None
+        parameter.data = net.parameters[name].detach().double()
+    return made
+
+
+def _magnitude(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.abs() if value.is_floating_point() else value
+    return abs(value) if isinstance(value, float) else value
+
+
+class _Noise(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Adds noise to the result of each operation on float64 numbers, and refuses operations that it does not know."""
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # else torch imports its compiler, which takes seconds, to exclude this class from compilation
+
+    def __init__(self, generator: np.random.Generator) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._generator = generator
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = func.overloadpacket.__name__
+        if func.is_view or name in EXACT:
+            return func(*args, **kwargs)
+        kind, before = name.removesuffix("_"), args
+        if name != kind:
+            before = [each.clone() if isinstance(each, Tensor) else each for each in args]
+        out = func(*args, **kwargs)
+        if kind in ELEMENTWISE_SIZES:
+            assert not kwargs, f"{func} with {list(kwargs)}: how large are its terms?"
+            self._add(out, ELEMENTWISE * ELEMENTWISE_SIZES[kind](before, out))
+        elif kind in TERMS:
+            sizes = func(*map(_magnitude, before), **kwargs)
+            several = isinstance(out, tuple)
+            for result, size in zip(out if several else [out], sizes if several else [sizes], strict=True):
+                if result is not None:
+                    self._add(result, math.sqrt(TERMS[kind](before, result)) * size)
+        elif kind == "native_layer_norm":
+            return self._layer_norm(func, *args)
+        else:
+            raise NotImplementedError(f"{func}: say here how large its rounding errors are")
+        return out
+
+    def _layer_norm(self, func: Any, x: Tensor, shape: Sequence[int], *others: Any) -> Any:
+        """It is that of numbers with errors of the largest of a row, as the mean has, and is rounded; n roundings each."""
+        n = math.prod(shape)
+        moved = x.clone()
+        self._add(moved, math.sqrt(n) * x.abs().amax(-1, keepdim=True).expand_as(x))
+        found = func(moved, shape, *others)
+        self._add(found[0], (n + ELEMENTWISE) * found[0].abs())
+        return found
+
+    def _add(self, result: Tensor, roundings: Tensor) -> None:
+        """Add noise to `result`, with a standard deviation of `roundings` u."""
+        if result.dtype == torch.float64:
+            noise = np.asarray(self._generator.random(tuple(result.shape), np.float32) - np.float32(0.5))
+            result.add_(roundings * torch.from_numpy(noise), alpha=math.sqrt(12) * UNIT)

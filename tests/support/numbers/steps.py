@@ -1,0 +1,129 @@
+"""One gradient step of an actor-critic, and how far its gradient may be from that of another computation.
+
+The tolerance follows from the rounding errors of log-probabilities, values, advantages and targets; see `rounding`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from learner.algorithms.actor_critic import ActorCritic
+from learner.algorithms.minibatches import LossInput, Minibatch
+from protocol.arrays import Array
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+from tests.support.numbers.batches import no_pulse
+from tests.support.numbers.rounding import (
+    ELEMENTWISE,
+    UNIT,
+    actor_critic_tolerance,
+    assert_within,
+    by_value_variance,
+    log_prob_variance,
+)
+
+
+class Errors(NamedTuple):
+    """The largest errors of the advantages, not standardized, and of the targets of a step."""
+
+    advantage: float = 0.0
+    target: float = 0.0
+
+
+NO_ERRORS = Errors()
+
+
+class Step(NamedTuple):
+    """The gradient of a step by all parameters, and its tolerance, [P] each; and the metrics of its update."""
+
+    gradient: Array
+    tolerance: Array
+    metrics: dict[str, float]
+
+    def assert_is(self, gradient: Array, parameters: slice = slice(None)) -> None:
+        """Assert that this is the gradient of the step, except for rounding, and that it is not 0."""
+        assert np.linalg.norm(gradient[parameters]) > 0.01
+        assert_within(self.gradient[parameters], gradient[parameters], self.tolerance[parameters])
+
+
+def only_step(algorithm: ActorCritic, batch: Batch, errors: Errors = NO_ERRORS) -> Step:
+    """Make an update of one gradient step, which must not be clipped."""
+    tolerances: list[Array] = []
+    evaluate = algorithm.evaluate
+
+    def recorded_evaluate(minibatch: Minibatch) -> LossInput:
+        algorithm.evaluate = evaluate  # type: ignore[method-assign]
+        tolerances.append(gradient_tolerance(algorithm, minibatch, errors))
+        return evaluate(minibatch)
+
+    algorithm.evaluate = recorded_evaluate  # type: ignore[method-assign]
+    metrics = algorithm.update(batch, no_pulse)
+    (tolerance,) = tolerances
+    assert metrics["train/n_updates"] == 1
+    assert metrics["train/grad_norm"] < algorithm.config.max_grad_norm
+    return Step(algorithm.net.flat_grad.numpy().copy(), tolerance, metrics)
+
+
+def gradient_tolerance(algorithm: ActorCritic, minibatch: Minibatch, errors: Errors = NO_ERRORS) -> Array:
+    """How far two float32 gradients [P] of the loss of a minibatch may differ.
+
+    The relative error of a ratio is the absolute error of its log-probability. Standardizing divides an error by the
+    standard deviation; the mean and the standard deviation are off by as much at most, and are sums of B terms, each at
+    most as large as the largest advantage. The errors of advantages and targets may be alike in all rows, for instance
+    those of a rounded discount: then the square of their sum is up to B times the sum of their squares.
+    """
+    rows = algorithm.evaluate(minibatch)
+    count, largest = len(rows.value), float(rows.advantage.abs().max())
+    leaves = [output.detach().requires_grad_() for output in (rows.log_prob_now, rows.entropy, rows.value)]
+    loss, _ = algorithm.loss(LossInput(*rows[:5], *leaves))
+    by_outputs = [each.numpy() for each in torch.autograd.grad(loss, leaves, materialize_grads=True)]
+    by_log_prob, _, by_value = by_outputs
+    of_advantage = errors.advantage
+    if algorithm.standardizes_advantages():
+        of_advantage *= (2 + largest) / float(rows.raw_advantage.std())
+    x, action = minibatch.features.numpy(), minibatch.action.numpy()
+    arrays = algorithm.net.flat.numpy(), x, action
+    rounded = log_prob_variance(algorithm.policy, *arrays) + 2 * (count + ELEMENTWISE) * UNIT**2 * largest**2
+    slope = 2 * algorithm.vf_coef / count
+    return actor_critic_tolerance(
+        algorithm.policy,
+        *arrays,
+        by_outputs,
+        (np.abs(by_log_prob) + (by_log_prob != 0) / count) ** 2 * rounded + of_advantage**2 / count,
+        by_value_variance(algorithm.net, x, by_value, slope) + slope**2 * count * errors.target**2,
+    ).gradient
+
+
+class UsualRows(NamedTuple):
+    """Rows of noise, and the outputs of a network for them with torch's own distributions."""
+
+    x: Tensor  # [B, 4]
+    action: Tensor  # [B, *action]
+    advantage: Tensor  # [B]
+    target: Tensor  # [B]
+    distribution: Any
+    value: Tensor  # [B]
+
+
+def usual_rows(algorithm: ActorCritic, count: int = 30) -> UsualRows:
+    """B = `count` rows of a policy without images and without a core."""
+    generator = torch.Generator().manual_seed(0)
+    x, advantage, target = (torch.randn(s, generator=generator) for s in [(count, 4), (count,), (count,)])
+    params, value = algorithm.net.forward(x)
+    distribution = usual_distribution(algorithm.policy, params)
+    if algorithm.policy.action.kind == "discrete":
+        action = torch.randint(4, (count,), generator=generator)
+    else:
+        action = torch.randn((count, 2), generator=generator)
+    return UsualRows(x, action, advantage, target, distribution, value)
+
+
+def usual_distribution(spec: PolicySpec, params: Tensor) -> Any:
+    """Torch's own distribution of discrete actions, or of two numbers."""
+    if spec.action.kind == "discrete":
+        return torch.distributions.Categorical(logits=params)
+    return torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)

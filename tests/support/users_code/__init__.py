@@ -1,0 +1,1 @@
+"""What a user could have written: environments, policies and encoders, good and bad ones."""

@@ -1,0 +1,349 @@
+"""A run that is interrupted and resumed equals, bit for bit, one that went on and whose lanes were started anew meanwhile.
+
+For every algorithm, with its replay buffer, and with the best policy of its evaluations. And the interruption takes no
+longer than the grace time.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import learner.interrupts
+from learner.algorithms.ppo import PPO
+from learner.config.layers import resolve
+from learner.interrupts import Interrupts
+from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
+from learner.rollouts.hub import Hub
+from learner.run_folder import checkpoint
+from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.progress import Progress
+from learner.run_folder.run_folder import Interrupted
+from millrace.launch.training import train
+from tests.system.stage.processes import START_S, Stage, crowding
+from tests.system.stage.run_folders import folder_of, summary
+
+ENV = "tests.system.ends_and_resume.restarting_env:Restarting-v0"
+T, LANES, ENVS = 16, 2, 4
+COMMON: dict[str, Any] = {
+    "preset": "none", "lanes": LANES, "envs": ENVS, "rollout_steps": T, "net": (8,), "steps": 12 * T * ENVS, "seed": 3,
+    "transport": "inproc", "workers": 1, "eval_every": 100, "eval_episodes": 4, "eval_copies": 4, "eval_max_steps": 120,
+    "max_lag": 0, "checkpoint_every_s": 1000.0,
+}  # fmt: skip
+NORMAL = {"normalize_observations": True, "normalize_rewards": True}
+PPO_SETTINGS = {"algo": "ppo", "n_epochs": 2, "batch_size": 16}
+DQN = {"algo": "dqn", "learning_starts": 100, "gradient_steps": 4, "batch_size": 16, "replay_size": 300}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "ppo": {**PPO_SETTINGS, **NORMAL, "learning_rate_schedule": "linear", "clip_range_schedule": "linear"},
+    "ppo, lstm": {**PPO_SETTINGS, "core": "lstm", "core_size": 4, "normalize_rewards": True},
+    "a2c": {"algo": "a2c", **NORMAL},
+    "impala": {"algo": "impala", **NORMAL},
+    "reinforce": {"algo": "reinforce", **NORMAL, "rollout_steps": 31, "steps": 12 * 31 * ENVS, "eval_every": 200},
+    "dqn, uniform": {**DQN, "normalize_observations": True},
+    "dqn, prioritized": {**DQN, "replay": "prioritized", "n_step": 3, "amsgrad": True, "dueling": True},
+}
+STOP = 6  # the update after which a run is interrupted
+Watch = Callable[[Progress], None]
+
+
+def silent(progress: Progress) -> None:
+    """Show nothing."""
+
+
+def run(tmp_path: Path, watch: Watch = silent, resume: Path | None = None, **settings: Any) -> Path:
+    return train(resolve(ENV, run_dir=str(tmp_path), **{**COMMON, **settings}), resume, watch)
+
+
+def restarted(tmp_path: Path, after: int, **settings: Any) -> Path:
+    """A run that goes on, and whose lanes are all started anew while they collect under the version `after`."""
+    rows = settings.get("rollout_steps", T)
+    kwargs = {"at": after * rows + rows // 2, "once": str(tmp_path / "failed")}
+    folder = run(tmp_path / "restarted", env_kwargs=kwargs, **settings)
+    assert (tmp_path / "failed").exists(), "no lane was started anew"
+    assert summary(folder)["ledger"]["lost"] == LANES, "the lanes were not started anew together"
+    return folder
+
+
+def interrupts_at(update: int) -> Watch:
+    def watch(progress: Progress) -> None:
+        if progress.updates == update and not progress.waiting.startswith("evaluating"):
+            raise KeyboardInterrupt
+
+    return watch
+
+
+def same(left: Any, right: Any) -> bool:
+    """Bit for bit; NaN equals NaN."""
+    match left:
+        case dict():
+            return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+        case list() | tuple():
+            return len(left) == len(right) and all(map(same, left, right))
+        case torch.Tensor():
+            return bool(left.dtype == right.dtype and left.numpy().tobytes() == right.numpy().tobytes())
+        case _:
+            return bool(left == right)
+
+
+MAY_DIFFER = {"wall_s", "ledger"}
+"""Of the counters in a checkpoint: the time, and the tickets that were lost with the old learner or the old worker."""
+
+
+def assert_equal(one: Path, other: Path) -> None:
+    """All that docs/how-to/resume_exactly.md says is equal is equal."""
+    (a, _), (b, _) = checkpoint.newest(one), checkpoint.newest(other)
+    assert a.env_steps == b.env_steps
+    for part in ("algorithm", "best_policy"):
+        assert same(a.state[part], b.state[part]), part
+    past, other_past = a.state["past"], b.state["past"]
+    assert past.keys() == other_past.keys()
+    for of_one in (past, other_past):
+        of_one["episodes"] = [(reward, length) for reward, length, *_ in of_one["episodes"]]  # without their seconds
+    for name in past.keys() - MAY_DIFFER:
+        assert same(past[name], other_past[name]), name
+    for file in ("policy.safetensors", "best.safetensors"):
+        assert (one / file).read_bytes() == (other / file).read_bytes(), file
+    for name in ("env_steps", "updates", "stop_reason", "return_mean_100", "evaluation", "best"):
+        assert summary(one)[name] == summary(other)[name], name
+    rows, others = read_rows(one / "metrics.jsonl"), read_rows(other / "metrics.jsonl")
+    assert [numbers(row) for row in rows] == [numbers(row) for row in others]
+
+
+def numbers(row: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of a row of metrics that do not depend on time and on lost tickets."""
+    kept = {name: row[name] for name in row if name.startswith(("train/", "rollout/", "eval/", "replay/", "lag/"))}
+    return kept | {name: row[name] for name in ("time/iterations", "time/total_timesteps", "ledger/used")}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_resumed_run_equals_one_whose_lanes_were_started_anew(tmp_path: Path, variant: str) -> None:
+    settings = VARIANTS[variant]
+    reference = restarted(tmp_path, STOP, **settings)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "resumed", interrupts_at(STOP), **settings)
+    folder = folder_of(tmp_path / "resumed")
+    assert checkpoint.newest(folder)[0].state["past"]["version"] == STOP
+    assert run(tmp_path / "resumed", resume=folder, **settings) == folder
+    assert_equal(reference, folder)
+    if variant == "ppo":
+        plain = run(tmp_path / "plain", **settings)
+        policies = [(one / "policy.safetensors").read_bytes() for one in (plain, folder)]
+        assert policies[0] != policies[1], "starting lanes anew changes nothing, so this shows nothing"
+
+
+def test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal(tmp_path: Path) -> None:
+    """They are not equal to one that went on: its first updates after the checkpoint use older weights."""
+    settings = {**VARIANTS["impala"], "max_lag": 2}
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "one", interrupts_at(STOP), **settings)
+    folder = folder_of(tmp_path / "one")
+    other = tmp_path / "other" / folder.name
+    shutil.copytree(folder, other)
+    run(tmp_path / "one", resume=folder, **settings)
+    run(tmp_path / "other", resume=other, **{**settings, "workers": 2})
+    assert_equal(folder, other)
+
+
+def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
+    """A run goes on from an older checkpoint than the newest. The policy that was the best later is not its best."""
+    settings = {**VARIANTS["ppo"], "checkpoint_every_updates": 1, "keep_checkpoints": 100, "learning_rate": 0.05}
+    folder = run(tmp_path / "resumed", **settings)
+    later = summary(folder)["best"]
+    saved = {path: checkpoint.load(path) for path in (folder / "checkpoints").iterdir()}
+    versions = {path: found.state["past"]["version"] for path, found in saved.items()}
+    stop = next(versions[path] for path, found in saved.items() if found.env_steps == later["env_steps"]) - 1
+    assert stop > 1, "the best policy of the first run is its first, so this shows nothing"
+    reference = restarted(tmp_path, stop, **settings)
+    for path, version in versions.items():
+        if version > stop:
+            path.unlink()
+    (folder / "summary.json").unlink()
+    assert run(tmp_path / "resumed", resume=folder, **settings) == folder
+    assert summary(folder)["best"] != later, "the second part of the run is that of the first, so this shows nothing"
+    assert_equal(reference, folder)
+
+
+def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is interrupted while its best policy is evaluated again, after its last checkpoint."""
+    settings = {**VARIANTS["ppo"], "target_return": 1.0}
+    whole = run(tmp_path / "whole", **settings)
+    assert summary(whole)["stop_reason"] == "target return 1 reached"
+    evaluate = Hub.evaluate
+
+    def interrupted(hub: Hub, plan: EvaluationPlan, *watch: Any) -> list[PlayedEpisode]:
+        played = evaluate(hub, plan, *watch)
+        if plan.of_best:
+            raise KeyboardInterrupt
+        return played
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Hub, "evaluate", interrupted)
+        run(tmp_path / "resumed", **settings)
+    folder = folder_of(tmp_path / "resumed")
+    assert run(tmp_path / "resumed", resume=folder, **settings) == folder
+    assert_equal(whole, folder)
+
+
+# ---------------------------------------------------------------- the grace time
+
+
+def interrupted_in_an_update(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, minibatch_s: float, **settings: Any
+) -> tuple[Path, float]:
+    """A run that gets SIGTERM in the fourth update, whose minibatches take so long, by its clock.
+
+    Returns its folder, and the seconds from the signal to the end, by the same clock.
+    """
+    differentiate, clock = PPO.differentiate, [1000.0]
+    monkeypatch.setattr(learner.interrupts, "monotonic", lambda: clock[0])
+    began: list[float] = []
+
+    def slow(self: PPO, *given: Any) -> dict[str, float]:
+        if self.version == 3:
+            if not began:
+                began.append(clock[0])
+                signal.raise_signal(signal.SIGTERM)
+            clock[0] += minibatch_s
+        return differentiate(self, *given)
+
+    monkeypatch.setattr(PPO, "differentiate", slow)
+    with pytest.raises(Interrupted):
+        run(tmp_path / "runs", **VARIANTS["ppo"], **settings)
+    monkeypatch.undo()
+    return folder_of(tmp_path / "runs"), clock[0] - began[0]
+
+
+def test_an_update_that_fits_into_the_grace_time_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, seconds = interrupted_in_an_update(tmp_path, monkeypatch, 1.0, grace_s=30.0)
+    assert checkpoint.newest(folder)[0].state["past"]["version"] == 4
+    assert seconds == 8, "eight minibatches"
+    assert summary(folder)["stop_reason"] == "interrupted"
+
+
+def test_an_update_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "whole", interrupts_at(3), **VARIANTS["ppo"])
+    folder, seconds = interrupted_in_an_update(tmp_path, monkeypatch, 4.0, grace_s=30.0)
+    assert 15 <= seconds <= 20, "it is given up when half of the grace time is over"
+    (whole, _), (broken, _) = (checkpoint.newest(one) for one in (folder_of(tmp_path / "whole"), folder))
+    assert same(whole.state["algorithm"], broken.state["algorithm"])
+    assert broken.state["past"]["version"] == 3
+    ledger = summary(folder)["ledger"]
+    assert ledger["lost"] == LANES, "the rollouts of the update that was taken back"
+
+
+def test_without_a_grace_time_an_update_takes_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, _ = interrupted_in_an_update(tmp_path, monkeypatch, 1e4, grace_s=0.0)
+    assert checkpoint.newest(folder)[0].state["past"]["version"] == 4
+
+
+def test_time_that_saving_needs_is_not_given_to_the_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(learner.interrupts, "monotonic", lambda: now[0])
+    with Interrupts(20.0) as interrupts:
+        assert interrupts.at_most(5.0) == 5
+        assert not interrupts.time_is_up(1e9)
+        signal.raise_signal(signal.SIGTERM)
+        for after_s, save_s, up in (
+            (9.9, 1.0, False),
+            (10.1, 1.0, True),
+            (4.9, 10.0, False),
+            (5.1, 10.0, True),
+            (0.1, 14.0, True),
+        ):
+            now[0] = 100 + after_s
+            assert interrupts.time_is_up(save_s) == up, (after_s, save_s)
+        now[0] = 117.0
+        assert interrupts.at_most(5.0) == 3
+        now[0] = 130.0
+        assert interrupts.at_most(5.0) == 0
+
+
+def test_a_second_sigterm_changes_nothing_and_a_second_ctrl_c_ends_at_once() -> None:
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    # `raise_signal` signals this thread, so the handler has run when it returns. `os.kill` may choose another thread.
+    with Interrupts(20.0) as interrupts:
+        for _ in range(3):
+            signal.raise_signal(signal.SIGTERM)
+        assert interrupts.received
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    signal.signal(signal.SIGINT, inherited)
+    before = signal.getsignal(signal.SIGTERM)
+    with Interrupts() as interrupts:
+        signal.raise_signal(signal.SIGTERM)
+        assert interrupts.received
+        assert signal.getsignal(signal.SIGTERM) == before, "without a grace time, the second one must be able to end it"
+
+
+@pytest.mark.parametrize("grace_s", [1.5, 8.0])
+def test_a_process_ends_within_its_grace_time_though_a_worker_does_not_leave(stage: Stage, grace_s: float) -> None:
+    """The worker is in a step that takes ten minutes."""
+    command = [
+        sys.executable,
+        "-m",
+        "millrace",
+        "train",
+        "tests.system.environments.slow_envs:Slow-v0",
+        "--grace-s",
+        str(grace_s),
+    ]
+    command += ["--env-kwargs", "step_s", "600", "--steps", "1000", "--run-dir", str(stage.runs), "--workers", "1"]
+    started = stage.start(command, "train")
+    workers = stage.runs.glob("*/checkpoints/*.pt")
+    deadline = time.monotonic() + START_S * crowding()
+    while not list(workers):
+        assert time.monotonic() < deadline, started.said()
+        time.sleep(0.1)
+        workers = stage.runs.glob("*/checkpoints/*.pt")
+    time.sleep(2.0)
+    began_s = time.monotonic()
+    started.signal(signal.SIGTERM)
+    assert started.ends() == 130, started.said()
+    seconds = time.monotonic() - began_s
+    sys.stdout.write(f"\n--grace-s {grace_s:g}: it ended after {seconds:.2f} s\n")
+    # It ends the worker when the time is up; then the interpreter exits. Without the limit it would wait for five seconds.
+    assert seconds <= grace_s + 1.5 * crowding()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("variant", ["ppo, lstm", "dqn, prioritized", "impala"])
+def test_a_process_that_gets_sigterm_loses_nothing_and_goes_on_as_if_its_lanes_were_started_anew(
+    stage: Stage, tmp_path: Path, variant: str
+) -> None:
+    """Real processes, two workers, SIGTERM at any time; the run that goes on has one worker in this process."""
+    settings = {**COMMON, **VARIANTS[variant], "steps": 60 * T * ENVS, "workers": 2, "transport": "ipc"}
+    command = [sys.executable, "-m", "millrace", "train"]
+    flags = [ENV, "--run-dir", str(stage.runs)]
+    for name, value in settings.items():
+        match value:
+            case bool():
+                flags.append(f"--{'' if value else 'no-'}{name.replace('_', '-')}")
+            case tuple():
+                flags += [f"--{name.replace('_', '-')}", *map(str, value)]
+            case _:
+                flags += [f"--{name.replace('_', '-')}", str(value)]
+    started = stage.start([*command, *flags], "train")
+    deadline = time.monotonic() + START_S * crowding()
+    while not any(len(read_rows(path)) > 10 for path in stage.runs.glob("*/metrics.jsonl")):
+        assert time.monotonic() < deadline, started.said()
+        time.sleep(0.01)
+    time.sleep(float(np.random.default_rng().uniform(0, 0.1)))
+    started.signal(signal.SIGTERM)
+    assert started.ends() == 130, started.said()
+    (folder,) = stage.runs.iterdir()
+    saved = checkpoint.newest(folder)[0].state["past"]["version"]
+    assert saved == read_rows(folder / "metrics.jsonl")[-1]["time/iterations"], "a finished update was lost"
+    resumed = stage.start([*command, "--resume", str(folder)], "resumed")
+    assert resumed.ends(START_S * crowding()) == 0, resumed.said()
+    kept = {name: settings[name] for name in VARIANTS[variant] | {"steps": 0}}
+    assert_equal(restarted(tmp_path / "reference", saved, **kept), folder)

@@ -1,0 +1,1 @@
+"""Runs on this machine from their start to their end: the same for any number of workers."""

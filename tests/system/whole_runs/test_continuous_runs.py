@@ -1,0 +1,125 @@
+"""Whole runs of SAC and TD3: the same for any number of workers, after a resume, beside the learner, and with prior data."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import millrace
+from learner.config.layers import resolve
+from learner.run_folder.metrics_log import read_rows
+from millrace.launch.training import train
+from tests.system.stage.preloaded import workers_of
+from tests.system.stage.processes import START_S, Learner, Stage
+
+SMALL: dict[str, Any] = {
+    "preset": "none",
+    "transport": "inproc",
+    "seed": 3,
+    "envs": 8,
+    "lanes": 4,
+    "rollout_steps": 5,
+    "learning_starts": 90,
+    "updates_per_step": 0.3,
+    "batch_size": 16,
+    "net": (16,),
+    "eval_episodes": 1,
+    "steps": 600,
+}
+ALGORITHMS = pytest.mark.parametrize("algo", ["sac", "td3"])
+
+
+def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) -> Path:
+    keywords = SMALL | settings
+    config = resolve("" if resume else "Pendulum-v1", run_dir=str(tmp_path / name), resume=resume, **keywords)
+    return train(config, resume, lambda _: None)
+
+
+def policy(folder: Path) -> bytes:
+    return (folder / "policy.safetensors").read_bytes()
+
+
+@ALGORITHMS
+def test_bits_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, algo: str) -> None:
+    folders = [run(tmp_path, str(workers), algo=algo, workers=workers) for workers in (1, 2, 4)]
+    assert policy(folders[0]) == policy(folders[1]) == policy(folders[2])
+    for folder in folders:
+        for row in read_rows(folder / "metrics.jsonl"):
+            own = max(0, row["time/total_timesteps"] - 90)
+            assert row["train/n_updates"] == int(0.3 * own + 1e-9), "the gradient steps that the ratio demands, no more"
+    learner = run(tmp_path, "learner", algo=algo, workers=2, inference="learner")
+    assert policy(learner) == policy(folders[0])
+
+
+@ALGORITHMS
+def test_the_replay_ratio_holds_with_lag_and_after_a_resume(tmp_path: Path, algo: str) -> None:
+    folder = run(tmp_path, "first", algo=algo, workers=2, steps=300, max_lag=2)
+    resumed = run(tmp_path, "first", resume=folder, workers=2, steps=600, max_lag=2)
+    last = read_rows(resumed / "metrics.jsonl")[-1]
+    assert last["time/total_timesteps"] > 500
+    assert last["train/n_updates"] == int(0.3 * (last["time/total_timesteps"] - 90) + 1e-9)
+
+
+@pytest.mark.soak
+def test_the_replay_ratio_is_exact_for_eight_uneven_workers_of_which_one_is_killed_now_and_then(
+    stage: Stage, tmp_path: Path
+) -> None:
+    command = f"""--algo sac --preset none --workers 8 --envs 8 --lanes 8 --rollout-steps 5 --max-lag 1 --learning-starts 90
+        --updates-per-step 0.3 --batch-size 16 --net 16 --eval-episodes 1 --steps 20000 --max-env-failures 9
+        --run-dir {stage.runs} --env-kwargs slow_file {tmp_path / "slow"}"""
+    words = [
+        sys.executable,
+        "-m",
+        "millrace",
+        "train",
+        "tests.system.environments.slow_envs:UnevenPendulum-v0",
+        *command.split(),
+    ]
+    learner = Learner(words, tmp_path / "train.log", stage.runs)
+    stage.started.append(learner)
+    random = Random(0)
+    for killed in range(1, 5):
+        learner.trains(8)
+        random.choice(workers_of(learner.pid)).kill()
+        learner.hears(r"worker w\d was killed by SIGKILL", START_S, killed)
+    learner.trains(8)
+    learner.signal(signal.SIGINT)
+    assert learner.ends() == 130
+    rows = learner.rows()
+    assert rows[-1]["train/n_updates"] > 200
+    for row in rows:
+        own = max(0, row["time/total_timesteps"] - 90)
+        assert row["train/n_updates"] == int(0.3 * own + 1e-9), "the gradient steps that the ratio demands, no more"
+
+
+@ALGORITHMS
+def test_the_policy_acts_within_the_bounds_and_so_do_its_episodes(tmp_path: Path, algo: str) -> None:
+    folder = run(tmp_path, "acts", algo=algo, workers=1)
+    loaded, env = millrace.load(folder), gymnasium.make("Pendulum-v1")
+    action = loaded(env.reset(seed=1)[0])
+    assert env.action_space.contains(action)
+    env.close()
+
+
+@ALGORITHMS
+def test_it_learns_from_prior_data(tmp_path: Path, algo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    first = run(tmp_path, "recorded", algo=algo, workers=1, record="pendulum/first-v0", steps=1_700)
+    recorded = minari.load_dataset("pendulum/first-v0")
+    actions = np.concatenate([episode.actions for episode in recorded.iterate_episodes()])
+    assert np.abs(actions).max() > 1.5, "as the environment took them: Pendulum's bounds are -2 and 2"
+    assert np.abs(actions).max() <= 2
+    prior = run(tmp_path, "prior", algo=algo, workers=1, prior="pendulum/first-v0", prior_steps=20, steps=300)
+    rows = read_rows(prior / "metrics.jsonl")
+    assert rows[0]["train/n_updates"] == 20
+    last = rows[-1]
+    assert last["train/n_updates"] == 20 + int(0.3 * (last["time/total_timesteps"] - 90) + 1e-9)
+    assert policy(prior) != policy(first)

@@ -1,0 +1,212 @@
+"""Facts of episodes: what a worker takes from `info`, for a loop over copies, a vector environment and envpool."""
+
+from __future__ import annotations
+
+import math
+from importlib.util import find_spec
+from typing import Any
+
+import gymnasium
+import msgspec
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+
+from protocol.errors import EnvironmentFailed
+from protocol.messages import Evaluate
+from protocol.rollout import Rollout, validate
+from protocol.specs import RunSpec
+from tests.support.in_process.collectors import (
+    collect,
+    no_pulse,
+    random_collector,
+    random_policy,
+    run_of,
+)
+from tests.support.users_code.fact_envs import Facts
+from workers.collect.collector import Collector
+from workers.copies.env_copies import VectorCopies
+from workers.copies.env_errors import CopyFailed
+from workers.copies.envpool_copies import EnvpoolCopies
+from workers.copies.facts import facts_of_copies, facts_of_info
+from workers.copies.split_vector_env import SplitVectorEnv
+from workers.evaluate.evaluator import Evaluator
+
+NAMES = ("is_success", "distance", "speed")
+FACTS = "tests.support.users_code.fact_envs:Facts-v0"
+RUN = msgspec.structs.replace(run_of(FACTS, T=50, N=3), facts=NAMES)
+
+
+def evaluate_order(run: RunSpec, episodes: int) -> Evaluate:
+    return Evaluate(1, 1, 0, tuple(range(episodes)), True, 1000, False, False)
+
+
+def facts(rollout: Rollout) -> list[tuple[float, ...]]:
+    return [episode.facts for episode in rollout.episodes]
+
+
+def expected_of(episode: int) -> tuple[float, float, float]:
+    return float(episode % 2 == 0), float(episode) if episode % 3 else math.nan, math.nan
+
+
+def same(one: Any, other: Any) -> bool:
+    return np.array_equal(one, other, equal_nan=True)
+
+
+def test_each_episode_has_the_facts_of_its_last_step() -> None:
+    (rollout,) = collect(random_collector(RUN), RUN)
+    validate(rollout, RUN)
+    episodes = len(rollout.episodes) // 3  # of each copy
+    assert episodes > 6
+    assert same(facts(rollout), [expected_of(n) for n in range(episodes) for _ in range(3)])
+
+
+def test_facts_of_an_episode_that_began_in_an_earlier_rollout() -> None:
+    run = msgspec.structs.replace(RUN, rollout_steps=2)
+    collector = random_collector(run)
+    found = [row for k in range(25) for row in facts(collect(collector, run, k)[0])]
+    (whole,) = collect(random_collector(RUN), RUN)
+    assert same(found, facts(whole))
+
+
+def test_without_names_there_are_none() -> None:
+    run = msgspec.structs.replace(RUN, facts=())
+    (rollout,) = collect(random_collector(run), run)
+    assert set(facts(rollout)) == {()}
+
+
+def test_a_vector_environment_gives_the_facts_of_the_loop() -> None:
+    collector = random_collector(RUN, lambda run, lane, pulse: VectorCopies(SyncVectorEnv([Facts] * run.copies), run.facts))
+    (rollout,), (loop,) = collect(collector, RUN), collect(random_collector(RUN), RUN)
+    assert same(facts(rollout), facts(loop))
+
+
+def test_a_split_vector_environment_gives_the_facts_of_the_loop() -> None:
+    env = SyncVectorEnv([RUN.env.make] * 6)
+    env.reset()
+    split = SplitVectorEnv(env, 2, facts=NAMES)
+    collector = Collector(RUN, random_policy(RUN.policy), split.open_lane, split.step_all)
+    for one, other in zip(
+        collect(collector, RUN, lanes=range(2)), collect(random_collector(RUN), RUN, lanes=range(2)), strict=True
+    ):
+        assert same(facts(one), facts(other))
+    env.close()
+
+
+class Pool:
+    """Stands for an envpool of two copies: copy n ends by itself after 3 + n steps, and reports its steps."""
+
+    def __init__(self) -> None:
+        self.t = np.zeros(2, int)
+
+    def reset(self, copies: Any = slice(None)) -> Any:
+        self.t[copies] = 0
+        return np.zeros((len(self.t[copies]), 1), np.float32), {}
+
+    def step(self, actions: Any, copies: Any = None) -> Any:
+        own = np.arange(2) if copies is None else np.asarray(copies)
+        over = self.t[own] >= 3 + own  # envpool resets these in this step
+        self.t[own] = np.where(over, 0, self.t[own] + 1)
+        ended = self.t[own] >= 3 + own
+        infos = {"elapsed_step": self.t[own].copy(), "copy": own * 10.0}
+        return np.zeros((len(own), 1), np.float32), np.ones(len(own)), ended, np.zeros(len(own), bool), infos
+
+    def close(self) -> None:
+        pass
+
+
+class PoolSpec:
+    """Stands for `EnvpoolSpec`, with a time limit of 3 steps."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    action_space = gymnasium.spaces.Discrete(2)
+    limit = 3
+
+    def make(self, seeds: Any) -> Pool:
+        return Pool()
+
+
+def test_envpool_at_its_time_limit() -> None:
+    """Copy 0 terminates at the limit; copy 1 is truncated here, so that copy 0 is stepped while copy 1 is reset."""
+    copies = EnvpoolCopies(PoolSpec(), 2, ("elapsed_step", "copy"))  # type: ignore[arg-type]
+    copies.reset([1, 2], no_pulse)
+    found = [dict(copies.step(np.zeros(2, int), no_pulse).facts) for _ in range(8)]
+    assert found == [{}, {}, {0: (3.0, 0.0), 1: (3.0, 10.0)}, {}, {}, {}, {0: (3.0, 0.0), 1: (3.0, 10.0)}, {}]
+
+
+@pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
+def test_envpool() -> None:
+    """Also at the time limit, which is applied here, and in steps in which some copies are reset explicitly."""
+    run = msgspec.structs.replace(
+        run_of("CartPole-v1", T=200, N=8, kwargs={"max_episode_steps": 20}), vector="envpool", facts=("elapsed_step", "no")
+    )
+    (rollout,) = collect(random_collector(run), run)
+    validate(rollout, run)
+    lengths = [episode.length for episode in rollout.episodes]
+    assert 20 in lengths
+    assert min(lengths) < 20
+    assert [row[0] for row in facts(rollout)] == lengths
+    assert all(math.isnan(row[1]) for row in facts(rollout))
+
+
+def test_a_native_vector_environment_without_infos_has_no_facts() -> None:
+    run = msgspec.structs.replace(run_of("CartPole-v1", T=100), vector="native", facts=("is_success",))
+    (rollout,) = collect(random_collector(run), run)
+    assert rollout.episodes
+    assert all(math.isnan(row[0]) for row in facts(rollout))
+
+
+def test_evaluation_episodes_have_facts_too() -> None:
+    run = msgspec.structs.replace(RUN, facts=("is_success", "speed"))
+    evaluator = Evaluator(run, random_policy(run.policy))
+    answer = evaluator.play(evaluate_order(run, 4), lambda rows: None, no_pulse)
+    assert same([episode.facts for episode in answer.episodes], [(1.0, math.nan)] * 4)
+    cut = evaluator.play(msgspec.structs.replace(evaluate_order(run, 4), most_steps=2), lambda rows: None, no_pulse)
+    assert same([episode.facts for episode in cut.episodes], [(math.nan, math.nan)] * 4), "of an episode that was cut"
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_what_is_no_number_names_the_key(vector: bool) -> None:
+    run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), facts=("name",))
+    copies = (lambda run, lane, pulse: VectorCopies(SyncVectorEnv([run.env.make] * 2), run.facts)) if vector else None
+    collector = random_collector(run, copies) if copies else random_collector(run)
+    expected = r"^lane 0, copy [01], step 2: info name: expected a number, got \w+ '?north'?; name only numbers"
+    with pytest.raises(EnvironmentFailed, match=expected.replace("north'?", "north.*")):
+        collect(collector, run)
+
+
+def test_an_evaluation_names_the_key_too() -> None:
+    run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), facts=("name",))
+    evaluator = Evaluator(run, random_policy(run.policy))
+    with pytest.raises(EnvironmentFailed, match=r"copy 0, step 2: info name: expected a number, got str 'north'"):
+        evaluator.play(evaluate_order(run, 2), lambda rows: None, no_pulse)
+
+
+@pytest.mark.parametrize(
+    ("value", "number"),
+    [
+        (True, 1.0), (3, 3.0), (np.float16(0.5), 0.5), (np.array([2]), 2.0), (np.bool_(False), 0.0),
+        (math.inf, math.nan), (math.nan, math.nan), (None, math.nan), (10**400, math.nan),
+    ],
+)  # fmt: skip
+def test_values_that_count_and_values_that_are_missing(value: Any, number: float) -> None:
+    assert same(facts_of_info(["a"], {"a": value}), (number,))
+
+
+@pytest.mark.parametrize("value", ["1", b"1", [], [1, 2], {}, np.ones(2), [[1], [2, 3]], 1j])
+def test_values_that_are_refused(value: Any) -> None:
+    with pytest.raises(CopyFailed) as caught:
+        facts_of_info(["a"], {"a": value}, 1)
+    assert caught.value.line.startswith("info a: expected a number, got ")
+
+
+def test_the_infos_of_copies() -> None:
+    infos = {"a": np.array([1.0, 2.0]), "_a": np.array([True, False]), "b": np.array([3, 4]), "_c": np.ones(2, bool)}
+    assert same(facts_of_copies(["a", "b", "c"], infos, 2), [[1.0, 3.0, math.nan], [math.nan, 4.0, math.nan]])
+    with pytest.raises(CopyFailed) as caught:
+        facts_of_copies(["a"], {"a": np.ones(3)}, 2)
+    assert caught.value.line.startswith("info a: expected a number for each of 2 copies, got ndarray")
+
+
+def test_gymnasium_s_environments_have_what_is_tested() -> None:
+    assert isinstance(gymnasium.make(FACTS).unwrapped, Facts)

@@ -1,0 +1,230 @@
+"""Every way to make an env copy says which one it is, and holds a slot of its own until the copy is closed."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import millrace
+from learner.vector_env.settings import VectorEnvSettings
+from millrace import EnvCopy
+from protocol.env_spec import EnvSpec
+from protocol.errors import UsageError
+from protocol.messages import Reset
+from protocol.specs import DescribeSpec, RunSpec, Vector
+from protocol.wire.plain_values import pack
+from tests.support.in_process.collectors import no_pulse, run_of
+from tests.support.in_process.described import step_spec
+from workers import made_copies
+from workers.collect.collector import open_env_copies
+from workers.described_copy import describing
+from workers.envs.reset_ahead import ResetAhead
+from workers.envs.toy import Countdown
+from workers.evaluate.evaluator import open_looped_copies
+from workers.vector_env.stepper import Stepper
+
+MODULE = __name__
+
+
+class Slots:
+    """The slots of a machine on which only this test runs."""
+
+    def __init__(self) -> None:
+        self.taken = set[int]()
+
+    def take(self) -> int:
+        slot = min(set(range(len(self.taken) + 1)) - self.taken)
+        self.taken.add(slot)
+        return slot
+
+    def give_back(self, slot: int) -> None:
+        self.taken.remove(slot)
+
+
+class Asks(Countdown):
+    """Its constructor asks which copy it is."""
+
+    made: ClassVar[list[EnvCopy]] = []
+    taken: ClassVar[set[int]] = set()
+    closed_late: ClassVar[list[int]] = []
+    fails_at: ClassVar[int] = -1
+
+    def __init__(self) -> None:
+        super().__init__(3)
+        self.copy = millrace.env_copy()
+        self.made.append(self.copy)
+        if self.copy.number == Asks.fails_at:
+            raise OSError("no licence")
+
+    def close(self) -> None:
+        self.closed_late.extend({self.copy.slot} - self.taken)
+
+
+def asking_together(num_envs: int) -> SyncVectorEnv:
+    """The vectorized form of `Asks`."""
+    Asks.made.append(millrace.env_copy())
+    return SyncVectorEnv([lambda: Countdown(3)] * num_envs, autoreset_mode=AutoresetMode.NEXT_STEP)
+
+
+gymnasium.register("Asks-v0", entry_point=f"{MODULE}:Asks", vector_entry_point=f"{MODULE}:asking_together")
+
+
+@pytest.fixture(autouse=True)
+def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[int]]:
+    """The slots that are taken."""
+    machine = Slots()
+    monkeypatch.setattr(made_copies, "slots", lambda: machine)
+    monkeypatch.setattr(Asks, "made", [])
+    monkeypatch.setattr(Asks, "taken", machine.taken)
+    monkeypatch.setattr(Asks, "closed_late", [])
+    monkeypatch.setattr(made_copies, "_slots", {})
+    made_copies._of_process.cache_clear()
+    yield machine.taken
+    assert not Asks.closed_late, "slots that were given back before their copy was closed"
+    made_copies._of_process.cache_clear()
+
+
+def run_with(vector: Vector = "loop") -> RunSpec:
+    """A run with two copies in a lane."""
+    found = run_of("workers.envs.toy:Countdown-v0", N=2, kwargs={"k": 3})
+    return RunSpec(EnvSpec("Asks-v0"), found.policy, rollout_steps=8, copies=2, lanes=8, seed=1, vector=vector)
+
+
+def test_copies_of_a_lane_follow_those_of_the_lanes_before_it(taken: set[int]) -> None:
+    lanes = [open_env_copies(run_with(), lane, no_pulse) for lane in (3, 0)]
+    assert Asks.made == [EnvCopy(6, 3, 0, False, 0), EnvCopy(7, 3, 1, False, 1), EnvCopy(0, 0, 0, False, 2),
+                         EnvCopy(1, 0, 1, False, 3)]  # fmt: skip
+    lanes[0].close()
+    assert taken == {2, 3}
+    again = open_env_copies(run_with(), 3, no_pulse)
+    assert Asks.made[-2:] == [EnvCopy(6, 3, 0, False, 0), EnvCopy(7, 3, 1, False, 1)]
+    again.close()
+    lanes[1].close()
+    assert not taken
+
+
+def test_one_call_that_makes_all_copies_of_a_lane_asks_for_the_first(taken: set[int]) -> None:
+    copies = open_env_copies(run_with("native"), 3, no_pulse)
+    assert Asks.made == [EnvCopy(6, 3, 0, False, 0)]
+    assert taken == {0}
+    copies.close()
+    assert not taken
+
+
+def test_copies_of_envpool_hold_a_slot(taken: set[int]) -> None:
+    pytest.importorskip("envpool")
+    run = run_of("CartPole-v1", N=2)
+    run = RunSpec(run.env, run.policy, rollout_steps=8, copies=2, lanes=8, seed=1, vector="envpool")
+    copies = open_env_copies(run, 1, no_pulse)
+    copies.reset([1, 2], no_pulse)
+    assert taken == {0}
+    copies.close()
+    assert not taken
+
+
+@pytest.mark.parametrize(
+    ("settings", "made"),
+    [
+        ({}, [(0, 0, 0, False), (1, 0, 1, False), (2, 0, 2, False), (3, 1, 0, False), (4, 1, 1, False)]),
+        ({"single_lanes": 2}, [(0, 0, 0, False), (1, 0, 1, False), (2, 0, 2, False), (3, 1, 0, False), (4, 1, 1, False),
+                               (0, 0, 0, True), (1, 0, 1, True)]),
+        ({"evaluates": True}, [(0, 0, 0, True), (1, 0, 1, True), (2, 0, 2, True), (3, 0, 3, True), (4, 0, 4, True)]),
+    ],
+)  # fmt: skip
+def test_copies_of_a_vector_environment(settings: dict[str, Any], made: list[Any], taken: set[int]) -> None:
+    spec = step_spec(VectorEnvSettings("Asks-v0", 5, lanes=2, workers=2, **settings))
+    Asks.made.clear()
+    stepper = Stepper(spec)
+    for lane, copies in enumerate(spec.lanes):
+        options = np.frombuffer(pack(None), np.uint8)
+        stepper.execute(Reset(1, 1, lane, 0, tuple(range(copies)), (1,) * copies, options), no_pulse)
+    assert [(copy.number, copy.lane, copy.copy, copy.evaluation) for copy in Asks.made] == made
+    assert [copy.slot for copy in Asks.made] == list(range(len(made)))
+    stepper.lanes.close_all()
+    assert not taken
+
+
+def test_copies_that_play_evaluations_are_numbered_among_themselves(taken: set[int]) -> None:
+    copies = open_looped_copies(run_with(), 3, None, no_pulse)
+    assert Asks.made == [EnvCopy(n, 0, n, True, n) for n in range(3)]
+    copies.close()
+    assert not taken
+
+
+@pytest.mark.parametrize("vector", ["loop", "native"])
+def test_the_copy_that_is_described_is_number_0(vector: Vector, taken: set[int]) -> None:
+    with describing(DescribeSpec(EnvSpec("Asks-v0"), vector)):
+        assert Asks.made == [EnvCopy(slot=0), EnvCopy(slot=1)][: 1 if vector == "loop" else 2]
+    assert not taken
+
+
+def test_the_slot_of_a_copy_that_cannot_be_made_is_not_free_because_its_constructor_may_have_started_something(
+    taken: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Asks, "fails_at", 1)
+    with pytest.raises(UsageError, match="no licence"):
+        open_env_copies(run_with(), 0, no_pulse)
+    assert taken == {1}
+    monkeypatch.setattr(Asks, "fails_at", 0)
+    with pytest.raises(millrace.EnvironmentFailed, match="no licence"), describing(DescribeSpec(EnvSpec("Asks-v0"))):
+        pass
+    assert taken == {0, 1}
+
+
+@pytest.mark.parametrize("steps", [8, 12])  # two or three episodes, so that either instance plays at the end
+def test_the_second_instance_of_a_copy_has_a_slot_of_its_own(taken: set[int], steps: int) -> None:
+    run = run_with()
+    env = EnvSpec.of("Asks-v0", wrappers=[ResetAhead])
+    copies = open_env_copies(RunSpec(env, run.policy, 8, copies=1, lanes=8, seed=1), 4, no_pulse)
+    copies.reset([1], no_pulse)
+    for _ in range(steps):
+        copies.step(np.zeros(1, np.int64), no_pulse)
+    assert Asks.made == [EnvCopy(4, 4, 0, False, 0), EnvCopy(4, 4, 0, False, 1)]
+    copies.close()
+    assert not taken
+
+
+# ----------------------------------------------------------------------------------------- when no copy is being made
+
+
+def test_a_program_that_makes_its_environment_itself_has_one_slot(taken: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    gymnasium.make("Asks-v0")
+    assert Asks.made == [EnvCopy(slot=0)]
+    assert millrace.env_copy() == EnvCopy(slot=0)
+    assert taken == {0}
+    with monkeypatch.context() as fork:
+        fork.setattr(os, "getpid", lambda: -1)
+        assert millrace.env_copy() == EnvCopy(slot=1)
+
+
+def test_who_asks_too_late_is_not_told_that_it_is_number_0() -> None:
+    copies = open_env_copies(run_with(), 1, no_pulse)
+    with pytest.raises(UsageError, match=r"^env_copy: this thread is not making an env copy now; ask in the environment's"):
+        millrace.env_copy()
+    copies.close()
+    assert millrace.env_copy().number == 0
+
+
+def test_each_thread_makes_its_own_copy() -> None:
+    meet = threading.Barrier(2, timeout=20)
+
+    def make() -> gymnasium.Env[Any, Any]:
+        meet.wait()
+        found.append(millrace.env_copy())
+        meet.wait()
+        return Countdown(3)
+
+    found: list[EnvCopy] = []
+    threads = [threading.Thread(target=made_copies.make_copy, args=(EnvCopy(number), make)) for number in (5, 9)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert {(copy.number, copy.slot) for copy in found} in ({(5, 0), (9, 1)}, {(5, 1), (9, 0)})

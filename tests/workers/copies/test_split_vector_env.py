@@ -1,0 +1,178 @@
+"""Lanes as parts of one vector environment: each gets, to the bit, what a loop over its own copies gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+
+from learner.recording.episodes import EpisodeAssembler
+from protocol.errors import NoWorkers
+from protocol.policy.layout import acting_size, buffer_size
+from protocol.policy.torch_policy import TorchPolicy
+from protocol.specs import RunSpec
+from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
+from workers.collect.collector import Collector
+from workers.conversation.held import Assignment
+from workers.copies.split_vector_env import SplitVectorEnv
+
+LANES = 3
+RUNS = {
+    "discrete": run_of("CartPole-v1", T=40),
+    "gaussian": run_of("Pendulum-v1", kwargs={"max_episode_steps": 30}, T=40),
+    "lstm": run_of("CartPole-v1", T=40, core="lstm", core_size=9),
+    "table": run_of(f"{TOY}Spaces-v0", kwargs={"observation": "dict", "action": "table"}, normalize_observations=True),
+    "offset": run_of(f"{TOY}Spaces-v0", kwargs={"observation": "multidiscrete", "action": "offset"}),
+}
+
+
+@contextmanager
+def split_collector(run: RunSpec) -> Iterator[Collector]:
+    env = SyncVectorEnv([run.env.make] * (LANES * run.copies))
+    env.reset()  # SyncVectorEnv, unlike ZmqVectorEnv, takes a mask only after a first reset
+    split = SplitVectorEnv(env, LANES)
+    yield Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
+    env.close()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_lane_gets_the_bits_of_a_loop_over_its_copies(name: str) -> None:
+    run = RUNS[name]
+    loop = random_collector(run)
+    with split_collector(run) as split:
+        for k in range(4):
+            actual, expected = (collect(collector, run, k, lanes=range(LANES)) for collector in (split, loop))
+            assert [bits(one) for one in actual] == [bits(other) for other in expected]
+            assert k or len({one.obs[0].tobytes() for one in actual}) == LANES, "the lanes are the same"
+
+
+def test_a_lane_of_a_new_incarnation_starts_anew_and_the_others_go_on() -> None:
+    run = RUNS["discrete"]
+    loop = random_collector(run)
+    assignments = [Assignment(n, n, 1 if n == 1 else 0, 0 if n == 1 else 1) for n in range(LANES)]
+    with split_collector(run) as split:
+        found = []
+        for collector in (split, loop):
+            collect(collector, run, 0, lanes=range(LANES))
+            found.append([bits(rollout) for rollout in collector.collect(assignments, 0, 0, no_pulse)])
+    assert found[0] == found[1]
+
+
+def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
+    run = RUNS["discrete"]
+    loop = random_collector(run)
+    with split_collector(run) as split:
+        actual, expected = (collect(collector, run, lanes=(2, 0, 1)) for collector in (split, loop))
+        assert [bits(one) for one in actual] == [bits(other) for other in expected]
+        with pytest.raises(ValueError, match=r"expected all 3 of the vector environment at once, got \[0, 2\]"):
+            collect(split, run, 1, lanes=(0, 2))
+
+
+class WithoutWorkers(SyncVectorEnv):
+    def step(self, actions: Any) -> Any:
+        raise NoWorkers("waited 1 s for 1 worker")
+
+
+def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
+    run = RUNS["discrete"]
+    env = WithoutWorkers([run.env.make] * (LANES * run.copies))
+    env.reset()
+    split = SplitVectorEnv(env, LANES)
+    with pytest.raises(NoWorkers):
+        collect(Collector(run, random_policy(run.policy), split.open_lane, split.step_all), run, lanes=range(LANES))
+    with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 worker$"):
+        split.raise_if_no_workers()
+    split.raise_if_no_workers()
+    env.close()
+
+
+class LosesTwoCopies(SyncVectorEnv):
+    """Loses the first two copies in its step number `at`, as a vector environment over worker processes would."""
+
+    def __init__(self, makes: Any, at: int) -> None:
+        super().__init__(makes)
+        self.at, self.made = at, 0
+
+    def step(self, actions: Any) -> Any:
+        self.made += 1
+        if self.made - 1 != self.at:
+            return super().step(actions)
+        before = np.array(self._observations)
+        obs, reward, terminated, truncated, _ = super().step(actions)
+        lost = np.arange(self.num_envs) < 2
+        obs[lost], reward[lost], terminated[lost], truncated[lost] = before[lost], 0.0, False, True
+        self._autoreset_envs = terminated | truncated
+        return obs, reward, terminated, truncated, {"worker_lost": lost, "_worker_lost": lost}
+
+
+@pytest.mark.parametrize("at", range(9))
+def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
+    """Within an episode, at its end (5 steps) or its reset, in the first row or the last row of a rollout (3 rows)."""
+    run = run_of(f"{TOY}Countdown-v0", T=3)
+    env = LosesTwoCopies([run.env.make] * (LANES * run.copies), at)
+    env.reset()
+    split = SplitVectorEnv(env, LANES)
+    collector = Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
+    by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
+    assembler = EpisodeAssembler(lambda actions: actions)
+    whole = []
+    for lane, rollouts in enumerate(by_lane):
+        valid = np.concatenate([rollout.valid for rollout in rollouts])  # [12, N]
+        left = np.concatenate([rollout.obs[0][:-1, :, 0] for rollout in rollouts])  # [12, N] of 1.0, in fifths
+        reward = np.concatenate([rollout.reward for rollout in rollouts])
+        assert valid[at].any() == (lane > 0 and at != 5), "row 5 is every other copy's reset"
+        np.testing.assert_array_equal(reward, valid)
+        np.testing.assert_allclose(np.diff(left, axis=0)[valid[:-1] & valid[1:]], -0.2, atol=1e-6)
+        assert (left[1:][~valid[:-1] & valid[1:]] == 1.0).all(), "an episode began amid another"
+        whole += [episode for rollout in rollouts for episode in assembler.add(rollout, 0)]
+    assert {episode.length for episode in whole if episode.terminated[-1]} == {5}
+    cut = [episode.length for episode in whole if episode.truncated[-1]]
+    assert cut == [] if at in (0, 3, 5, 6) else cut == [at if at < 5 else at - 6] * 2
+    assert assembler.left_out == (6 if at == 3 else 0), "three steps of two copies, delivered before the loss"
+    assert collector.steps == assembler.waiting + assembler.left_out + sum(episode.length for episode in whole)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        {"kwargs": {"observation": "image", "action": "table"}},
+        {"kwargs": {"observation": "image"}, "core": "gru", "core_size": 5},
+        {"kwargs": {"observation": "image"}, "head": "q"},
+        {"kwargs": {"observation": "dict", "action": "box"}, "normalize_observations": True},
+    ],
+)
+def test_one_forward_pass_for_all_lanes_equals_one_pass_for_each_lane(policy: dict[str, Any]) -> None:
+    spec = run_of(f"{TOY}Spaces-v0", **policy).policy
+    generator = np.random.default_rng(0)
+    parameters = generator.normal(0, 0.3, acting_size(spec)).astype(np.float32)
+    buffers = generator.uniform(0.5, 1.5, buffer_size(spec)).astype(np.float32)
+    leaves = [generator.integers(0, 2, (LANES, 4, *leaf.shape)).astype(leaf.dtype) for leaf in spec.observation]
+    for array, leaf in zip(leaves, spec.observation, strict=True):
+        array += np.reshape(leaf.start, leaf.shape).astype(leaf.dtype) if leaf.start else 0
+    results = []
+    for together in (True, False):
+        acting = TorchPolicy(spec, together=together)
+        acting.load(parameters, buffers)
+        state = np.full((LANES, 4, spec.state_size), 0.25, np.float32)
+        results.append((acting(leaves, state), state))
+    (one, after_one), (each, after_each) = results
+    assert one.shape == each.shape
+    np.testing.assert_allclose(one, each, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(after_one, after_each, rtol=1e-4, atol=1e-5)
+    assert not spec.state_size or (after_one != 0.25).any()
+
+
+def test_step_all_gets_the_actions_of_all_lanes_before_the_first_lane_steps() -> None:
+    run = msgspec.structs.replace(RUNS["discrete"], rollout_steps=2)
+    calls: list[tuple[list[int], tuple[int, ...]]] = []
+    collector = Collector(
+        run, random_policy(run.policy), step_all=lambda lanes, actions, pulse: calls.append((list(lanes), actions.shape))
+    )
+    collect(collector, run, lanes=(4, 1))
+    assert calls == [([4, 1], (2, 2))] * 2

@@ -1,0 +1,168 @@
+"""`ResetAhead`: what overlaps, which random numbers an episode has, and what becomes of errors and attributes."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+from protocol.errors import UsageError
+from protocol.random_streams import Purpose, env_seed
+from protocol.wire.plain_values import pack
+from tests.support.in_process.collectors import no_pulse
+from workers.copies.env_copies import LoopedCopies
+from workers.envs.reset_ahead import ResetAhead
+
+DEADLINE_S = 20.0
+
+
+class Traced(gymnasium.Env[Any, Any]):
+    """Two steps an episode. Observations are random numbers of the episode's reset and of the instance's steps."""
+
+    made: list[Traced] = []
+    resets_wait_for = threading.Event()
+    fails = False
+    patience_s = DEADLINE_S
+    observation_space = Box(0, 1, (1,), np.float64)
+    action_space = Discrete(2)
+    resetting = False  # an instance is being reset
+    set_meanwhile = False  # an attribute was set during a reset
+
+    @property
+    def level(self) -> int:
+        return self._level
+
+    @level.setter
+    def level(self, value: int) -> None:
+        self._level = value
+        self.set_meanwhile |= self.resetting
+
+    def __init__(self) -> None:
+        self.closed = False
+        self._level = 0
+        self.levels: list[int] = []
+        self.seeds: list[int | None] = []
+        Traced.made.append(self)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.resetting = True
+        self.seeds.append(seed)
+        if threading.current_thread() is not threading.main_thread():
+            assert Traced.resets_wait_for.wait(Traced.patience_s) or Traced.patience_s < DEADLINE_S
+            if Traced.fails:
+                raise RuntimeError("no reset today")
+        self.levels.append(self.level)
+        self._left = 2
+        self.resetting = False
+        return self.np_random.uniform(size=1), {"instance": Traced.made.index(self)}
+
+    def step(self, action: Any) -> Any:
+        Traced.resets_wait_for.set()
+        self._left -= 1
+        return self.np_random.uniform(size=1), 1.0, self._left == 0, False, {}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+gymnasium.register("tests/Traced-v0", f"{__name__}:Traced", disable_env_checker=True)
+
+
+@pytest.fixture(autouse=True)
+def _fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Traced, "made", [])
+    monkeypatch.setattr(Traced, "fails", False)
+    monkeypatch.setattr(Traced, "resets_wait_for", threading.Event())
+    Traced.resets_wait_for.set()
+
+
+def episode(env: gymnasium.Env[Any, Any], seed: int | None = None) -> tuple[int, list[float]]:
+    """The instance that played, and all observations."""
+    first, info = env.reset(seed=seed)
+    return info["instance"], [first.item(), *(env.step(0)[0].item() for _ in range(2))]
+
+
+def alone(seed: int, episodes: int) -> list[list[float]]:
+    env = Traced()
+    return [episode(env, seed if n == 0 else None)[1] for n in range(episodes)]
+
+
+def test_episodes_take_turns_between_two_instances_with_random_numbers_of_their_own() -> None:
+    env = ResetAhead(gymnasium.make("tests/Traced-v0"))
+    found = [episode(env, 5), *(episode(env) for _ in range(5))]
+    env.close()
+    assert [instance for instance, _ in found] == [0, 0, 1, 0, 1, 0]
+    second_seed = env_seed(5, Purpose.SECOND_INSTANCE)
+    first, second = alone(5, 4), alone(second_seed, 2)
+    assert [observations for _, observations in found] == [first[0], first[1], second[0], first[2], second[1], first[3]]
+    assert all(each.closed for each in Traced.made[:2])
+
+
+def test_a_reset_runs_while_the_other_instance_steps() -> None:
+    env = ResetAhead(gymnasium.make("tests/Traced-v0"))
+    episode(env, 1)
+    Traced.resets_wait_for.clear()  # only a step lets the reset in the thread end
+    for _ in range(3):
+        assert len(episode(env)[1]) == 3
+        env.instances()  # the reset in the thread has ended, so it saw the step
+        Traced.resets_wait_for.clear()
+    Traced.resets_wait_for.set()
+    env.close()
+
+
+def test_a_reset_with_a_seed_begins_again_and_prepares_nothing() -> None:
+    env = ResetAhead(gymnasium.make("tests/Traced-v0"))
+    for seed in (3, 3, 4):
+        assert episode(env, seed)[1] == alone(seed, 1)[0]
+    assert [len(each.seeds) for each in Traced.made if each.closed or each is env.unwrapped] == [3]
+    found = [episode(env, 7), *(episode(env) for _ in range(3))]
+    again = [episode(env, 7), *(episode(env) for _ in range(3))]
+    env.close()
+    assert [observations for _, observations in found] == [observations for _, observations in again]
+
+
+def test_what_the_prepared_reset_raises_arrives_at_the_next_reset() -> None:
+    env = ResetAhead(gymnasium.make("tests/Traced-v0"))
+    episode(env, 1)
+    Traced.fails = True
+    episode(env)
+    with pytest.raises(RuntimeError, match="no reset today"):
+        env.reset()
+    env.close()
+
+
+def test_attributes_reach_both_instances_and_the_prepared_episode_has_the_old_ones() -> None:
+    made = gymnasium.make("tests/Traced-v0")
+    copies = LoopedCopies([lambda: ResetAhead(made)], no_pulse)
+    copies.reset([1], no_pulse)
+    for level in (1, 2):
+        copies.assign("level", pack(level), no_pulse)
+        for _ in range(6):  # two episodes
+            copies.step(np.zeros(1, np.int64), no_pulse)
+    copies.close()
+    assert [each.level for each in Traced.made] == [2, 2]
+    assert [each.levels for each in Traced.made] == [[0, 1, 1, 2], [1, 2]]  # of each reset
+
+
+def test_an_attribute_is_not_set_during_a_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = ResetAhead(gymnasium.make("tests/Traced-v0"))
+    env.reset(seed=1)
+    monkeypatch.setattr(Traced, "patience_s", 0.2)  # the reset in the thread takes as long
+    Traced.resets_wait_for.clear()
+    env.reset()
+    copies = LoopedCopies([lambda: env], no_pulse)
+    copies.assign("level", pack(1), no_pulse)
+    copies.close()
+    assert [(each.level, each.set_meanwhile) for each in Traced.made] == [(1, False)] * 2
+
+
+def test_an_environment_that_gymnasium_did_not_make_is_refused() -> None:
+    with pytest.raises(
+        UsageError, match=r"ResetAhead: expected an environment of gymnasium.make, got Traced without a spec"
+    ):
+        ResetAhead(Traced())
