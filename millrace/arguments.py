@@ -23,6 +23,7 @@ WORDS: dict[Any, str] = {
     type(None): "None",
     Callable: "a function",
     os.PathLike: "a path",
+    tuple: "a tuple",
     Sequence: "a list",
     Mapping: "a dict",
 }

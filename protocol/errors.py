@@ -27,6 +27,7 @@ import resource
 from collections.abc import Iterable, Sequence
 
 from protocol.bounds import one_line
+from protocol.worker_exception import worker_exception
 
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
@@ -177,19 +178,22 @@ class Stalled(RunError):
 class EnvironmentFailed(RunError):
     """The environment raised; `detail` is the traceback where it happened. In a worker, `lane` is the lane of its copy.
 
+    Its `__cause__` is the environment's exception if that is one of Python's own; otherwise it shows the traceback.
+
     >>> import millrace
     >>> def broken():
     ...     raise OSError("the simulator has no licence")
     >>> try:
     ...     millrace.make_vec(broken, 2)
     ... except millrace.EnvironmentFailed as error:
-    ...     print(error.detail.splitlines()[-1])
-    OSError: the simulator has no licence
+    ...     error.__cause__
+    OSError('the simulator has no licence')
     """
 
     def __init__(self, line: str, detail: str = "", lane: int | None = None) -> None:
         super().__init__(line, detail)
         self.lane = lane
+        self.__cause__ = worker_exception(detail)
 
 
 class PolicyFailed(RunError):

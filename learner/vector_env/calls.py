@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
-
-from gymnasium import Space
 
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import call_order
@@ -55,23 +54,12 @@ class CopyCalls:
                 described += [None] * count
         return described
 
-    def make(self, spaces: tuple[Space[Any], Space[Any]]) -> None:
-        """Make all copies, before they are reset. Raises as `call`, and `EnvironmentFailed` also if their spaces differ."""
-        described: list[DescribedEnv | None] = []
-        for attempt in range(RESET_ATTEMPTS):
-            try:
-                described = self.describe(range(self._parts.layout.num_envs))
-                break
-            except WorkerLost:  # another worker may make them
-                if attempt == RESET_ATTEMPTS - 1:
-                    raise
-        for n, copy in enumerate(described):
-            if copy is not None and (copy.observation_space, copy.action_space) != spaces:
-                raise EnvironmentFailed(
-                    f"copy {n}: its observations {copy.observation_space} and actions {copy.action_space} are not those of "
-                    f"copy 0, {spaces[0]} and {spaces[1]}; all copies must have the same, and each machine the same version "
-                    "of the environment"
-                )
+    def make(self) -> list[DescribedEnv | None]:
+        """Make all copies, before they are reset, and describe them. Raises as `call`."""
+        for _ in range(RESET_ATTEMPTS - 1):
+            with suppress(WorkerLost):  # another worker may make them
+                return self.describe(range(self._parts.layout.num_envs))
+        return self.describe(range(self._parts.layout.num_envs))
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
         self._send_recv.call(orders)
@@ -146,7 +134,9 @@ def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
 def _error(name: str, lane: int, answer: Returned) -> Exception:
     """The exception of a call, with the worker's traceback. An `AttributeError` keeps its type, as `hasattr` needs it."""
     line = f"call of {name!r}, lane {lane}: {answer.error}"
-    missing = answer.error.startswith("AttributeError")
-    error: Exception = AttributeError(line) if missing else EnvironmentFailed(line, answer.traceback)
-    error.add_note(answer.traceback)
+    failed = EnvironmentFailed(line, answer.traceback)
+    if not answer.error.startswith("AttributeError"):
+        return failed
+    error = AttributeError(line)
+    error.__cause__ = failed.__cause__
     return error

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.vector.utils import batch_space
 
 from learner.vector_env.batch_arrays import BatchArrays
@@ -22,10 +23,10 @@ from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.calls import CopyCalls
 from learner.vector_env.infos import InfoReader, merged
 from learner.vector_env.lost_lanes import LostLanes
-from learner.vector_env.send_recv import SendRecv, VectorEnvParts, numbered
+from learner.vector_env.send_recv import SendRecv, VectorEnvParts
 from learner.vector_env.sent_lanes import Infos, ReadyLane
 from learner.vector_env.spec import VectorEnvDescription
-from learner.vector_env.step_arguments import Options, action_arrays, seed_list, take_reset_mask
+from learner.vector_env.step_arguments import Options, action_arrays, numbered, reset_arguments
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
@@ -69,11 +70,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """the newest infos that are not empty, as each copy returned them"""
         self.hub = hub
         """who is asked; it may be told what to call while it waits"""
+        self.address = hub.address
+        """the address that workers connect to"""
         self._action_leaves, self._read_actions = step.action, make_flatten(self.single_action_space)
         self._layout = BatchLayout(step.lanes)
         memory = None if hub.shared is None else hub.shared.memory
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
-        self._step_is_pending = False
+        self._state = AsyncState.DEFAULT
         self._info_reader = InfoReader(self._layout, hub.refuse_owner)
         seeds, ever_reset = list[int | None]([None] * N), np.zeros(N, bool)
         parts = VectorEnvParts(
@@ -95,11 +98,31 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `UsageError` for a part of them.
         """
         self._check_idle("reset")
-        seeds = seed_list(seed, self.num_envs)
-        mask, options = take_reset_mask(options, self.num_envs)
-        self._send_recv.reset(np.flatnonzero(mask).tolist(), seeds, options)
-        ready = self._send_recv.recv_all()
-        return self._batch.observation(copy=self.copy), self._infos(ready)
+        self.reset_async(seed, options)
+        return self.reset_wait()
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: Options = None,
+        *,
+        env_ids: Sequence[int] | Array | None = None,
+    ) -> None:
+        """Begin episodes as `reset` does, or in the copies `env_ids`; a list of seeds then has one for each of these.
+
+        `reset_wait` returns what `reset` does. `recv` returns the copies that are ready, with reward 0. Raises
+        `AlreadyPendingCallError` if one of the copies, or another one of its lane, has not come back.
+        """
+        self._check_idle("reset_async", of_sent=True)
+        copies, seeds, options = reset_arguments(env_ids, seed, options, self.num_envs)
+        alone = not self.outstanding
+        self._send_recv.reset(copies, seeds, options)
+        self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
+
+    def reset_wait(self, timeout: float | None = None) -> tuple[Any, Infos]:
+        """Wait for the pending reset. Returns and raises what `reset` does; otherwise it is as `step_wait`."""
+        observation, _, _, _, infos = self._wait(AsyncState.WAITING_RESET, timeout)
+        return observation, infos
 
     def step(self, actions: Any) -> StepResult:
         """Step every copy. Returns observations, rewards, terminated, truncated and infos.
@@ -118,47 +141,16 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._check_idle("step_async")
         arrays = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
         self._send_recv.step(self._layout.lanes if lanes is None else lanes, arrays, self._layout.rows, together=True)
-        self._step_is_pending = True
+        self._state = AsyncState.WAITING_STEP
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """Wait for the pending step. Returns and raises what `step` does, and `NoAsyncCallError` if there is none.
 
         A worker that does not answer within `timeout` seconds (`timeout_s` by default) is given up.
         """
-        if self.closed:
-            raise ClosedEnvironmentError("step_wait after close()")
-        if not self._step_is_pending:
-            raise NoAsyncCallError("step_wait without step_async before it", "step")
-        self._step_is_pending = False
-        ready = self._send_recv.recv_all(timeout)
-        batch, truncated = self._batch, self._batch.truncated.copy()
-        if lost := [n for lane in ready if lane.loss_infos for n in lane.loss_infos]:
-            truncated[lost] = True
-        observation = batch.observation(copy=self.copy)
-        return observation, batch.reward.copy(), batch.terminated.copy(), truncated, self._infos(ready)
+        return self._wait(AsyncState.WAITING_STEP, timeout)
 
     # ---------------------------------------------------------------- lanes that do not wait for each other
-
-    def async_reset(
-        self,
-        env_ids: Sequence[int] | Array | None = None,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> None:
-        """Begin episodes in these copies, by default in all. `recv` returns their first observations, with reward 0.
-
-        A single seed s gives copy n the seed s + n; a list has one for each of `env_ids`. Raises `AlreadyPendingCallError`
-        if one of the copies, or another one of its lane, has not come back.
-        """
-        self._check_idle("async_reset", of_sent=True)
-        copies = numbered(env_ids, self.num_envs)
-        self._layout.check(copies)
-        if isinstance(seed, int | np.integer):
-            seed = [int(seed) + n for n in copies]
-        seeds = np.full(self.num_envs, None)
-        seeds[copies] = seed_list(seed, len(copies))
-        self._send_recv.reset(copies, seeds.tolist(), options)
 
     def send(self, actions: Any, env_ids: Sequence[int] | Array | None = None) -> None:
         """Step these copies, by default all, with one action each, in the order of `env_ids`; `recv` returns the results.
@@ -170,7 +162,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         number of actions, `UsageError` for copies that must be reset first. Then nothing was sent.
 
         envs = millrace.make_vec("CartPole-v1", 8, workers=2, lanes=8)
-        envs.async_reset(seed=1)
+        envs.reset_async(seed=1)
         for _ in range(100):
             observation, reward, terminated, truncated, infos = envs.recv()
             envs.send(policy(observation), infos["env_id"])
@@ -180,6 +172,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         at = self._layout.positions(copies)
         arrays = action_arrays(actions, self._read_actions, self._action_leaves, len(copies))
         self._send_recv.step(list(at), arrays, at, together=False)
+        self._state = AsyncState.DEFAULT
 
     def recv(self, min_envs: int = 1, timeout: float | None = None) -> StepResult:
         """The results of all copies that are ready; waits until at least `min_envs` are. 0 does not wait.
@@ -194,14 +187,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         back truncated or are named by `WorkerLost`.
         """
         self._check_idle("recv", of_sent=True)
+        self._state = AsyncState.DEFAULT
         ready = self._send_recv.recv(min_envs, timeout)
-        batch, copies = self._batch, [n for lane in ready for n in lane.copies]
-        truncated = batch.truncated[copies]
-        if lost := {n for lane in ready if lane.loss_infos for n in lane.loss_infos}:
-            truncated[[n in lost for n in copies]] = True
-        infos = self._infos(ready, copies)
-        infos["env_id"] = np.array(copies, np.int64)
-        return batch.observation_of_some(copies), batch.reward[copies], batch.terminated[copies], truncated, infos
+        copies = [n for lane in ready for n in lane.copies]
+        rows = self._rows(ready, copies)
+        rows[-1]["env_id"] = np.array(copies, np.int64)
+        return rows
 
     @property
     def outstanding(self) -> list[int]:
@@ -242,18 +233,6 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The seed of each copy's random generator, as `SyncVectorEnv` shows it."""
         return self.get_attr("np_random_seed")
 
-    # ---------------------------------------------------------------- workers
-
-    @property
-    def address(self) -> str:
-        """The address that workers connect to."""
-        return self.hub.address
-
-    @property
-    def workers(self) -> int:
-        """Number of workers that have joined."""
-        return len(self.hub.coordinator.members)
-
     # ---------------------------------------------------------------- close
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -273,14 +252,31 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Raise if this cannot be done now. `of_sent`: it may be done while copies have not come back."""
         if self.closed:
             raise ClosedEnvironmentError(f"{doing} after close()")
-        if self._step_is_pending:
-            raise AlreadyPendingCallError(f"{doing} while a step is pending: expected step_wait() first", "step")
+        if self._state is AsyncState.WAITING_STEP or (self._state is AsyncState.WAITING_RESET and not of_sent):
+            pending = self._state.value
+            raise AlreadyPendingCallError(f"{doing} while a {pending} is pending: expected {pending}_wait() first", pending)
         if not of_sent and (copies := self._send_recv.copies()):
             raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
 
-    def _infos(self, ready: Sequence[ReadyLane], copies: Sequence[int] | None = None) -> Infos:
+    def _wait(self, awaited: AsyncState, timeout_s: float | None) -> StepResult:
+        """Wait for what is pending, which must be this."""
+        if self.closed:
+            raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
+        if self._state is not awaited:
+            raise NoAsyncCallError(f"{awaited.value}_wait without {awaited.value}_async before it", awaited.value)
+        self._state = AsyncState.DEFAULT
+        return self._rows(self._send_recv.recv_all(timeout_s))
+
+    def _rows(self, ready: Sequence[ReadyLane], copies: list[int] | None = None) -> StepResult:
+        """The rows of these copies, which came back, or of all."""
+        batch, rows = self._batch, slice(None) if copies is None else copies
+        truncated = batch.truncated.copy()
+        if lost := [n for lane in ready if lane.loss_infos for n in lane.loss_infos]:
+            truncated[lost] = True
         self.infos_by_copy = self._info_reader.by_copy(ready)
-        return merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
+        infos = merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
+        observation = batch.observation(copy=self.copy) if copies is None else batch.observation_of_some(copies)
+        return observation, batch.reward.copy()[rows], batch.terminated.copy()[rows], truncated[rows], infos
 
 
 def _call_in_process(pid: int, function: Callable[[], None]) -> None:

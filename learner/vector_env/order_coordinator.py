@@ -90,9 +90,7 @@ class OrderCoordinator(Coordinator[Member]):
         """Raise `EnvironmentFailed` if an environment raised."""
         if self.failures:
             failure, self.failures = self.failures[0], []
-            error = EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
-            error.add_note(failure.traceback)
-            raise error
+            raise EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
 
     def forget(self, lane: int) -> None:
         """Forget the answer to the last order of one lane; the caller has taken it."""

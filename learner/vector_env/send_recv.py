@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
 from learner.vector_env.batch_arrays import BatchArrays
@@ -225,7 +224,7 @@ class SendRecv:
         parts, lost_lanes = self._parts, self._parts.lost_lanes
         if not self._all_were_reset:
             if never := [n for n in parts.layout.copies_of(lanes) if not parts.ever_reset[n]]:
-                raise UsageError(f"step before reset of copies {never}: call reset(), or async_reset() and recv(), first")
+                raise UsageError(f"step before reset of copies {never}: call reset(), or reset_async() and recv(), first")
             self._all_were_reset = bool(parts.ever_reset.all())
         if parts.autoreset == "Disabled":
             over = parts.batch.terminated | parts.batch.truncated
@@ -234,13 +233,15 @@ class SendRecv:
                 n for n in parts.layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
             ]:
                 raise UsageError(
-                    f"copies {ended} have ended: autoreset_mode is Disabled, expected async_reset({ended}) or "
+                    f"copies {ended} have ended: autoreset_mode is Disabled, expected reset_async(env_ids={ended}) or "
                     "reset(options={'reset_mask': ended}) before the next step"
                 )
         awaiting = [lane for lane in lanes if lane in lost_lanes.awaiting_reset] if parts.on_worker_loss == "raise" else ()
         if awaiting:
             copies = parts.layout.copies_of(awaiting)
-            raise WorkerLost(f"lanes {awaiting} were lost with their worker; call reset() or async_reset({copies}) first")
+            raise WorkerLost(
+                f"lanes {awaiting} were lost with their worker; call reset() or reset_async(env_ids={copies}) first"
+            )
 
     def _asked_reset(self, lane: int, chosen: Sequence[int], seeds: Sequence[int | None], options: Options) -> AskedReset:
         rows = self._parts.layout.rows[lane]
@@ -312,13 +313,3 @@ class SendRecv:
     def _warn(self, lane: int, why: str) -> None:
         copies = self._parts.layout.copies(lane)
         log.warning("%s; its lane %d comes back truncated (copies %d to %d)", why, lane, copies[0], copies[-1])
-
-
-def numbered(env_ids: Any, num_envs: int) -> list[int]:
-    """The copies that `env_ids` names; None names all. Raises `TypeError` for what are not whole numbers."""
-    if env_ids is None:
-        return list(range(num_envs))
-    array = np.asarray(env_ids)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
-        raise TypeError(f"env_ids: expected a list of whole numbers, got {array.dtype}{list(array.shape)}")
-    return [int(n) for n in array]

@@ -10,9 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
 from learner.members.bind_settings import BindSettings
+from learner.vector_env.observation_mode import ObservationMode
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
@@ -31,6 +33,7 @@ class VectorEnvSettings:
     transport: Literal["ipc", "tcp", "inproc"] = "ipc"
     shared_memory: bool = True
     autoreset_mode: AutoresetMode | str = "NextStep"
+    observation_mode: ObservationMode = "same"
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
     timeout_s: float = 60.0
     worker_timeout_s: float = 5.0
@@ -57,6 +60,9 @@ class VectorEnvSettings:
             raise UsageError(f"workers: expected at least 0, got {self.workers}")
         if self.max_env_failures < 0:
             raise UsageError(f"max_env_failures: expected at least 0, got {self.max_env_failures}")
+        mode = self.observation_mode
+        if isinstance(mode, tuple) and [isinstance(space, Space) for space in mode] != [True, True]:
+            raise UsageError(f"observation_mode: expected the spaces of the batch and of a single copy, got {mode}")
 
     @property
     def envs(self) -> list[EnvLike | EnvSpec]:

@@ -58,6 +58,34 @@ def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
     return mask, {key: value for key, value in options.items() if key != "reset_mask"}
 
 
+def reset_arguments(
+    env_ids: Any, seed: int | Sequence[int | None] | None, options: Options, num_envs: int
+) -> tuple[list[int], list[int | None], Options]:
+    """The copies to reset, the seed of each copy there is, and the options without a mask.
+
+    Raises as `seed_list`, `take_reset_mask` and `numbered`, and `ValueError` if both `env_ids` and a mask choose copies.
+    """
+    mask, options_without = take_reset_mask(options, num_envs)
+    if env_ids is None:
+        return np.flatnonzero(mask).tolist(), seed_list(seed, num_envs), options_without
+    if options_without is not options:
+        raise ValueError("reset: expected env_ids or options['reset_mask'], got both")
+    copies = numbered(env_ids, num_envs)
+    each = [int(seed) + n for n in copies] if isinstance(seed, int | np.integer) else seed
+    by_copy = dict(zip(copies, seed_list(each, len(copies)), strict=True))
+    return copies, [by_copy.get(n) for n in range(num_envs)], options
+
+
+def numbered(env_ids: Any, num_envs: int) -> list[int]:
+    """The copies that `env_ids` names; None names all. Raises `TypeError` for what are not whole numbers."""
+    if env_ids is None:
+        return list(range(num_envs))
+    array = np.asarray(env_ids)
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise TypeError(f"env_ids: expected a list of whole numbers, got {array.dtype}{list(array.shape)}")
+    return [int(n) for n in array]
+
+
 def action_arrays(
     actions: Any, read: Callable[[Any], tuple[Any, ...]], leaves: Sequence[Leaf], num_envs: int
 ) -> tuple[list[Array], bool]:

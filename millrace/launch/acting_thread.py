@@ -65,7 +65,7 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
     def stepping() -> list[Member]:
         return list(env.hub.coordinator.members.values())
 
-    processes = ProcessCallbacks(ended, thread.activities, lambda: env.workers, stepping=stepping, expected=expected)
+    processes = ProcessCallbacks(ended, thread.activities, lambda: len(stepping()), stepping=stepping, expected=expected)
     env.hub.on_death = processes.failed.append
     return processes
 
@@ -109,7 +109,7 @@ class _BeforeWaits:
     def _during(self, pulse: Pulse) -> None:
         pulse()
         now = monotonic()
-        if self._env.workers:
+        if self._env.hub.coordinator.members:
             self._there_s = now
         elif now - self._there_s > self._timeout_s:
             raise self._env.hub.no_workers(self._timeout_s)

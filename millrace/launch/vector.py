@@ -22,6 +22,7 @@ from learner.members.describe_coordinator import Accept, accept_any
 from learner.members.events import Failed
 from learner.members.failure_count import FailureCount
 from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.observation_mode import ObservationMode, observation_spaces
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.shared_steps import SharedSteps
 from learner.vector_env.spec import RequestedCopies, requested_copies
@@ -35,7 +36,7 @@ from protocol.cpu_cores import usable_cores
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
-from protocol.errors import EnvironmentFailed, UsageError
+from protocol.errors import UsageError
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
 from workers.supervise.supervisor import timeout_flags
@@ -60,6 +61,7 @@ def make_vec(
     transport: Literal["ipc", "tcp", "inproc"] = "ipc",
     shared_memory: bool = True,
     autoreset_mode: AutoresetMode | str = "NextStep",
+    observation_mode: ObservationMode = "same",
     on_worker_loss: Literal["truncate", "raise"] = "truncate",
     timeout: float = 60.0,
     max_env_failures: int = 3,
@@ -88,6 +90,8 @@ def make_vec(
             which then runs the environment. Otherwise only workers do.
         shared_memory: local workers get actions and return results through shared memory. It is faster; results are equal.
         autoreset_mode: as in gymnasium: "NextStep", "SameStep" or "Disabled".
+        observation_mode: as in gymnasium: with "different", the bounds of observations may differ between env copies, and a
+            tuple has the observation spaces of the batch and of a single copy.
         on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
             and continues with new copies on another worker. "raise" raises `WorkerLost`.
         timeout: seconds that a worker may take to answer; then it is given up.
@@ -127,6 +131,7 @@ def make_vec(
         transport=transport,
         shared_memory=shared_memory,
         autoreset_mode=autoreset_mode,
+        observation_mode=observation_mode,
         on_worker_loss=on_worker_loss,
         timeout_s=timeout,
         max_env_failures=max_env_failures,
@@ -159,12 +164,12 @@ def make_vec(
         made.hub.on_death = died
         made.hub.while_waiting = deaths.check
         made.hub.wait_for(local_workers or settings.lane_count, join_timeout_s)
-        made.calls.make((made.single_observation_space, made.single_action_space))
+        spaces = made.single_observation_space, made.single_action_space
+        found = observation_spaces(settings.observation_mode, spaces, made.calls.make())
+        made.single_observation_space, made.observation_space = found
         return made
-    except BaseException as error:
+    except BaseException:
         resources.close()
-        if isinstance(error, EnvironmentFailed) and error.detail:
-            error.add_note(error.detail)
         raise
 
 

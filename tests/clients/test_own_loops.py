@@ -73,7 +73,7 @@ def test_the_vector_environment_over_js_clients(clients: Clients) -> None:
         for step in range(1, 51):
             *_, truncated, _ = envs.step(np.zeros(4, np.int64))
             assert truncated.tolist() == [step == 50] * 4
-        envs.async_reset(seed=1)
+        envs.reset_async(seed=1)
         for _ in range(20):
             obs, *_, infos = envs.recv()
             assert len(infos["env_id"]) in (2, 4)

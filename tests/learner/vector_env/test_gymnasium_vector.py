@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -125,6 +125,32 @@ def test_bounds_that_differ_by_rounding_are_the_same() -> None:
     makes = [partial(with_spaces, BOX, DISCRETE), partial(with_spaces, near, DISCRETE)]
     inproc(makes, None).close()
     SyncVectorEnv(makes).close()
+
+
+@pytest.mark.parametrize("mode", ["different", (spaces.Box(-9, 9, (3, 2), np.float64), spaces.Box(-9, 9, (2,), np.float64))])
+def test_bounds_of_observations_may_differ_with_another_observation_mode(mode: Any) -> None:
+    class AtItsBound(gymnasium.Env[Any, Any]):
+        def __init__(self, bound: float) -> None:
+            self.observation_space, self.action_space = spaces.Box(-bound, bound, (2,), np.float64), DISCRETE
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+            return self.observation_space.high, {}
+
+    makes = [partial(AtItsBound, bound) for bound in (1.0, 2.0, 3.0)]
+    theirs = SyncVectorEnv(makes, observation_mode=mode)
+    with inproc(makes, None, observation_mode=mode) as ours:
+        assert ours.observation_space == theirs.observation_space
+        assert ours.single_observation_space == theirs.single_observation_space
+        assert bit_equal(ours.reset()[0], theirs.reset()[0])
+    theirs.close()
+
+
+@pytest.mark.parametrize("mode", ["different", (spaces.Box(-9, 9, (2, 3)), spaces.Box(-9, 9, (3,)))])
+def test_shapes_and_action_spaces_do_not_differ_in_any_observation_mode(mode: Any) -> None:
+    for observation, action in (spaces.Box(-1, 1, (3,), np.float64), DISCRETE), (BOX, spaces.Discrete(3)):
+        makes = [partial(with_spaces, BOX, DISCRETE), partial(with_spaces, observation, action)]
+        with pytest.raises(EnvironmentFailed, match="all copies must have the same"):
+            inproc(makes, None, observation_mode=mode)
 
 
 def test_the_metadata_of_the_environment_is_not_changed() -> None:
@@ -269,18 +295,47 @@ METHODS: dict[str, Callable[[ZmqVectorEnv], object]] = {
     "set_attr": lambda env: env.set_attr("gravity", 1.0),
     "render": lambda env: env.render(),
     "step_wait": lambda env: env.step_wait(),
+    "reset_async": lambda env: env.reset_async(),
+    "reset_wait": lambda env: env.reset_wait(),
 }
 
 
-def test_while_a_step_is_pending_other_calls_are_refused() -> None:
+@pytest.mark.parametrize("pending", ["step", "reset"])
+def test_while_a_step_or_a_reset_is_pending_other_calls_are_refused(pending: str) -> None:
     with inproc("CartPole-v1") as env:
-        env.reset(seed=1)
-        env.step_async(np.zeros(3, np.int64))
+        first = env.reset(seed=1)
+        if pending == "step":
+            env.step_async(np.zeros(3, np.int64))
+        else:
+            env.reset_async(seed=1)
         for name, method in METHODS.items():
-            if name != "step_wait":
-                with pytest.raises(AlreadyPendingCallError, match="a step is pending"):
+            if not name.endswith("_wait"):
+                with pytest.raises(AlreadyPendingCallError, match=f"a {pending} is pending|have not come back"):
                     method(env)
-        assert env.step_wait()[1].tolist() == [1.0] * 3, "the refused calls must not disturb the step"
+            elif name != f"{pending}_wait":
+                with pytest.raises(NoAsyncCallError):
+                    method(env)
+        if pending == "step":
+            assert env.step_wait()[1].tolist() == [1.0] * 3, "the refused calls must not disturb the step"
+        else:
+            assert bit_equal(env.reset_wait(), first), "the refused calls must not disturb the reset"
+
+
+def test_what_was_received_after_reset_async_is_not_waited_for_again() -> None:
+    with millrace.make_vec("CartPole-v1", 3, workers=1, lanes=3, transport="inproc") as env:
+        env.reset_async(seed=1)
+        assert len(env.recv(2)[1]) >= 2
+        with pytest.raises(NoAsyncCallError, match="reset_wait without reset_async before it"):
+            env.reset_wait()
+        while env.outstanding:
+            env.recv()
+        env.reset_async(env_ids=[1])
+        env.send(np.zeros(2, np.int64), [0, 2])
+        with pytest.raises(NoAsyncCallError):
+            env.reset_wait()
+        assert env.recv(3)[1].tolist() == [1.0, 0.0, 1.0]
+        with pytest.raises(ValueError, match=r"expected env_ids or options\['reset_mask'\], got both"):
+            env.reset_async(options={"reset_mask": np.ones(3, bool)}, env_ids=[1])
 
 
 @pytest.mark.parametrize("pending", [False, True])

@@ -77,7 +77,7 @@ def rows_apart(env: ZmqVectorEnv, actions: Sequence[Any], draw: Any) -> list[lis
         disabled = env.autoreset_mode is AutoresetMode.DISABLED
         return [n for n in layout.copies(lane) if disabled and (found[n][-1].terminated or found[n][-1].truncated)]
 
-    env.async_reset(seed=5)
+    env.reset_async(seed=5)
     while env.outstanding or any(sent[lane] < len(actions) or ended(lane) for lane in idle):
         if env.outstanding:
             for n, row in received(env, draw(0 if idle else 1, len(env.outstanding))).items():
@@ -85,7 +85,7 @@ def rows_apart(env: ZmqVectorEnv, actions: Sequence[Any], draw: Any) -> list[lis
                 idle.add(layout.lane_of(n))
         for lane in sorted(idle):
             if (over := ended(lane)) and draw(0, 1):
-                env.async_reset(over)
+                env.reset_async(env_ids=over)
                 idle.remove(lane)
         ready = [lane for lane in sorted(idle) if sent[lane] < len(actions) and not ended(lane)]
         chosen = ready[draw(0, len(ready)) :]
@@ -131,7 +131,7 @@ def test_actions_go_to_their_copies_also_where_shared_memory_would_round_them(sh
     with made("Pendulum-v1", 2, 2, 2, shared=shared) as (env, link):
         theirs = SyncVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
         theirs.reset(seed=1)
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(2)
         kept = []
         for t in range(6):
@@ -147,7 +147,7 @@ def test_actions_go_to_their_copies_also_where_shared_memory_would_round_them(sh
 
 def test_a_worker_wakes_the_learner_when_its_lane_is_done_although_others_are_not() -> None:
     with made() as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.frozen = {"w0", "w2"}
         send(env, [0, 1, 2])
@@ -182,7 +182,7 @@ def send(env: ZmqVectorEnv, ids: Sequence[int]) -> None:
 @BOTH_WAYS
 def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_results(shared: bool) -> None:
     with made(shared=shared) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
         env.recv(3)
@@ -207,7 +207,7 @@ def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_res
 @BOTH_WAYS
 def test_a_worker_lost_while_its_copies_are_here_is_reported_for_the_next_step(shared: bool) -> None:
     with made(shared=shared) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.leave("w2")
         send(env, [0, 2])
@@ -220,12 +220,12 @@ def test_a_worker_lost_while_its_copies_are_here_is_reported_for_the_next_step(s
 
 def test_a_copy_that_is_reset_after_its_loss_is_not_reported() -> None:
     with made(shared=False) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.leave("w2")
         send(env, [0])
         env.recv()  # hears of the loss
-        env.async_reset([2])
+        env.reset_async(env_ids=[2])
         assert received(env)[2].observation == 1.0
         send(env, [2])
         row = received(env)[2]
@@ -244,7 +244,7 @@ def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for
         with pytest.raises(InterruptedError):
             env.step_wait()
         env.hub.while_waiting = lambda: None
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         link.frozen = set()
         abandoned = [0, 0, 0]
         link.choose = lambda count: abandoned.pop() if abandoned else count - 1  # only the old orders at first
@@ -254,7 +254,7 @@ def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for
 @BOTH_WAYS
 def test_results_that_came_before_the_loss_are_returned_first(shared: bool) -> None:
     with made(shared=shared) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
         link.frozen = {"w0"}
@@ -271,7 +271,7 @@ def test_results_that_came_before_the_loss_are_returned_first(shared: bool) -> N
 @BOTH_WAYS
 def test_with_same_step_the_row_of_a_lost_copy_has_its_last_observation_and_a_new_first_one(shared: bool) -> None:
     with made(shared=shared, autoreset_mode=SAME) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
         env.recv(3)
@@ -292,15 +292,15 @@ def test_with_same_step_the_row_of_a_lost_copy_has_its_last_observation_and_a_ne
 
 def test_with_disabled_the_caller_resets_a_lost_copy() -> None:
     with made(autoreset_mode=DISABLED) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.frozen = {"w1"}
         send(env, [1])
         link.leave("w1")
         assert received(env)[1].truncated
-        with pytest.raises(UsageError, match=r"copies \[1\] have ended: .* expected async_reset\(\[1\]\) or reset"):
+        with pytest.raises(UsageError, match=r"copies \[1\] have ended: .* expected reset_async\(env_ids=\[1\]\) or reset"):
             send(env, [1])
-        env.async_reset([1])
+        env.reset_async(env_ids=[1])
         assert received(env)[1].observation == 1.0
         send(env, [1])
         assert received(env)[1].observation == np.float32(0.8)
@@ -309,7 +309,7 @@ def test_with_disabled_the_caller_resets_a_lost_copy() -> None:
 def test_a_reset_is_repeated_when_its_worker_is_lost() -> None:
     with made() as (env, link):
         link.frozen = {"w1"}
-        env.async_reset(seed=7)
+        env.reset_async(seed=7)
         assert sorted(received(env, 2)) == [0, 2]
         link.leave("w1")
         row = received(env)[1]
@@ -328,7 +328,7 @@ def test_copies_are_made_again_when_a_worker_is_lost_over_it() -> None:
                 link.leave(leaving.pop())
 
         env.hub.while_waiting = watch
-        env.calls.make((env.single_observation_space, env.single_action_space))
+        env.calls.make()
         env.reset(seed=7)
         assert not env.step(np.zeros((3, 1), np.float32))[3].any(), "no episode had begun"
 
@@ -336,7 +336,7 @@ def test_copies_are_made_again_when_a_worker_is_lost_over_it() -> None:
 def test_after_three_lost_resets_the_loss_is_raised() -> None:
     with made(copies=1, lanes=1, workers=4) as (env, link):
         link.frozen = {f"w{n}" for n in range(4)}
-        env.async_reset(seed=7)
+        env.reset_async(seed=7)
         for n in range(3):
             assert not env.recv(0)[1].size
             link.leave(f"w{n}")
@@ -344,18 +344,18 @@ def test_after_three_lost_resets_the_loss_is_raised() -> None:
             env.recv()
         assert env.outstanding == []
         link.frozen = set()
-        env.async_reset([0], seed=7)
+        env.reset_async(env_ids=[0], seed=7)
         assert received(env)[0].observation == 1.0
 
 
 def test_copies_of_a_lane_that_were_not_asked_for_a_reset_are_reported_when_it_is_lost() -> None:
     with made(copies=2, lanes=1, workers=2, autoreset_mode=DISABLED) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(2)
         send(env, [0, 1])
         env.recv(2)
         link.frozen = {"w0"}
-        env.async_reset([1])
+        env.reset_async(env_ids=[1])
         link.leave("w0")
         assert {n: row.observation for n, row in received(env).items()} == {1: 1.0}
         send(env, [0, 1])
@@ -400,7 +400,7 @@ def test_copies_that_were_lost_are_reset_together_with_same_step_autoreset() -> 
         with pytest.raises(UsageError, match=expected):
             env.reset(options={"reset_mask": np.array([False, True])})
         with pytest.raises(UsageError, match=expected):
-            env.async_reset([1])
+            env.reset_async(env_ids=[1])
         env.reset(options={"reset_mask": np.array([True, True])})
         assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
         env.reset(options={"reset_mask": np.array([False, True])})  # of copies that were reset since
@@ -428,7 +428,7 @@ def test_a_loss_that_a_call_has_raised_is_over_when_its_copies_are_reset(loss: s
 
 
 def test_a_loss_that_a_call_has_raised_is_not_raised_anew_by_a_step() -> None:
-    again = r"^lanes \[0\] were lost with their worker; call reset\(\) or async_reset\(\[0\]\) first$"
+    again = r"^lanes \[0\] were lost with their worker; call reset\(\) or reset_async\(env_ids=\[0\]\) first$"
     with loses_w0_in_a_call("raise") as env, pytest.raises(WorkerLost, match=again):
         env.step(zeros([0, 1]))
 
@@ -440,7 +440,7 @@ def test_with_truncate_the_step_after_a_call_that_lost_a_worker_truncates() -> N
 
 def test_with_raise_recv_names_the_lost_copies_once_and_the_others_can_be_received() -> None:
     with made(on_worker_loss="raise") as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.frozen = {"w1"}
         send(env, [0, 1, 2])
@@ -450,10 +450,11 @@ def test_with_raise_recv_names_the_lost_copies_once_and_the_others_can_be_receiv
         assert env.outstanding == [0, 2]
         assert sorted(received(env, 2)) == [0, 2]
         with pytest.raises(
-            WorkerLost, match=r"lanes \[1\] were lost with their worker; call reset\(\) or async_reset\(\[1\]\) first"
+            WorkerLost,
+            match=r"lanes \[1\] were lost with their worker; call reset\(\) or reset_async\(env_ids=\[1\]\) first",
         ):
             send(env, [1])
-        env.async_reset([1])
+        env.reset_async(env_ids=[1])
         assert received(env)[1].observation == 1.0
         send(env, [1])
         assert received(env)[1].observation == np.float32(0.8)
@@ -462,7 +463,7 @@ def test_with_raise_recv_names_the_lost_copies_once_and_the_others_can_be_receiv
 @BOTH_WAYS
 def test_a_worker_that_takes_too_long_is_given_up_while_the_others_go_on(shared: bool) -> None:
     with made(shared=shared, timeout_s=10.0) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
         link.frozen = {"w1"}
@@ -481,7 +482,7 @@ def test_a_worker_that_takes_too_long_is_given_up_while_the_others_go_on(shared:
 
 def test_time_in_which_the_caller_did_other_things_counts_little() -> None:
     with made(timeout_s=10.0) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.frozen = {"w1"}
         send(env, [0, 1, 2])
@@ -494,7 +495,7 @@ def test_time_in_which_the_caller_did_other_things_counts_little() -> None:
 
 def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> None:
     with made("workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
         env.recv(3)
@@ -512,7 +513,7 @@ def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> 
 def test_without_any_worker_the_wait_ends_and_goes_on_when_one_joins() -> None:
     with made(copies=1, lanes=1, workers=1, timeout_s=5.0) as (env, link):
         link.leave("w0")
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         with pytest.raises(NoWorkers, match="waited 5 s for 1 worker"):
             env.recv()
         assert env.outstanding == [0]
@@ -522,7 +523,7 @@ def test_without_any_worker_the_wait_ends_and_goes_on_when_one_joins() -> None:
 
 def test_long_infos_come_with_their_step_and_a_loss_before_they_came_is_reported_later() -> None:
     with made(INFORMS, 1, 1, 1, kwargs={"wordy": 1_500_000}) as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv()
         action = {"move": np.zeros((1, 2), np.float32), "pick": np.zeros(1, np.int64)}
         env.send(action)
@@ -546,9 +547,9 @@ def test_wrong_arguments_are_refused_in_one_line_and_nothing_is_sent() -> None:
     with made(copies=4, lanes=2, workers=2) as (env, link):
         with pytest.raises(NoAsyncCallError, match="recv without send"):
             env.recv()
-        with pytest.raises(UsageError, match=r"step before reset of copies \[0, 1, 2, 3\]: call reset\(\), or async_reset"):
+        with pytest.raises(UsageError, match=r"step before reset of copies \[0, 1, 2, 3\]: call reset\(\), or reset_async"):
             env.send(zeros(range(4)))
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         for many in (5, -1):
             with pytest.raises(ValueError, match=f"min_envs: expected 0 to 4, the copies that .*; got {many}"):
                 env.recv(many)
@@ -568,11 +569,11 @@ def test_wrong_arguments_are_refused_in_one_line_and_nothing_is_sent() -> None:
         with pytest.raises(ValueError, match="actions: expected one for each of 2 copies"):
             env.send(zeros(range(4)), [0, 1])
         with pytest.raises(ValueError, match="env_ids: expected different numbers"):
-            env.async_reset([2, 2])
+            env.reset_async(env_ids=[2, 2])
         with pytest.raises(ValueError, match="seed: expected one for each of 2 copies, got 3"):
-            env.async_reset([2, 3], seed=[1, 2, 3])
+            env.reset_async(env_ids=[2, 3], seed=[1, 2, 3])
         with pytest.raises(TypeError):
-            env.async_reset(options={"what": object()})
+            env.reset_async(options={"what": object()})
         assert env.outstanding == []
         assert len(link.orders) == 2
 
@@ -586,26 +587,26 @@ def test_lock_step_and_send_do_not_mix() -> None:
         for call in (step, env.reset, attribute, partial(env.call, "level")):
             with pytest.raises(AlreadyPendingCallError, match=r"while copies \[1\] have not .* expected recv\(\) first"):
                 call()
-        for again in (partial(send, env, [0, 1]), partial(env.async_reset, [1])):
+        for again in (partial(send, env, [0, 1]), partial(env.reset_async, env_ids=[1])):
             with pytest.raises(AlreadyPendingCallError, match=r"copies \[1\] have not come back: expected recv\(\)"):
                 again()
         assert env.get_attr("spec") == (env.spec,) * 3
         assert sorted(received(env)) == [1]
         env.step_async(zeros(range(3)))
-        for call in (env.recv, partial(send, env, [0]), env.async_reset):
+        for call in (env.recv, partial(send, env, [0]), env.reset_async):
             with pytest.raises(AlreadyPendingCallError, match=r"while a step is pending: expected step_wait\(\) first"):
                 call()
         observation = env.step_wait()[0]
         assert observation[:, 0].tolist() == pytest.approx([0.8, 0.6, 0.8]), "each copy has made its own steps"
         env.close()
-        for call in (env.recv, partial(send, env, [0]), env.async_reset):
+        for call in (env.recv, partial(send, env, [0]), env.reset_async):
             with pytest.raises(ClosedEnvironmentError):
                 call()
 
 
 def test_what_a_watch_raises_ends_the_wait_and_loses_nothing() -> None:
     with made() as (env, link):
-        env.async_reset(seed=1)
+        env.reset_async(seed=1)
         env.recv(3)
         link.frozen = {"w0", "w1", "w2"}
         send(env, [0, 1, 2])

@@ -258,6 +258,8 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "insecure": True, "keys": "k"}, "got both"),
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "advertise": "host:7"}, "expected an IPv6 address in brackets"),
         ({"autoreset_mode": "Never"}, "autoreset_mode: expected"),
+        ({"observation_mode": "other"}, "observation_mode: expected one of same, different or a tuple, got 'other'"),
+        ({"observation_mode": (1, 2)}, "observation_mode: expected the spaces of the batch and of a single copy, got "),
         ({"timeout": 0}, "^timeout: expected a number of seconds above 0, got 0$"),
         ({"timeout": -1.0}, "^timeout: expected a number of seconds above 0, got -1.0$"),
         ({"timeout": float("nan")}, "^timeout: expected a number of seconds above 0, got nan$"),
@@ -332,7 +334,7 @@ calls = st.lists(
         st.tuples(st.just("step"), st.integers(1, 4)),
         st.tuples(st.just("step_async"), st.none()),
         st.tuples(st.just("send"), st.tuples(st.permutations([(0, 1), (2,)]), st.integers(0, 3))),
-        st.tuples(st.just("reset"), st.tuples(seeds, options)),
+        st.tuples(st.sampled_from(["reset", "reset_async"]), st.tuples(seeds, options)),
         st.tuples(st.just("mask"), st.tuples(seeds, options, masks)),
         st.tuples(st.just("call"), st.tuples(st.text(max_size=3), st.integers(0, 2))),
         st.tuples(st.just("set_attr"), st.integers(-3, 3) | st.lists(st.integers(-3, 3), min_size=3, max_size=3)),
@@ -405,6 +407,10 @@ def play_sequence(
             case "reset":
                 same("reset", seed=value[0], options=value[1])
                 ended[:] = False
+            case "reset_async":
+                ours.reset_async(value[0], value[1])
+                assert bit_equal(ours.reset_wait(), theirs.reset(seed=value[0], options=value[1]))
+                ended[:] = False
             case "mask":
                 seed_argument, other_options, mask = value
                 same("reset", seed=seed_argument, options={"reset_mask": np.array(mask), **(other_options or {})})
@@ -424,7 +430,7 @@ def test_with_more_lanes_than_workers_all_lanes_are_placed_at_once() -> None:
     env = millrace.make_vec("CartPole-v1", 4, workers=1, lanes=4, timeout=5)
     env.reset(seed=1)  # within the deadline, which is shorter than that wait
     assert env.step(np.zeros(4, np.int64))[1].tolist() == [1.0] * 4
-    assert env.workers == 1
+    assert len(env.hub.coordinator.members) == 1
     env.close()
 
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -297,4 +298,5 @@ def test_a_vector_environment_that_cannot_be_made_raises_with_the_worker_s_trace
     with pytest.raises(EnvironmentFailed, match="Broken cannot be made: OSError: no display") as caught:
         millrace.make_vec(Broken, 2, workers=1)
     assert "raise OSError" in caught.value.detail
-    assert any("raise OSError" in note for note in caught.value.__notes__)
+    assert "raise OSError" in "".join(traceback.format_exception(caught.value))
+    assert repr(caught.value.__cause__) == "OSError('no display')"
