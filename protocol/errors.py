@@ -16,18 +16,19 @@
         ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the row format
 
-A message is one line: who, what, expected, got, what to do next.
+A message is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in no family: it is a cause.
 """
 
 from __future__ import annotations
 
+import builtins
 import difflib
 import errno
 import resource
 from collections.abc import Iterable, Sequence
+from itertools import dropwhile
 
-from protocol.bounds import one_line
-from protocol.worker_exception import worker_exception
+from protocol.bounds import escaped, one_line
 
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
@@ -173,6 +174,37 @@ class Stalled(RunError):
     ... except millrace.Stalled as error:
     ...     print(error)  # no worker made progress for a minute; the run can be resumed
     """
+
+
+class WorkerTraceback(Exception):
+    """The worker's traceback, shown in the place of this process's own, which does not have the frames."""
+
+    def __str__(self) -> str:
+        return f'\n"""\n{super().__str__()}\n"""'  # as the standard library shows that of another process
+
+
+def worker_exception(traceback: str) -> Exception | None:
+    """The exception of which a worker sent this traceback; None if it sent none. Its own cause is the `WorkerTraceback`.
+
+    Nothing is unpickled or imported for it, and it is shown without control characters. Only an exception of Python's own is
+    made again, by its name and with its message as the one argument; any other is a `WorkerTraceback`.
+    """
+    if not traceback:
+        return None
+    traceback = escaped(traceback).rstrip()
+    text, lines = WorkerTraceback(traceback), traceback.split("\n")
+    last_frame = max((n for n, line in enumerate(lines) if line.startswith('  File "')), default=len(lines))
+    raised = dropwhile(lambda line: line.startswith(" "), lines[last_frame:])
+    name, colon, message = "\n".join(raised).partition(": ")
+    kind = vars(builtins).get(name)
+    if not isinstance(kind, type) or not issubclass(kind, Exception):
+        return text
+    try:
+        error = kind(message) if colon else kind()
+    except TypeError:  # it takes other arguments, as UnicodeDecodeError does
+        return text
+    error.__cause__ = text
+    return error
 
 
 class EnvironmentFailed(RunError):

@@ -63,8 +63,8 @@ class CopyCalls:
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
         self._send_recv.call(orders)
-        ready = self._send_recv.recv_all()
-        return {lane.lane: lane.result for lane in ready if isinstance(lane.result, Returned)}
+        results = self._send_recv.recv_all().results
+        return {lane: result for lane, result in results.items() if isinstance(result, Returned)}
 
 
 def call_orders(

@@ -24,7 +24,7 @@ from learner.vector_env.calls import CopyCalls
 from learner.vector_env.infos import InfoReader, merged
 from learner.vector_env.lost_lanes import LostLanes
 from learner.vector_env.send_recv import SendRecv, VectorEnvParts
-from learner.vector_env.sent_lanes import Infos, ReadyLane
+from learner.vector_env.sent_lanes import Infos, Ready
 from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_arguments import Options, action_arrays, numbered, reset_arguments
 from learner.vector_env.step_hub import StepHub
@@ -188,8 +188,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """
         self._check_idle("recv", of_sent=True)
         self._state = AsyncState.DEFAULT
-        ready = self._send_recv.recv(min_envs, timeout)
-        copies = [n for lane in ready for n in lane.copies]
+        ready, copies = self._send_recv.recv(min_envs, timeout)
         rows = self._rows(ready, copies)
         rows[-1]["env_id"] = np.array(copies, np.int64)
         return rows
@@ -267,12 +266,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.DEFAULT
         return self._rows(self._send_recv.recv_all(timeout_s))
 
-    def _rows(self, ready: Sequence[ReadyLane], copies: list[int] | None = None) -> StepResult:
+    def _rows(self, ready: Ready, copies: list[int] | None = None) -> StepResult:
         """The rows of these copies, which came back, or of all."""
         batch, rows = self._batch, slice(None) if copies is None else copies
         truncated = batch.truncated.copy()
-        if lost := [n for lane in ready if lane.loss_infos for n in lane.loss_infos]:
-            truncated[lost] = True
+        truncated[list(ready.losses)] = True
         self.infos_by_copy = self._info_reader.by_copy(ready)
         infos = merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
         observation = batch.observation(copy=self.copy) if copies is None else batch.observation_of_some(copies)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 
 from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.sent_lanes import Infos, ReadyLane
+from learner.vector_env.sent_lanes import Infos, Ready
 from protocol.arrays import Array
 from protocol.errors import BadMessage
 from protocol.wire.plain_values import repr_paths, unpack
@@ -34,19 +34,17 @@ class InfoReader:
         self._layout, self._refuse = layout, refuse
         self._warned: set[str] = set()  # keys of infos that arrived as their repr
 
-    def by_copy(self, ready: Iterable[ReadyLane]) -> dict[int, Infos]:
+    def by_copy(self, ready: Ready) -> dict[int, Infos]:
         """The infos that are not empty, in the order of the copies."""
-        found: dict[int, Infos] = {}
-        for lane in ready:
-            if lane.loss_infos:
-                found |= {n: dict(info) for n, info in lane.loss_infos.items()}
-            if not isinstance(lane.result, bytes) or not lane.result:
+        found = dict(ready.losses)
+        for lane, packed in ready.results.items():
+            if not isinstance(packed, bytes) or not packed:
                 continue
             try:
-                for n, info in unpack_infos(lane.result, self._layout.copies(lane.lane)).items():
+                for n, info in unpack_infos(packed, self._layout.copies(lane)).items():
                     found[n] = found.get(n, {}) | info
             except BadMessage as error:
-                self._refuse(lane.lane, f"lane {lane.lane}: infos cannot be read: {error}")
+                self._refuse(lane, f"lane {lane}: infos cannot be read: {error}")
         if not found:
             return found
         for n in sorted(found):

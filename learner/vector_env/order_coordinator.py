@@ -64,7 +64,7 @@ class OrderCoordinator(Coordinator[Member]):
         self.answers: dict[int, Answer] = {}
         """Answers by lane, until the next orders."""
         self.shared_orders: dict[int, int] = {}
-        """Number of the newest order through shared memory, by lane."""
+        """Number of the order through shared memory that is under way, by lane."""
         self.infos: dict[int, bytes] = {}
         """Packed infos of such an order, by lane, if they came as a message."""
         self.lost: dict[int, str] = {}
@@ -170,7 +170,6 @@ class OrderCoordinator(Coordinator[Member]):
         for ticket in member.tickets:
             del self.orders[ticket]
         for lane in member.lanes:
-            self.shared_orders.pop(lane, None)
             if self.lanes[lane].started:
                 self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {why}"
         self._placement.removed(member)

@@ -19,12 +19,12 @@ from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import packed, step_order
 from learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
 from learner.vector_env.order_coordinator import MakeOrder
-from learner.vector_env.sent_lanes import AfterLoss, Asked, AskedReset, ReadyLane, Sent, SentLanes, WatchedTime, after_loss
+from learner.vector_env.sent_lanes import AfterLoss, Asked, AskedReset, Ready, Sent, SentLanes, WatchedTime, after_loss
 from learner.vector_env.step_arguments import Options
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array, Bools
 from protocol.errors import NoWorkers, UsageError, WorkerLost
-from protocol.messages import Answer, Returned
+from protocol.messages import Stepped
 
 log = logging.getLogger("millrace.learner")
 
@@ -60,14 +60,14 @@ class SendRecv:
         """`timeout_s`: how long a worker may take, if no other time is given."""
         self.timeout_s, self.closed = timeout_s, False
         self._parts = parts
-        self._sent = SentLanes()
+        self._sent = SentLanes(parts.layout)
         self._all_were_reset = False
         self._to_raise: dict[int, str] = {}  # lanes that were lost, and for which the caller gets an error
         self._watched = WatchedTime(parts.hub.now())
 
     def copies(self) -> list[int]:
         """The copies that have not come back."""
-        return self._sent.copies()
+        return self._sent.copies
 
     # ---------------------------------------------------------------- out
 
@@ -92,7 +92,7 @@ class SendRecv:
         parts.lost_lanes.forget(whole)
         now = self._watched.look(hub.now())
         for lane, reset in resets.items():
-            self._sent.send(lane, Sent([layout.copies(lane)[n] for n in reset.copies], now, reset))
+            self._sent.send([lane], Sent(reset, now))
             hub.send_order(lane, reset.order())
 
     def step(
@@ -114,9 +114,9 @@ class SendRecv:
         lost_lanes.add(hub.coordinator.take_lost())
         self._check_steppable(lanes)
         now, (arrays, fit), shared = self._watched.look(hub.now()), actions, []
-        unreported, awaiting_reset, asked = lost_lanes.unreported, lost_lanes.awaiting_reset, Asked.STEP
+        unreported, awaiting_reset = lost_lanes.unreported, lost_lanes.awaiting_reset
+        self._sent.send(lanes, Sent(Asked.STEP, now))
         for lane in lanes:
-            self._sent.send(lane, Sent(parts.layout.copies(lane), now, asked))
             if lane in unreported:
                 continue  # the loss is reported in its place
             if lane in awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
@@ -139,19 +139,19 @@ class SendRecv:
         """Send an order of its own to each of these lanes. The copies go on with their episodes."""
         self._check_back(orders)
         now = self._watched.look(self._parts.hub.now())
+        self._sent.send(orders, Sent(Asked.CALL, now))
         for lane, make in orders.items():
-            self._sent.send(lane, Sent((), now, Asked.CALL))
             self._parts.hub.send_order(lane, make)
 
     # ---------------------------------------------------------------- in
 
-    def recv(self, min_envs: int, timeout_s: float | None = None) -> Sequence[ReadyLane]:
-        """Wait until at least `min_envs` copies are ready, and take the lanes that are.
+    def recv(self, min_envs: int, timeout_s: float | None = None) -> tuple[Ready, list[int]]:
+        """Wait until at least `min_envs` copies are ready, and take the lanes that are, and the numbers of the copies.
 
         Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`; then lanes that are ready stay so for the next call.
         """
         sent, hub = self._sent, self._parts.hub
-        if not (out := sent.copies()):
+        if not (out := sent.copies):
             raise NoAsyncCallError("recv without send before it", "send")
         if not 0 <= min_envs <= len(out):
             raise ValueError(f"min_envs: expected 0 to {len(out)}, the copies that have not come back; got {min_envs}")
@@ -160,11 +160,11 @@ class SendRecv:
         while True:
             self.look(timeout_s)
             self._raise_losses()
-            if sent.ready_copies >= min_envs:
-                return sent.take()
+            if len(copies := sent.ready_copies) >= min_envs:
+                return sent.take(), copies
             hub.wait(timeout_s, together=False)
 
-    def recv_all(self, timeout_s: float | None = None) -> Sequence[ReadyLane]:
+    def recv_all(self, timeout_s: float | None = None) -> Ready:
         """Wait until every lane is ready, and take them. Raises as `recv`; then nothing is waited for any more."""
         sent, hub = self._sent, self._parts.hub
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
@@ -192,7 +192,7 @@ class SendRecv:
 
     def abandon(self) -> None:
         """Nothing is waited for any more. The caller knows of the lanes that were lost meanwhile."""
-        steps = [lane for lane, sent in self._sent.under_way.items() if sent.asked is Asked.STEP]
+        steps = [lane for lane in self._sent.under_way if self._sent.sent[lane].asked is Asked.STEP]
         self._to_raise.clear()
         self._parts.hub.forget(self._sent.clear())
         lost_lanes = self._parts.lost_lanes
@@ -255,17 +255,20 @@ class SendRecv:
 
     def _take_results(self) -> None:
         """Note which lanes are done."""
-        for lane, result in self._parts.hub.take(self._sent.under_way).items():
-            self._sent.ready(lane, result if isinstance(result, bytes | Returned) else self._stored(lane, result))
+        self._sent.ready(
+            {
+                lane: self._stored(lane, result) if isinstance(result, Stepped) else result
+                for lane, result in self._parts.hub.take().items()
+            }
+        )
 
-    def _stored(self, lane: int, answer: Answer) -> bytes:
+    def _stored(self, lane: int, answer: Stepped) -> bytes:
         """Write results that came as a message to the batch. Packed infos."""
-        parts, sent = self._parts, self._sent.under_way[lane]
-        assert not isinstance(answer, Returned)
+        parts, asked = self._parts, self._sent.sent[lane].asked
         parts.batch.store(lane, answer)
         parts.lost_lanes.answered({lane})
-        if isinstance(sent.asked, AskedReset):
-            parts.ever_reset[list(sent.copies)] = True
+        if isinstance(asked, AskedReset):
+            parts.ever_reset[parts.layout.rows[lane]][list(asked.copies)] = True
         return bytes(answer.infos.data)
 
     def _give_up_late(self, timeout_s: float) -> None:
@@ -282,15 +285,15 @@ class SendRecv:
         """What becomes of the lanes that were lost while they were under way."""
         parts, sent = self._parts, self._sent
         parts.lost_lanes.add(parts.hub.coordinator.take_lost())
-        lost = [lane for lane in parts.lost_lanes.unreported if lane in sent.under_way and not parts.hub.is_ordered(lane)]
-        for lane in lost:
-            copies, asked = parts.layout.copies(lane), sent.under_way[lane].asked
-            match after_loss(sent.under_way[lane], parts.autoreset, parts.on_worker_loss):
+        unreported, under_way = parts.lost_lanes.unreported, sent.under_way if parts.lost_lanes.unreported else ()
+        for lane in [lane for lane in unreported if lane in under_way and not parts.hub.is_ordered(lane)]:
+            copies, asked = parts.layout.copies(lane), sent.sent[lane].asked
+            match after_loss(sent.sent[lane], parts.autoreset, parts.on_worker_loss):
                 case AfterLoss.RAISE:
                     self._to_raise[lane] = parts.lost_lanes.unreported[lane]
                     if asked is not Asked.CALL or parts.on_worker_loss == "raise":
                         parts.lost_lanes.report([lane])  # else the next step reports it too: the caller may go on
-                    sent.drop([lane])
+                    sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)
                     if len(asked.copies) == len(copies):

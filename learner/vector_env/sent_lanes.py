@@ -6,11 +6,12 @@ no other order, so that nothing overwrites its results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal
 
+from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import reset_order
 from learner.vector_env.lost_lanes import RESET_ATTEMPTS
 from learner.vector_env.order_coordinator import MakeOrder
@@ -43,31 +44,26 @@ class Asked(Enum):
     CALL = 1
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Sent:
-    """What was asked of a lane."""
+    """What was asked of a lane, or of several alike."""
 
-    copies: Sequence[int]
-    """the copies that come back, numbered as in the whole batch"""
-    since_s: float
     asked: AskedReset | Asked
+    since_s: float
     attempts: int = 1
     """how often a reset was sent"""
     last_observations: Mapping[int, Any] | None = None
     """Of copies that were lost and whose episodes end with these observations, while their new copies are reset."""
 
 
-@dataclass(slots=True)
-class ReadyLane:
-    """A lane that comes back. Its observations, rewards and episode ends are in the batch."""
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The lanes that come back together. Their observations, rewards and episode ends are in the batch."""
 
-    lane: int
-    copies: Sequence[int]
-    """the copies that come back, numbered as in the whole batch"""
-    result: bytes | Returned = b""
-    """packed infos, or what a call returned"""
-    loss_infos: Mapping[int, Infos] | None = None
-    """of copies that come back truncated, because their worker was lost"""
+    results: Mapping[int, bytes | Returned]
+    """by lane, in ascending order: packed infos, or what a call returned"""
+    losses: Mapping[int, Infos]
+    """by copy: infos of those that come back truncated, because their worker was lost"""
 
 
 class AfterLoss(Enum):
@@ -97,83 +93,91 @@ def after_loss(
 class SentLanes:
     """The lanes that were sent an order: those that are under way, and those that are ready to come back."""
 
-    def __init__(self) -> None:
-        self._under_way: dict[int, Sent] = {}
-        self._ready: dict[int, ReadyLane] = {}
+    def __init__(self, layout: BatchLayout) -> None:
+        self._layout = layout
+        self.sent: dict[int, Sent] = {}
+        """by lane: what the lanes that have not come back were asked for"""
+        self._results: dict[int, bytes | Returned] = {}  # of those that are ready
+        self._losses: dict[int, Infos] = {}  # by copy, of those that are ready
 
     @property
-    def under_way(self) -> Mapping[int, Sent]:
-        """Lanes that are not ready, and what they were asked for."""
-        return self._under_way
+    def under_way(self) -> list[int]:
+        """Lanes that are not ready."""
+        return [lane for lane in self.sent if lane not in self._results]
 
     @property
-    def ready_copies(self) -> int:
-        """Number of copies that `take` would return."""
-        return sum(len(ready.copies) for ready in self._ready.values())
-
     def copies(self) -> list[int]:
         """The copies that have not come back, in ascending order."""
-        lanes: list[Sent | ReadyLane] = [*self._under_way.values(), *self._ready.values()]
-        return sorted(n for lane in lanes for n in lane.copies)
+        return self._copies(sorted(self.sent))
+
+    @property
+    def ready_copies(self) -> list[int]:
+        """The copies that `take` would return, in ascending order."""
+        return self._copies(sorted(self._results))
 
     def among(self, lanes: Iterable[int]) -> list[int]:
         """Those of these lanes that have not come back."""
-        return [lane for lane in lanes if lane in self._under_way or lane in self._ready]
+        return [lane for lane in lanes if lane in self.sent]
 
-    def send(self, lane: int, sent: Sent) -> None:
-        """The lane was sent an order. Raises `ValueError` if an earlier one has not come back."""
-        if lane in self._under_way or lane in self._ready:
-            raise ValueError(f"lane {lane}: expected one that has come back, got one that has not")
-        self._under_way[lane] = sent
+    def send(self, lanes: Iterable[int], sent: Sent) -> None:
+        """These lanes were sent an order. Raises `ValueError` if an earlier one of theirs has not come back."""
+        if early := self.among(lanes):
+            raise ValueError(f"lanes {early}: expected some that have come back, got some that have not")
+        self.sent |= dict.fromkeys(lanes, sent)
 
     def reset_instead(self, lane: int, reset: AskedReset, now: float, last_observations: Mapping[int, Any]) -> None:
         """The lane was lost: its new copies are reset before it comes back."""
-        sent = self._under_way[lane]
+        sent = self.sent[lane]
         again = 1 if sent.asked is Asked.STEP else sent.attempts + 1
-        kept = last_observations or sent.last_observations
-        self._under_way[lane] = replace(sent, asked=reset, attempts=again, since_s=now, last_observations=kept)
+        self.sent[lane] = Sent(reset, now, again, last_observations or sent.last_observations)
 
     def start_again(self, now: float) -> None:
         """From now on, every lane that is under way has its whole time again."""
-        self._under_way = {lane: replace(sent, since_s=now) for lane, sent in self._under_way.items()}
+        self.sent = {lane: replace(sent, since_s=now) for lane, sent in self.sent.items()}
 
-    def ready(self, lane: int, result: bytes | Returned) -> None:
-        """The lane has its results."""
-        sent = self._under_way.pop(lane)
-        if not sent.last_observations:
-            self._ready[lane] = ReadyLane(lane, sent.copies, result)
-            return
-        losses: dict[int, Infos] = {
-            n: {"worker_lost": True, "final_obs": last, "final_info": {"worker_lost": True}}
-            for n, last in sent.last_observations.items()
-        }
-        self._ready[lane] = ReadyLane(lane, sent.copies, result, losses)
+    def ready(self, results: Mapping[int, bytes | Returned]) -> None:
+        """These lanes have their results."""
+        self._results |= results
+        for lane in results:
+            for n, last in (self.sent[lane].last_observations or {}).items():
+                self._losses[n] = {"worker_lost": True, "final_obs": last, "final_info": {"worker_lost": True}}
 
     def ready_as_lost(self, lane: int) -> None:
         """The lane comes back truncated, and is reset by the caller or by its next step."""
-        copies = self._under_way.pop(lane).copies
-        self._ready[lane] = ReadyLane(lane, copies, loss_infos={n: {"worker_lost": True} for n in copies})
+        self._results[lane] = b""
+        self._losses |= {n: {"worker_lost": True} for n in self._layout.copies(lane)}
 
-    def drop(self, lanes: Iterable[int]) -> None:
-        """These lanes do not come back: the caller gets an error that names them."""
-        for lane in lanes:
-            self._under_way.pop(lane, None)
+    def drop(self, lane: int) -> None:
+        """The lane does not come back: the caller gets an error that names it."""
+        del self.sent[lane]
 
     def clear(self) -> list[int]:
         """Nothing is waited for any more. Returns the lanes that were under way."""
-        dropped = list(self._under_way)
-        self._under_way.clear()
-        self._ready.clear()
+        dropped = self.under_way
+        self.sent, self._results, self._losses = {}, {}, {}
         return dropped
 
     def overdue(self, now: float, timeout_s: float) -> list[int]:
         """Lanes that have been under way for longer than `timeout_s`."""
-        return [lane for lane, sent in self._under_way.items() if now - sent.since_s > timeout_s]
+        return [lane for lane in self.under_way if now - self.sent[lane].since_s > timeout_s]
 
-    def take(self) -> Sequence[ReadyLane]:
-        """The lanes that are ready, in the order of their copies. They have come back now."""
-        ready, self._ready = self._ready, {}
-        return [ready[lane] for lane in sorted(ready)]
+    def take(self) -> Ready:
+        """The lanes that are ready. They have come back now."""
+        ready = Ready({lane: self._results[lane] for lane in sorted(self._results)}, self._losses)
+        self._results, self._losses = {}, {}
+        for lane in ready.results:
+            del self.sent[lane]
+        return ready
+
+    def _copies(self, lanes: Iterable[int]) -> list[int]:
+        found: list[int] = []
+        for lane in lanes:
+            match self.sent[lane].asked:
+                case Asked.STEP:
+                    found += self._layout.copies(lane)
+                case AskedReset(copies):
+                    found += [self._layout.copies(lane)[n] for n in copies]
+        return found
 
 
 class WatchedTime:

@@ -8,16 +8,18 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
 from learner.members.bind_settings import BindSettings
-from learner.vector_env.observation_mode import ObservationMode
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
+
+ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
+"""gymnasium's. A tuple has the observation spaces of the batch and of a single copy."""
 
 
 @dataclass(frozen=True)

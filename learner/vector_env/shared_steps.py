@@ -38,15 +38,15 @@ class SharedSteps:
 
     def step(self, lanes: Iterable[int], *, together: bool) -> None:
         """Step these lanes with the actions in the memory. `together`: they are waited for together."""
-        memory, pipes = self.memory, dict[int, WakePipe]()
-        for lane in lanes:
-            self.under_way[lane] = number = memory.ordered(lane) + 1
-            memory.order(lane, number, wake=not together)
-            pipe = self.pipes[lane]
+        self.under_way |= self.memory.order(lanes, wake=not together)
+        for pipe in {self.pipes[lane] for lane in lanes}:
             assert pipe is not None
-            pipes[id(pipe)] = pipe
-        for pipe in pipes.values():
             pipe.wake()
+
+    def done(self) -> dict[int, bytes | None]:
+        """By lane: packed infos of the steps under way that are done; None if they come as a message."""
+        memory = self.memory
+        return {lane: memory.infos(lane) for lane, number in self.under_way.items() if memory.answered(lane) == number}
 
     def is_done(self, lane: int) -> bool:
         """Whether the lane's step, which is under way, is done."""

@@ -1,19 +1,26 @@
-"""A vector environment as data: its env copies and lanes from the settings, its spaces as a worker described them. Pure."""
+"""A vector environment as data: its env copies and lanes from the settings, its spaces as workers described them. Pure.
+
+Rule: the observations of all copies have the same shapes and dtypes, because they share arrays; all have the same actions.
+"""
 
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import gymnasium
+from gymnasium import Space
+from gymnasium.spaces.utils import is_space_dtype_shape_equiv
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_differing_spaces, batch_space
 
-from learner.vector_env.settings import VectorEnvSettings
+from learner.vector_env.settings import ObservationMode, VectorEnvSettings
 from protocol.env_spec import EnvSpec, PickledCallable
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import leaves_with_own_dtype
-from protocol.errors import UsageError
+from protocol.errors import EnvironmentFailed, UsageError
 from protocol.specs import DescribeSpec, Leaf, StepSpec
 from protocol.wire.codec import check_can_be_sent
 
@@ -23,8 +30,8 @@ class VectorEnvDescription:
     """The description for workers, and the spaces and properties of a single env copy."""
 
     step: StepSpec
-    observation_space: gymnasium.Space[Any]
-    action_space: gymnasium.Space[Any]
+    observation_space: Space[Any]
+    action_space: Space[Any]
     metadata: dict[str, Any]
     render_mode: str | None
     spec: Any
@@ -106,7 +113,34 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
     )
 
 
-def _action_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
+def observation_spaces(
+    mode: ObservationMode, first: tuple[Space[Any], Space[Any]], copies: Sequence[DescribedEnv | None]
+) -> tuple[Space[Any], Space[Any]]:
+    """The observation spaces of a single copy and of the batch.
+
+    `first`: observation and action space of copy 0. `copies`: None for one that its client did not describe. Raises
+    `EnvironmentFailed` for a copy that does not fit.
+    """
+    observation, action = first
+    single = observation if isinstance(mode, str) else mode[1]
+    fits = operator.eq if mode == "same" else is_space_dtype_shape_equiv
+    for n, copy in enumerate(copies):
+        if copy is not None and not (fits(copy.observation_space, single) and copy.action_space == action):
+            raise EnvironmentFailed(
+                f"copy {n}: its observations {copy.observation_space} and actions {copy.action_space} are not those of "
+                f"copy 0, {single} and {action}; all copies must have the same, and each machine the same version of the "
+                "environment; observation_mode='different' allows other bounds of observations"
+            )
+    match mode:
+        case "same":
+            return single, batch_space(single, len(copies))
+        case "different":
+            return single, batch_differing_spaces([copy.observation_space if copy else single for copy in copies])
+        case (batch, _):
+            return single, batch
+
+
+def _action_leaves(space: Space[Any]) -> tuple[Leaf, ...]:
     try:
         return leaves_with_own_dtype(space)
     except UsageError as error:

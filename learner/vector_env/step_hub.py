@@ -86,6 +86,9 @@ class StepHub:
         """the status of the run that acts on these copies: `millrace status` gets its figures, and the workers here"""
         self._link = link
         self.coordinator = OrderCoordinator(spec, first_session, worker_timeout_s)
+        self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
+        if shared is not None:
+            self._under_way = self.coordinator.shared_orders = shared.under_way
         self._local_workers = local_workers
         self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
         self._waiting_since_s: dict[int, float] = {}  # of these lanes
@@ -121,7 +124,6 @@ class StepHub:
         """Step these lanes with the actions that are in shared memory. `together`: they are waited for together."""
         assert self.shared is not None
         self.shared.step(lanes, together=together)
-        self.coordinator.shared_orders |= self.shared.under_way
 
     def can_share(self, lane: int) -> bool:
         """Whether a step of this lane may go through shared memory: its worker has the memory, and has no other order.
@@ -138,31 +140,24 @@ class StepHub:
             shared.opened(lane, member.hello.worker)
         return shared.pipes[lane] is not None
 
-    def take(self, lanes: Iterable[int]) -> dict[int, Answer | bytes]:
-        """What has come of the orders of these lanes: the answer that came as a message, or the packed infos of a step that
-        went through shared memory. A lane is not in it if nothing has come yet, or the lane is lost.
+    def take(self) -> dict[int, Answer | bytes]:
+        """What has come of the newest orders, by lane: the answer that came as a message, or the packed infos of a step that
+        went through shared memory. It is forgotten here. A lane is not in it if nothing has come yet, or the lane is lost.
         """
-        found: dict[int, Answer | bytes] = {}
-        coordinator, shared = self.coordinator, self.shared
-        under_way = {} if shared is None else shared.under_way
-        for lane in lanes:
-            if lane not in under_way:
-                answer = coordinator.answers.get(lane)
-                if answer is not None and answer.ticket == self._newest_tickets.get(lane):  # else it is of an earlier order
-                    found[lane] = answer
-            elif shared is not None and shared.is_done(lane):
-                infos = shared.memory.infos(lane)
-                if infos is None:
-                    infos = self._long_infos(lane)
-                if infos is not None:
-                    found[lane] = infos
+        newest = self._newest_tickets  # another answer is of an earlier order
+        found: dict[int, Answer | bytes] = {
+            lane: answer for lane, answer in self.coordinator.answers.items() if answer.ticket == newest.get(lane)
+        }
+        for lane, infos in () if self.shared is None else self.shared.done().items():
+            if (packed := self._long_infos(lane) if infos is None else infos) is not None:
+                found[lane] = packed
         self.forget(found)
         return found
 
     def _long_infos(self, lane: int) -> bytes | None:
         """The infos of a lane's step that are too long for the shared memory. None: they are still to come."""
         infos = self.coordinator.infos.get(lane)
-        if infos is None and lane not in self.coordinator.shared_orders:
+        if infos is None and not self.coordinator.lanes[lane].started:
             return b""  # its worker is gone, and the lane is in `OrderCoordinator.take_lost`
         if infos is None:
             self._infos_to_come.add(lane)
@@ -170,22 +165,17 @@ class StepHub:
 
     def is_ordered(self, lane: int) -> bool:
         """Whether the lane has an order that is not answered, or waits for a worker to take it."""
-        if lane in self._waiting_orders or (self.shared is not None and lane in self.shared.under_way):
-            return True
-        return self._newest_tickets.get(lane) in self.coordinator.orders
+        waits = lane in self._waiting_orders or lane in self._under_way
+        return waits or self._newest_tickets.get(lane) in self.coordinator.orders
 
     def forget(self, lanes: Iterable[int]) -> None:
         """The results of the last orders of these lanes were taken, or are not wanted any more."""
-        under_way = {} if self.shared is None else self.shared.under_way
-        shared_orders, infos = self.coordinator.shared_orders, self.coordinator.infos
         for lane in lanes:
-            if under_way.pop(lane, None) is not None and lane not in infos and lane not in self._infos_to_come:
-                shared_orders.pop(lane, None)
-                continue
-            self.coordinator.forget(lane)
-            self._infos_to_come.discard(lane)
-            self._waiting_orders.pop(lane, None)
-            self._newest_tickets.pop(lane, None)
+            if self._under_way.pop(lane, None) is None or self.coordinator.infos or self._infos_to_come:
+                self.coordinator.forget(lane)
+                self._infos_to_come.discard(lane)
+                self._waiting_orders.pop(lane, None)
+                self._newest_tickets.pop(lane, None)
 
     # ---------------------------------------------------------------- waiting
 
@@ -203,7 +193,7 @@ class StepHub:
         self._patience_s = min(PATIENCE_S, timeout_s / 2)
         self._send_waiting_orders()
         shared = self.shared
-        if shared is None or not shared.under_way or self._infos_to_come:
+        if shared is None or not self._under_way or self._infos_to_come:
             self._turn(POLL_S)
             return
         only_shared = not self._waiting_orders and not self.coordinator.orders

@@ -22,10 +22,9 @@ from learner.members.describe_coordinator import Accept, accept_any
 from learner.members.events import Failed
 from learner.members.failure_count import FailureCount
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.observation_mode import ObservationMode, observation_spaces
-from learner.vector_env.settings import VectorEnvSettings
+from learner.vector_env.settings import ObservationMode, VectorEnvSettings
 from learner.vector_env.shared_steps import SharedSteps
-from learner.vector_env.spec import RequestedCopies, requested_copies
+from learner.vector_env.spec import RequestedCopies, observation_spaces, requested_copies
 from learner.vector_env.step_hub import StepHub
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint

@@ -11,6 +11,7 @@ from __future__ import annotations
 import mmap
 import os
 import threading
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -103,12 +104,17 @@ class SharedMemory:
         """Number of the lane's newest order."""
         return self._words[2 * WORDS * lane]
 
-    def order(self, lane: int, number: int, *, wake: bool = False) -> None:
-        """Order a step, after its actions were written. `wake`: the worker wakes the learner when this lane is done, even if
-        others are not.
+    def order(self, lanes: Iterable[int], *, wake: bool = False) -> dict[int, int]:
+        """Order a step of these lanes, after the actions were written. Returns the number of each lane's order.
+
+        `wake`: the worker wakes the learner when a lane is done, even if others are not.
         """
-        self._words[2 * WORDS * lane + 1] = wake
-        self._words[2 * WORDS * lane] = number
+        words, numbers = self._words, dict[int, int]()
+        for lane in lanes:
+            at = 2 * WORDS * lane
+            words[at + 1] = wake
+            words[at] = numbers[lane] = words[at] + 1
+        return numbers
 
     def wakes(self, lane: int) -> bool:
         """Whether the learner is to be woken when the lane's newest order is done, whatever the other lanes do."""
@@ -138,7 +144,8 @@ class SharedMemory:
 
     def infos(self, lane: int) -> bytes | None:
         """The packed infos of the lane's newest answer; None if they travel as a message."""
-        size = self._words[2 * WORDS * lane + WORDS + 1]
+        if not (size := self._words[2 * WORDS * lane + WORDS + 1]):
+            return b""
         return None if size == INFOS_IN_MESSAGE else bytes(self.lanes[lane].infos[:size])
 
     def close(self) -> None:

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from protocol.errors import EnvironmentFailed
-from protocol.worker_exception import WorkerTraceback, worker_exception
+from protocol.errors import EnvironmentFailed, WorkerTraceback, worker_exception
 
 
 def raised(*errors: BaseException) -> str:

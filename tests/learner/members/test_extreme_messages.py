@@ -240,7 +240,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
         while len(got) < 2:
             assert link.now < deadline_s, hub.coordinator.take_lost()
             hub.wait(30.0, together=True)
-            got |= hub.take((0, 1))
+            got |= hub.take()
         found += [answer.obs[0].tobytes() for _, answer in sorted(got.items()) if isinstance(answer, Stepped)]
     assert hub._server.unexpected_errors == 0
     return found

@@ -131,7 +131,8 @@ def test_bounds_that_differ_by_rounding_are_the_same() -> None:
 def test_bounds_of_observations_may_differ_with_another_observation_mode(mode: Any) -> None:
     class AtItsBound(gymnasium.Env[Any, Any]):
         def __init__(self, bound: float) -> None:
-            self.observation_space, self.action_space = spaces.Box(-bound, bound, (2,), np.float64), DISCRETE
+            self.observation_space: Any = spaces.Box(-bound, bound, (2,), np.float64)
+            self.action_space = DISCRETE
 
         def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
             return self.observation_space.high, {}

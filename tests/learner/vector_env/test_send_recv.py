@@ -17,6 +17,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
+from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, Sent, SentLanes, WatchedTime
 from learner.vector_env.settings import VectorEnvSettings
@@ -648,19 +649,19 @@ def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> 
 
 
 def test_a_lane_comes_back_once_and_takes_no_other_order_before() -> None:
-    lanes = SentLanes()
-    lanes.send(1, Sent((2, 3), 0.0, Asked.STEP))
-    lanes.send(0, Sent((0, 1), 5.0, Asked.STEP))
-    assert lanes.copies() == [0, 1, 2, 3]
-    with pytest.raises(ValueError, match="lane 1: expected one that has come back"):
-        lanes.send(1, Sent((2, 3), 1.0, Asked.STEP))
+    lanes = SentLanes(BatchLayout([2, 2]))
+    lanes.send([1], Sent(Asked.STEP, 0.0))
+    lanes.send([0], Sent(Asked.STEP, 5.0))
+    assert lanes.copies == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match=r"lanes \[1\]: expected some that have come back"):
+        lanes.send([1], Sent(Asked.STEP, 1.0))
     assert lanes.overdue(4.0, 3.0) == [1]
-    lanes.ready(1, b"infos")
-    assert (lanes.ready_copies, lanes.overdue(9.0, 3.0), lanes.among([0, 1, 2])) == (2, [0], [0, 1])
-    lanes.ready(0, b"")
-    assert [(one.lane, one.copies, one.result) for one in lanes.take()] == [(0, (0, 1), b""), (1, (2, 3), b"infos")]
-    assert (list(lanes.take()), lanes.copies()) == ([], [])
-    lanes.send(1, Sent((2, 3), 1.0, Asked.STEP))
+    lanes.ready({1: b"infos"})
+    assert (lanes.ready_copies, lanes.overdue(9.0, 3.0), lanes.among([0, 1, 2])) == ([2, 3], [0], [0, 1])
+    lanes.ready({0: b""})
+    assert list(lanes.take().results.items()) == [(0, b""), (1, b"infos")]
+    assert (lanes.take().results, lanes.copies) == ({}, [])
+    lanes.send([1], Sent(Asked.STEP, 1.0))
 
 
 def test_a_long_time_between_two_looks_counts_as_a_short_one() -> None:

@@ -130,7 +130,7 @@ class Caller:
             if self.send_recv._sent.under_way:
                 return
             ready = self.send_recv.recv_all()
-            self.told |= {lane.lane for lane in ready if lane.loss_infos}
+            self.told |= {self.parts.layout.lane_of(n) for n in ready.losses}
             self.at += 1
         except (NoWorkers, WorkerLost) as error:
             self.send_recv.abandon()
@@ -153,21 +153,21 @@ class Caller:
 
     # ---------------------------------------------------------------- inside
 
-    def _taken(self, lanes: Iterable[int]) -> dict[int, Answer | bytes]:
-        """The results of these lanes, each of which is looked at once."""
-        found = self._take(lanes)
+    def _taken(self) -> dict[int, Answer | bytes]:
+        """What has come, each result of which is looked at once."""
+        found = self._take()
         for lane, answer in found.items():
             self._look_at(lane, answer)
         return found
 
     def _look_at(self, lane: int, answer: Answer | bytes) -> None:
-        asked = self.send_recv._sent.under_way[lane].asked
+        sent = self.send_recv._sent.sent[lane]
         assert not isinstance(answer, bytes)
         incarnation, before = self.copies.get(lane, (-1, NEW))
         assert answer.incarnation <= self.coordinator.lanes[lane].incarnation, "a result of a later incarnation"
         assert answer.incarnation >= incarnation, "a result of an earlier incarnation"
         before = before if answer.incarnation == incarnation else NEW
-        kind, seed = self.kind(lane, self.send_recv._sent.under_way[lane]) if asked is not Asked.CALL else ("call", 0)
+        kind, seed = self.kind(lane, sent) if sent.asked is not Asked.CALL else ("call", 0)
         expected = executed(make_order(kind, seed)(0, 0, LaneIncarnation(lane, answer.incarnation)), before)
         assert state_in(answer) == expected, f"lane {lane}: expected the result {expected}, got {state_in(answer)}"
         self.copies[lane] = answer.incarnation, expected

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from learner.members.membership import Member, Outgoing
 from learner.vector_env.order_coordinator import OrderCoordinator
-from learner.vector_env.sent_lanes import Asked, AskedReset, ReadyLane, Sent
+from learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from protocol.messages import ToLearner, WorkerExit
 from tests.model.conversation import Content, Event
 from tests.model.message_content import hello, incarnation, peer_of, session, ticket, worker_of
@@ -131,16 +131,17 @@ def _member(member: Member, now: float) -> Content:
     )
 
 
+def _asked(caller: Caller, lane: int, sent: Sent) -> Content:
+    return *caller.kind(lane, sent), sent.asked is Asked.STEP, sent.attempts, max(sent.since_s - caller.now, -99.0)
+
+
 def _caller(caller: Caller) -> Content:
     sent, lost_lanes = caller.send_recv._sent, caller.parts.lost_lanes
     return (
         caller.at,
         None if not caller.waits else 0,
-        tuple(
-            (lane, *caller.kind(lane, each), each.asked is Asked.STEP, each.attempts, max(each.since_s - caller.now, -99.0))
-            for lane, each in sorted(sent._under_way.items())
-        ),
-        tuple((lane, bool(each.loss_infos)) for lane, each in sorted(sent._ready.items())),
+        tuple((lane, *_asked(caller, lane, sent.sent[lane])) for lane in sorted(sent.under_way)),
+        tuple((lane, lane in sent._losses) for lane in sorted(sent._results)),
         tuple(sorted(caller.send_recv._to_raise)),
         tuple(sorted(caller.hub._waiting_orders)),
         tuple((lane, ticket(number)) for lane, number in sorted(caller.hub._newest_tickets.items())),
@@ -192,12 +193,13 @@ def _load_caller(caller: Caller, content: Content) -> None:
     lost_lanes.expect_reset(awaiting)
     for lane, kind, seed, is_step, attempts, since_s in under_way:
         asked = Asked.STEP if is_step else Asked.CALL if kind == "call" else AskedReset((0,), (seed,), NOTHING)
-        sent._under_way[lane] = Sent((lane,), since_s, asked, attempts)
+        sent.sent[lane] = Sent(asked, since_s, attempts)
         if lane in waiting:
             caller.hub._waiting_orders[lane] = make_order(kind, seed)
             caller.hub._waiting_since_s[lane] = 0.0
     for lane, lost in ready:
-        sent._ready[lane] = ReadyLane(lane, (lane,), loss_infos={lane: {}} if lost else {})
+        sent.sent[lane], sent._results[lane] = Sent(Asked.STEP, 0.0), b""
+        sent._losses |= {lane: {}} if lost else {}
     caller.send_recv._to_raise = dict.fromkeys(to_raise, "lost")
     caller.hub._newest_tickets = {lane: number.value for lane, number in newest}
     caller.copies = {lane: (life.value, state) for lane, life, state in copies}
