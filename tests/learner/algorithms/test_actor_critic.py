@@ -31,8 +31,7 @@ from tests.support.numbers.batches import (
     normal,
     shared,
 )
-from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, tolerance_of
-from tests.support.numbers.sampled_rounding import SAMPLES
+from tests.support.numbers.rounding import ELEMENTWISE, SAMPLES, UNIT, assert_within, tolerance_of
 from tests.support.numbers.steps import gradient_tolerance, usual_rows
 
 NAMES = ["a2c", "impala", "reinforce"]

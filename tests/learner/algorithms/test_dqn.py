@@ -15,24 +15,16 @@ from learner.algorithms.normalization import RewardScaler
 from learner.algorithms.replay import replay_buffer as replay_module
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import DQNConfig
-from protocol.arrays import Array, Floats, Ints
+from protocol.arrays import Floats, Ints
 from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
-from protocol.policy.layout import hidden_names, named_views
+from protocol.policy.layout import named_views
 from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
 from tests.support.numbers.batches import BOX, COPIES, LANES, no_pulse
 from tests.support.numbers.batches import batch as noise_batch
-from tests.support.numbers.rounding import (
-    ELEMENTWISE,
-    UNIT,
-    assert_within,
-    forward_pass,
-    network_layers,
-    q_gradient_tolerance,
-    tolerance_of,
-)
+from tests.support.numbers.rounding import flat_gradient, in_float64, sampled
 
 CHOICE = ActionSpec("discrete", (), "int64", (4,), (0,))
 PLAIN = DQNConfig(net=(16,), replay_size=1000, learning_starts=0, gradient_steps=5, target_every=7)
@@ -165,46 +157,6 @@ def test_the_gradient_of_a_loss_is_autograds(name: str) -> None:
     torch.testing.assert_close(*(torch.autograd.grad(each, error)[0] for each in (loss, expected)))
 
 
-def error_variance(made: DQN, drawn: Sample) -> Array:
-    """The variance of the rounding errors of float32 errors [B]: of values less their targets.
-
-    A value Q is V + A − mean A, whose variances are added up; the target has as many roundings as the value. With double,
-    rounding may decide which action is the best one; then the target may be off by the range of the values.
-    """
-    spec = made.policy
-    variance = np.zeros(len(drawn.reward))
-    tops = ("q.out", "q.value") if spec.dueling else ("q.out",)
-    rows = made.transitions(drawn)
-    for network, x in ((made.net, rows.x.numpy()), (made.target, rows.next_x.numpy())):
-        for top in tops:
-            layers = network_layers(network.parameters, [*hidden_names(spec), top])
-            found = forward_pass(layers, x, spec.activation == "relu")
-            # the largest value of a row, and its mean, is as far off as the worst of them at most
-            own = found.out_variance.max(1) + (ELEMENTWISE * UNIT * np.abs(found.out).max(1)) ** 2
-            variance += own * (4 if spec.dueling and top == "q.out" else 1)
-    if made.config.double:
-        x, trunk, relu = rows.next_x.numpy(), hidden_names(spec), spec.activation == "relu"
-        ours, others = (
-            forward_pass(network_layers(network.parameters, [*trunk, "q.out"]), x, relu)
-            for network in (made.net, made.target)
-        )
-        gap = np.subtract(*np.sort(ours.out, 1)[:, [-1, -2]].T)
-        variance += (gap <= 2 * tolerance_of(ours.out_variance.max(1))) * np.ptp(others.out, 1) ** 2
-    return variance * len(tops)
-
-
-def gradient_tolerance(made: DQN, drawn: Sample, error: Array) -> Array:
-    """How far two float32 gradients of the loss may differ. The Huber loss clips the gradient of an error [B] above 1."""
-    huber, rows = made.config.loss == "huber", len(error)
-    by_value, by_value_variance = np.zeros((2, rows, made.policy.action.sizes[0]))
-    chosen = np.arange(rows), drawn.action
-    slope = drawn.weight / rows * (1 if huber else 2)
-    by_value[chosen] = slope * (np.clip(error, -1, 1) if huber else error)
-    by_value_variance[chosen] = slope**2 * error_variance(made, drawn)
-    x = made.transitions(drawn).x.numpy()
-    return q_gradient_tolerance(made.policy, made.net.flat.numpy(), x, by_value, by_value_variance)
-
-
 @pytest.mark.parametrize("dueling", [False, True])
 def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
     made = dqn(changed(PLAIN, dueling=dueling, replay="prioritized", double=False))
@@ -213,21 +165,23 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
     first = made.replay.sample(30)
     made.replay.update_priorities(first.slots, np.linspace(0, 5, 30, dtype=np.float32))
     drawn = made.replay.sample(64, beta=0.5)
-    x, following = torch.from_numpy(drawn.leaves[0]), torch.from_numpy(drawn.next_leaves[0])
-    with torch.no_grad():
-        target = torch.from_numpy(drawn.reward) + torch.from_numpy(drawn.discount) * made.target.params(following).amax(1)
-    chosen = made.net.params(x)[torch.arange(64), torch.from_numpy(drawn.action)]
-    tolerance = gradient_tolerance(made, drawn, (chosen - target).detach().numpy())
-    loss = (torch.from_numpy(drawn.weight) * torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none")).mean()
-    made.net.flat_grad.zero_()
-    torch.autograd.backward(loss)
-    expected = made.net.flat_grad.clone()
+    x, following = torch.from_numpy(drawn.leaves[0]).double(), torch.from_numpy(drawn.next_leaves[0]).double()
+    reward, discount, weight = (torch.from_numpy(each).double() for each in (drawn.reward, drawn.discount, drawn.weight))
+    net, target_net = in_float64(made.net), in_float64(made.target)
+
+    def usual() -> list[torch.Tensor]:
+        target = (reward + discount * target_net.params(following).amax(1)).detach()
+        chosen = net.params(x).gather(1, torch.from_numpy(drawn.action)[:, None])[:, 0]
+        loss = (weight * torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none")).mean()
+        return [flat_gradient(loss, net), loss, chosen.mean()]
+
+    expected, loss, q_mean = sampled(usual)
     measured, _ = made.step(made.transitions(drawn))
+    expected.assert_is(made.net.flat_grad.numpy())
+    assert measured["loss"] == pytest.approx(loss.exact.item(), rel=1e-5)
+    assert measured["q_mean"] == pytest.approx(q_mean.exact.item(), rel=1e-5)
+    assert measured["grad_norm"] == pytest.approx(np.linalg.norm(expected.exact), rel=1e-5)
     assert drawn.weight.min() < 1
-    assert_within(made.net.flat_grad.numpy(), expected.numpy(), tolerance)
-    assert measured["loss"] == pytest.approx(loss.item(), rel=1e-5)
-    assert measured["q_mean"] == pytest.approx(chosen.mean().item(), rel=1e-5)
-    assert measured["grad_norm"] == pytest.approx(expected.norm().item(), rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows
 from tests.learner.algorithms.test_vtrace import OffPolicy, on_policy, slow_vtrace, vtrace_tolerances
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
-from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, log_prob_variance, tolerance_of, value_tolerance
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, in_double, in_float64, sampled
 from tests.support.numbers.steps import Errors, only_step, usual_distribution
 
 GAMMA = 0.9
@@ -62,9 +62,10 @@ def largest_differences(found: Estimates, advantage: Array, target: Array) -> Er
 
 def log_prob_error(algorithm: Impala, rows: Batch) -> float:
     """How far two float32 log-probabilities of the actions of this batch may differ under the algorithm's weights."""
-    x = algorithm.observations(rows).features[: rows.valid.size].numpy()
-    action = rows.action.reshape(len(x), *rows.action.shape[2:])
-    return float(tolerance_of(log_prob_variance(algorithm.policy, algorithm.net.flat.numpy(), x, action)).max())
+    x = algorithm.observations(rows).features[: rows.valid.size].double()
+    action, exact = in_double(torch.from_numpy(rows.action).flatten(0, 1)), in_float64(algorithm.net)
+    ((_, tolerance),) = sampled(lambda: [exact.evaluate(x, (), None, action)[0]])
+    return float(tolerance.max())
 
 
 @pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
@@ -89,7 +90,9 @@ def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spe
     (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy()[valid].mean()).backward()
     expected = algorithm.net.flat_grad.numpy().copy()
     # Targets and advantages are linear in the values, and so are their errors.
-    of_values = np.full_like(values, value_tolerance(algorithm.net, x.numpy()).max())
+    exact_net = in_float64(algorithm.net)
+    ((_, of_value),) = sampled(lambda: [exact_net.value(x.double())])
+    of_values = np.full_like(values, of_value.max())
     of_means = slow_vtrace(o._replace(rows=o.rows._replace(reward=0 * rows.reward, values=of_values)).sizes, *bars)
     of_sums = vtrace_tolerances(o, *bars, log_ratio_error=log_prob_error(algorithm, rows))
     of_target, of_advantage = (one + other for one, other in zip(of_sums, of_means, strict=True))

@@ -26,7 +26,7 @@ from protocol.specs import NamedShape, PolicySpec
 from tests.support.in_process.described import run_spec
 from tests.support.in_process.saved_policies import load_policy
 from tests.support.numbers.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
-from tests.support.numbers.sampled_rounding import in_float64, sampled
+from tests.support.numbers.rounding import in_float64, sampled
 
 HERE = "tests.support.users_code.custom_encoders"
 

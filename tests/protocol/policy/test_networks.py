@@ -23,8 +23,7 @@ from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-from tests.support.numbers.rounding import assert_within, log_prob_tolerance, params_variance, tolerance_of
-from tests.support.numbers.sampled_rounding import in_float64, sampled
+from tests.support.numbers.rounding import in_double, in_float64, sampled
 
 BOX = Leaf("x", "box", (2, 3), "float32")
 OBSERVATIONS = {
@@ -70,11 +69,6 @@ def random_weights(spec: PolicySpec, net: ActorCriticNetwork, generator: np.rand
     return net.flat.numpy()[: net.acting_size].copy(), buffers
 
 
-def params_tolerance(spec: PolicySpec, flat: Array, x: Array) -> Array:
-    """How far two float32 computations of the distribution parameters [B, P] may differ."""
-    return tolerance_of(params_variance(spec, flat, x)[1])
-
-
 @given(
     st.sampled_from(sorted(OBSERVATIONS)),
     st.sampled_from(sorted(ACTIONS)),
@@ -97,13 +91,17 @@ def test_numpy_and_torch_agree(
     x = normalize(x, *np.split(buffers, 2)) if normal else x
     expected = numpy_net(obs)[0]
     params, value = torch_net.forward(torch.tensor(x[0]))
-    assert_within(params.detach().numpy(), expected, params_tolerance(spec, parameters, x[0]))
+    exact = in_float64(torch_net)
+    (of_params,) = sampled(lambda: [exact.params(torch.tensor(x[0]).double())])
+    of_params.assert_is(params.detach().numpy(), expected)
     np.testing.assert_array_equal(value.detach(), torch_net.value(torch.tensor(x[0])).detach())
 
     over = distribution(spec)
     actions = over.sample(expected, over.noise(generator, (7,)))
     log_prob, entropy = log_prob_and_entropy(spec.action, torch.tensor(expected), torch.tensor(actions))
-    assert_within(log_prob.numpy(), over.log_prob(expected, actions), log_prob_tolerance(spec, expected, actions))
+    doubles = torch.tensor(expected).double(), in_double(torch.tensor(actions))
+    (of_log_prob,) = sampled(lambda: [log_prob_and_entropy(spec.action, *doubles)[0]])
+    of_log_prob.assert_is(log_prob.numpy(), over.log_prob(expected, actions))
     assert entropy.shape == (7,)
 
 
@@ -292,8 +290,9 @@ def test_torch_policy_acts_as_the_numpy_policy() -> None:
     numpy_policy.load(it.net.flat.numpy()[: it.net.acting_size], it.buffers)
     obs = leaves(it.spec.observation, (2, 4), np.random.default_rng(0))
     x = normalize(features(it.spec, obs), *np.split(it.buffers, 2)).reshape(8, -1)
-    tolerance = params_tolerance(it.spec, it.net.flat.numpy()[: it.net.acting_size], x)
-    assert_within(it.policy(obs).reshape(8, -1), numpy_policy(obs).reshape(8, -1), tolerance)
+    exact = in_float64(it.net)
+    (expected,) = sampled(lambda: [exact.params(torch.tensor(x).double())])
+    expected.assert_is(it.policy(obs).reshape(8, -1), numpy_policy(obs).reshape(8, -1))
 
 
 def test_torch_policy_refuses_weights_of_another_size() -> None:

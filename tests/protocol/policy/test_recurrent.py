@@ -25,13 +25,13 @@ from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
 from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import advance, zero_state
+from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.rollout import Rollout, stack_rollouts, validate
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.in_process.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
-from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, core_tolerance, log_prob_tolerance
-from tests.support.numbers.sampled_rounding import in_float64, sampled
+from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, in_double, in_float64, sampled
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 from workers.envs.toy import Scripted
@@ -80,15 +80,17 @@ def test_it_computes_what_torch_computes(core: Core) -> None:
     with torch.no_grad():
         expected, after = own(x, begun)
         found, last = net.core(x.flatten(0, 1), RecurrentInput(state, torch.ones(T, C)))
-    parameters = {name: tensor.detach().numpy() for name, tensor in net.parameters.items()}
-    outputs_tolerance, state_tolerance = core_tolerance(core, parameters, x.numpy(), state.numpy())
-    assert_within(found.view(T, C, 8).numpy(), expected.numpy(), outputs_tolerance)
-    assert_within(last.numpy(), (torch.cat(after, -1)[0] if core == "lstm" else after[0]).numpy(), state_tolerance)
+    parameters, exact = {name: tensor.detach().numpy() for name, tensor in net.parameters.items()}, in_float64(net)
+    given = doubles(RecurrentInput(state, torch.ones(T, C)))
+    outputs, of_state = sampled(lambda: exact.core(x.double().flatten(0, 1), given))
+    outputs_tolerance = outputs.tolerance.reshape(T, C, 8)
+    outputs.assert_is(found.numpy(), expected.flatten(0, 1).numpy())
+    of_state.assert_is(last.numpy(), (torch.cat(after, -1)[0] if core == "lstm" else after[0]).numpy())
     now = state.numpy()[None].copy()
     for t in range(T):
         out = advance(spec, parameters, x[t].numpy()[None], now)
         assert_within(out[0], expected[t].numpy(), outputs_tolerance[t])
-    assert_within(now[0], last.numpy(), state_tolerance)
+    of_state.assert_is(now[0])
 
 
 @pytest.mark.parametrize("core", CORES)
@@ -142,15 +144,19 @@ def test_no_state_is_the_beginning_of_an_episode() -> None:
 
 def check_states(run: RunSpec, rollouts: list[Rollout]) -> None:
     """Act again on the observations: the state before each rollout, and the log-probabilities in it."""
-    policy, state = random_policy(run.policy), zero_state(run.policy, 1, run.copies)
+    policy, state, acted = random_policy(run.policy), zero_state(run.policy, 1, run.copies), []
     for rollout in rollouts:
         np.testing.assert_array_equal(rollout.state, state[0])
         for t, valid in enumerate(rollout.valid):
-            params = policy([leaf[t][None] for leaf in rollout.obs], state)[0]
-            log_prob = distribution(run.policy).log_prob(params, rollout.action[t])
-            tolerance = log_prob_tolerance(run.policy, params, rollout.action[t])
-            assert_within(rollout.log_prob[t][valid], log_prob[valid], tolerance[valid])
+            acted.append(policy([leaf[t][None] for leaf in rollout.obs], state)[0][valid])
             state[0, ~valid] = 0  # the row that resets: what comes is the first observation of an episode
+    params = np.concatenate(acted)
+    action, log_prob = (
+        np.concatenate([getattr(rollout, name)[rollout.valid] for rollout in rollouts]) for name in ("action", "log_prob")
+    )
+    given = torch.tensor(params).double(), in_double(torch.tensor(action))
+    (expected,) = sampled(lambda: [log_prob_and_entropy(run.policy.action, *given)[0]])
+    expected.assert_is(log_prob, distribution(run.policy).log_prob(params, action))
 
 
 @pytest.mark.parametrize("core", CORES)

@@ -1,11 +1,13 @@
 """One gradient step of an actor-critic, and how far its gradient may be from that of another computation.
 
-The tolerance follows from the rounding errors of log-probabilities, values, advantages and targets; see `rounding`.
+The tolerance follows from the roundings of the pass, the loss and its derivative, and the errors of advantages and targets.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -17,14 +19,7 @@ from protocol.arrays import Array
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.support.numbers.batches import no_pulse
-from tests.support.numbers.rounding import (
-    ELEMENTWISE,
-    UNIT,
-    actor_critic_tolerance,
-    assert_within,
-    by_value_variance,
-    log_prob_variance,
-)
+from tests.support.numbers.rounding import SAMPLES, assert_within, flat_gradient, in_double, in_float64, sampled
 
 
 class Errors(NamedTuple):
@@ -69,33 +64,26 @@ def only_step(algorithm: ActorCritic, batch: Batch, errors: Errors = NO_ERRORS) 
 
 
 def gradient_tolerance(algorithm: ActorCritic, minibatch: Minibatch, errors: Errors = NO_ERRORS) -> Array:
-    """How far two float32 gradients [P] of the loss of a minibatch may differ.
+    """How far two float32 gradients [P] of the loss of a minibatch of B rows may differ.
 
-    The relative error of a ratio is the absolute error of its log-probability. Standardizing divides an error by the
-    standard deviation; the mean and the standard deviation are off by as much at most, and are sums of B terms, each at
-    most as large as the largest advantage. The errors of advantages and targets may be alike in all rows, for instance
-    those of a rounded discount: then the square of their sum is up to B times the sum of their squares.
+    The errors of advantages and targets may be alike in all rows, for instance those of a rounded discount: then the square
+    of their sum is up to B times the sum of their squares.
     """
-    rows = algorithm.evaluate(minibatch)
-    count, largest = len(rows.value), float(rows.advantage.abs().max())
-    leaves = [output.detach().requires_grad_() for output in (rows.log_prob_now, rows.entropy, rows.value)]
-    loss, _ = algorithm.loss(LossInput(*rows[:5], *leaves))
-    by_outputs = [each.numpy() for each in torch.autograd.grad(loss, leaves, materialize_grads=True)]
-    by_log_prob, _, by_value = by_outputs
-    of_advantage = errors.advantage
-    if algorithm.standardizes_advantages():
-        of_advantage *= (2 + largest) / float(rows.raw_advantage.std())
-    x, action = minibatch.features.numpy(), minibatch.action.numpy()
-    arrays = algorithm.net.flat.numpy(), x, action
-    rounded = log_prob_variance(algorithm.policy, *arrays) + 2 * (count + ELEMENTWISE) * UNIT**2 * largest**2
-    slope = 2 * algorithm.vf_coef / count
-    return actor_critic_tolerance(
-        algorithm.policy,
-        *arrays,
-        by_outputs,
-        (np.abs(by_log_prob) + (by_log_prob != 0) / count) ** 2 * rounded + of_advantage**2 / count,
-        by_value_variance(algorithm.net, x, by_value, slope) + slope**2 * count * errors.target**2,
-    ).gradient
+    exact, rows = in_float64(algorithm.net), Minibatch(*map(in_double, minibatch))
+    generator, deviations = torch.Generator().manual_seed(0), iter([0.0, *[math.sqrt(len(rows.action))] * SAMPLES])
+
+    def gradient() -> list[Tensor]:
+        deviation = next(deviations)  # the first call is exact
+        advantage, target = (
+            each + deviation * error * torch.randn(len(each), dtype=torch.float64, generator=generator)
+            for each, error in ((rows.advantage, errors.advantage), (rows.target, errors.target))
+        )
+        with patch.object(algorithm, "net", exact):
+            loss, _ = algorithm.loss(algorithm.evaluate(rows._replace(advantage=advantage, target=target)))
+        return [flat_gradient(loss, exact)]
+
+    (found,) = sampled(gradient)
+    return found.tolerance
 
 
 class UsualRows(NamedTuple):

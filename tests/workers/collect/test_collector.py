@@ -12,11 +12,13 @@ import gymnasium
 import msgspec
 import numpy as np
 import pytest
+import torch
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from protocol.arrays import Array
 from protocol.policy.distributions import distribution
 from protocol.policy.features import features, normalize
+from protocol.policy.networks import ActorCriticNetwork
 from protocol.specs import Leaf, RunSpec
 from tests.support.in_process.collectors import (
     TOY,
@@ -30,7 +32,7 @@ from tests.support.in_process.collectors import (
     run_around,
     run_of,
 )
-from tests.support.numbers.rounding import assert_within, log_prob_variance, tolerance_of
+from tests.support.numbers.rounding import in_double, in_float64, sampled
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 from workers.copies.env_copies import copy_seeds
@@ -176,9 +178,12 @@ def test_log_probabilities_are_those_of_the_policy_in_these_observations(run: Ru
     parameters, buffers = random_weights(run.policy)
     x = features(run.policy, obs)
     x = normalize(x, *np.split(buffers, 2)) if run.policy.normalize_observations else x
-    rows = x.reshape(-1, x.shape[-1]), rollout.action.reshape(-1, *rollout.action.shape[2:])
-    tolerance = tolerance_of(log_prob_variance(run.policy, parameters, *rows))
-    assert_within(rollout.log_prob.ravel(), expected.ravel(), tolerance)
+    net = ActorCriticNetwork(run.policy)
+    net.flat[: net.acting_size] = torch.tensor(parameters)
+    exact, rows = in_float64(net), (x.reshape(-1, x.shape[-1]), rollout.action.reshape(-1, *rollout.action.shape[2:]))
+    x64, action = (in_double(torch.tensor(each)) for each in rows)
+    (of_log_prob,) = sampled(lambda: [exact.evaluate(x64, (), None, action)[0]])
+    of_log_prob.assert_is(rollout.log_prob.ravel(), expected.ravel())
 
 
 def test_arrays_are_contiguous_and_never_written_again() -> None:

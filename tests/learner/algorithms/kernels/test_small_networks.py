@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import msgspec
@@ -17,22 +18,12 @@ from torch import Tensor
 from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels import trained_networks
 from learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
-from protocol.arrays import Array
-from protocol.policy.layout import hidden_names
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from protocol.specs import ActionSpec, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN, IMAGE, recurrent, shared
 from tests.support.numbers.finite_differences import is_the_slope
-from tests.support.numbers.rounding import (
-    UNIT,
-    actor_critic_tolerance,
-    assert_within,
-    forward_tolerance,
-    network_layers,
-    q_gradient_tolerance,
-    value_tolerance,
-)
+from tests.support.numbers.rounding import assert_within, flat_gradient, in_double, in_float64, sampled
 
 BOUNDED = ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2)
 RELATIVE = 1e-7  # float64 has 1e-16; a few thousand additions, gradients that cancel, and 1 − tanh² near 0
@@ -67,26 +58,67 @@ def numbers(generator: np.random.Generator, *shape: int) -> Tensor:
     return torch.tensor(generator.normal(size=shape), dtype=torch.get_default_dtype())
 
 
+def is_the_same(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
+    """In float64, except for rounding."""
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=RELATIVE, atol=RELATIVE * theirs.abs().max().item())
+
+
+def values_of(net: ActorCriticNetwork, x: Tensor) -> list[Tensor]:
+    return [net.value(x)]
+
+
+def backward(loss: Tensor, net: FlatNetwork) -> Tensor:
+    """The gradient that a loss leaves in the network."""
+    net.flat_grad.zero_()
+    loss.backward()  # type: ignore[no-untyped-call]
+    return net.flat_grad.clone()
+
+
 # -------------------------------------------------------------------- an actor and a critic
 
 
-def check_actor_critic(spec: PolicySpec, rows: int, seed: int) -> None:
-    generator = np.random.default_rng(seed)
-    plain, small = pair(ActorCriticNetwork, SmallActorCritic, spec, seed, 0.4)
-    x, taken = numbers(generator, rows, 4), some_actions(spec.action, rows, generator)
-    given_back = [numbers(generator, rows) for _ in range(3)]
-    expected, found = (net.evaluate(x, (), None, taken) for net in (plain, small))
-    flat, tolerance = plain.flat.numpy(), value_tolerance(plain, x.numpy())
-    allowed = actor_critic_tolerance(spec, flat, x.numpy(), taken.numpy(), [each.numpy() for each in given_back])
-    for mine, theirs, bound in zip(found, expected, (allowed.log_prob, allowed.entropy, tolerance), strict=True):
-        assert_within(mine.detach().numpy(), theirs.detach().numpy(), bound)
-    assert_within(small.value(x).detach().numpy(), expected[2].detach().numpy(), tolerance)
-    for net, outputs in ((plain, expected), (small, found)):
-        net.flat_grad.zero_()
-        torch.autograd.backward(outputs, given_back)
-    assert_within(small.flat_grad.numpy(), plain.flat_grad.numpy(), allowed.gradient)
+class Rows(NamedTuple):
+    """Rows of noise for an actor and a critic, or for action values."""
+
+    x: Tensor  # [B, 4]
+    action: Tensor  # [B, *action]
+    by_outputs: list[Tensor]  # the gradient by each output
+
+    @classmethod
+    def of(cls, spec: PolicySpec, rows: int, seed: int) -> Rows:
+        generator = np.random.default_rng(seed)
+        shapes = [(rows, 4)] if spec.head == "q" else [(rows,)] * 3
+        x, action = numbers(generator, rows, 4), some_actions(spec.action, rows, generator)
+        return cls(x, action, [numbers(generator, *shape) for shape in shapes])
+
+    def outcome(self, net: Any, gradient: Callable[[Tensor, Any], Tensor] = backward) -> list[Tensor]:
+        """All outputs, the value alone, and the gradient."""
+        if net.spec.head == "q":
+            outputs = [net.params(self.x)]
+        else:
+            outputs = [*net.evaluate(self.x, (), None, self.action), net.value(self.x)]
+        total = torch.stack([(by * each).sum() for by, each in zip(self.by_outputs, outputs, strict=False)]).sum()
+        return [each.detach() for each in (*outputs, gradient(total, net))]
+
+    def in_double(self) -> Rows:
+        return Rows(in_double(self.x), in_double(self.action), [in_double(each) for each in self.by_outputs])
 
 
+def networks_of(spec: PolicySpec, seed: int) -> tuple[Any, Any]:
+    if spec.head == "q":
+        return pair(QNetwork, SmallQNetwork, spec, seed, 0.4)
+    return pair(ActorCriticNetwork, SmallActorCritic, spec, seed, 0.4)
+
+
+def is_the_same_in_chunks(spec: PolicySpec, rows: int, seed: int, chunk: int, by_torch: bool) -> None:
+    plain, small = networks_of(spec, seed)
+    given_rows = Rows.of(spec, rows, seed)
+    with patch.multiple(layers, CHUNK_ROWS=chunk, uses_torch=lambda _: by_torch):
+        is_the_same(given_rows.outcome(small), given_rows.outcome(plain))
+
+
+@pytest.mark.usefixtures("float64")
 @given(
     st.sampled_from(sorted(ACTIONS)),
     st.sampled_from(["tanh", "relu"]),
@@ -99,21 +131,49 @@ def check_actor_critic(spec: PolicySpec, rows: int, seed: int) -> None:
 def test_an_actor_and_a_critic(
     action: str, activation: Any, net: list[int], shared_net: bool, rows: int, chunk: int, by_torch: bool, seed: int
 ) -> None:
-    with patch.multiple(layers, CHUNK_ROWS=chunk, uses_torch=lambda _: by_torch):
-        check_actor_critic(PolicySpec((BOX,), ACTIONS[action], tuple(net), activation, shared_net=shared_net), rows, seed)
+    spec = PolicySpec((BOX,), ACTIONS[action], tuple(net), activation, shared_net=shared_net)
+    is_the_same_in_chunks(spec, rows, seed, chunk, by_torch)
 
 
-@pytest.mark.parametrize("rows", [64, 129, 513, 2048])
-@pytest.mark.parametrize("action", sorted(ACTIONS))
-def test_an_actor_and_a_critic_of_the_sizes_that_are_used(rows: int, action: str) -> None:
-    check_actor_critic(PolicySpec((BOX,), ACTIONS[action], (64, 64)), rows, 0)
+@pytest.mark.usefixtures("float64")
+@given(
+    st.sampled_from(["tanh", "relu"]),
+    st.lists(st.integers(1, 9), max_size=3),
+    st.booleans(),
+    st.integers(1, 40),
+    *ROUNDS.values(),
+)
+@settings(max_examples=100, deadline=None)
+def test_action_values(
+    activation: Any, net: list[int], dueling: bool, rows: int, chunk: int, by_torch: bool, seed: int
+) -> None:
+    spec = msgspec.structs.replace(DISCRETE, head="q", net=tuple(net), activation=activation, dueling=dueling)
+    is_the_same_in_chunks(spec, rows, seed, chunk, by_torch)
+
+
+VALUES = msgspec.structs.replace(DISCRETE, head="q", net=(64, 64))
+SIZES = [
+    *((PolicySpec((BOX,), action, (64, 64)), rows) for action in ACTIONS.values() for rows in (64, 129, 513, 2048)),
+    *((msgspec.structs.replace(VALUES, dueling=dueling), rows) for dueling in (False, True) for rows in (64, 129)),
+    *((msgspec.structs.replace(VALUES, dueling=dueling, net=(256, 256)), 2048) for dueling in (False, True)),
+]
+
+
+@pytest.mark.parametrize(("spec", "rows"), SIZES)
+def test_the_sizes_that_are_used_in_float32(spec: PolicySpec, rows: int) -> None:
+    plain, small = networks_of(spec, 0)
+    given_rows = Rows.of(spec, rows, 0)
+    exact, doubles = in_float64(plain), given_rows.in_double()
+    found = given_rows.outcome(small), given_rows.outcome(plain)
+    for expected, mine, theirs in zip(sampled(lambda: doubles.outcome(exact, flat_gradient)), *found, strict=True):
+        expected.assert_is(mine.numpy(), theirs.numpy())
 
 
 def test_the_tolerance_of_values_is_exceeded_if_a_single_term_is_lost() -> None:
     for net_size in ((), (5,), (64, 64)):
-        plain, small = pair(ActorCriticNetwork, SmallActorCritic, PolicySpec((BOX,), ACTIONS["discrete"], net_size), 0, 0.4)
+        plain, small = networks_of(PolicySpec((BOX,), ACTIONS["discrete"], net_size), 0)
         x = numbers(np.random.default_rng(0), 64, 4)
-        before, tolerance = small.value(x).detach(), value_tolerance(plain, x.numpy())
+        before, ((_, tolerance),) = small.value(x).detach(), sampled(partial(values_of, in_float64(plain), x.double()))
         for name in [name for name in small.parameters if name.startswith("critic") and name.endswith("weight")]:
             with torch.no_grad():
                 lost = small.parameters[name][0, -1].clone()
@@ -145,53 +205,10 @@ def test_the_gradient_of_an_actor_and_a_critic_is_the_slope(
     is_the_slope(net.flat_grad.numpy().copy(), lambda: total().item(), net.flat.numpy(), 1e-6)
 
 
-# -------------------------------------------------------------------- action values
-
-
-def check_action_values(spec: PolicySpec, rows: int, seed: int) -> None:
-    generator = np.random.default_rng(seed)
-    plain, small = pair(QNetwork, SmallQNetwork, spec, seed, 0.4)
-    x, by_value = numbers(generator, rows, 4), numbers(generator, rows, 4)
-    expected, found = plain.params(x), small.params(x)
-    trunk, tops = hidden_names(spec), ("q.out", "q.value") if spec.dueling else ("q.out",)
-    parts = [network_layers(plain.parameters, [*trunk, top]) for top in tops]
-    tolerance, *of_value = (forward_tolerance(part, x.numpy(), spec.activation == "relu") for part in parts)
-    if of_value:  # Q = V + A − mean A
-        tolerance = tolerance + of_value[0] + tolerance.mean(1, keepdims=True) + 8 * UNIT * float(found.detach().abs().max())
-    assert_within(found.detach().numpy(), expected.detach().numpy(), tolerance)
-    for net, values in ((plain, expected), (small, found)):
-        net.flat_grad.zero_()
-        values.backward(by_value)
-    allowed = q_gradient_tolerance(spec, plain.flat.numpy(), x.numpy(), by_value.numpy())
-    assert_within(small.flat_grad.numpy(), plain.flat_grad.numpy(), allowed)
-
-
-@given(
-    st.sampled_from(["tanh", "relu"]),
-    st.lists(st.integers(1, 9), max_size=3),
-    st.booleans(),
-    st.integers(1, 40),
-    *ROUNDS.values(),
-)
-@settings(max_examples=100, deadline=None)
-def test_action_values(
-    activation: Any, net: list[int], dueling: bool, rows: int, chunk: int, by_torch: bool, seed: int
-) -> None:
-    spec = msgspec.structs.replace(DISCRETE, head="q", net=tuple(net), activation=activation, dueling=dueling)
-    with patch.multiple(layers, CHUNK_ROWS=chunk, uses_torch=lambda _: by_torch):
-        check_action_values(spec, rows, seed)
-
-
-@pytest.mark.parametrize("dueling", [False, True])
-@pytest.mark.parametrize(("rows", "net"), [(64, (64, 64)), (129, (64, 64)), (2048, (256, 256))])
-def test_action_values_of_the_sizes_that_are_used(dueling: bool, rows: int, net: tuple[int, ...]) -> None:
-    check_action_values(msgspec.structs.replace(DISCRETE, head="q", net=net, dueling=dueling), rows, 0)
-
-
 # -------------------------------------------------------------------- an actor and two critics
 
 
-def everything_of(net: ActorAndCritics, seed: int, rows: int) -> list[Array]:
+def everything_of(net: ActorAndCritics, seed: int, rows: int) -> list[Tensor]:
     """All outputs and gradients for random rows."""
     generator = np.random.default_rng(seed)
     x, action, noise = (numbers(generator, rows, size) for size in (4, 2, 2))
@@ -202,7 +219,7 @@ def everything_of(net: ActorAndCritics, seed: int, rows: int) -> list[Array]:
     parts = (taken, log_prob, values, *by_action)
     loss: Tensor = sum((part * numbers(generator, *part.shape)).sum() for part in parts)  # type: ignore[assignment]
     loss.backward()  # type: ignore[no-untyped-call]
-    return [each.detach().numpy() for each in (*parts, net.params(x), net.actor.grad, net.critics.grad) if each is not None]
+    return [each.detach() for each in (*parts, net.params(x), net.actor.grad, net.critics.grad) if each is not None]
 
 
 @pytest.mark.usefixtures("float64")
@@ -218,8 +235,7 @@ def test_an_actor_and_two_critics(net: list[int], activation: Any, head: Any, ro
     """Weights are large, so that the logarithms of many standard deviations leave their bounds."""
     spec = PolicySpec((BOX,), BOUNDED, tuple(net), activation, head=head)
     plain, small = pair(ActorAndCritics, SmallActorAndCritics, spec, seed, 1.5)
-    for mine, theirs in zip(everything_of(small, seed, rows), everything_of(plain, seed, rows), strict=True):
-        np.testing.assert_allclose(mine, theirs, rtol=RELATIVE, atol=RELATIVE * abs(theirs).max())
+    is_the_same(everything_of(small, seed, rows), everything_of(plain, seed, rows))
 
 
 @pytest.mark.usefixtures("float64")
@@ -265,8 +281,8 @@ def test_a_loss_may_contain_several_calls(order: Sequence[int]) -> None:
         for net in nets:
             net.flat_grad.zero_()
             three_calls(net, order).backward()  # type: ignore[no-untyped-call]
-        plain, small = (net.flat_grad.numpy() for net in nets)
-        np.testing.assert_allclose(small, plain, rtol=RELATIVE, atol=RELATIVE * abs(plain).max())
+        plain, small = (net.flat_grad for net in nets)
+        is_the_same([small], [plain])
 
 
 def test_a_pass_without_a_gradient_leaves_the_arrays_of_one_whose_backward_is_to_come() -> None:
@@ -371,8 +387,10 @@ def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(layers, "MAX_PLANS", 30)
     plain, net = pair(ActorCriticNetwork, SmallActorCritic, msgspec.structs.replace(DISCRETE, net=(5,)), 0, 0.4)
     x = numbers(np.random.default_rng(0), 99, 4)
+    exact = in_float64(plain)
+    ((_, tolerance),) = sampled(lambda: [exact.value(x.double())])
     with torch.no_grad():
-        whole, tolerance = net.value(x).numpy(), value_tolerance(plain, x.numpy())
+        whole = net.value(x).numpy()
         for rows in (*range(1, 99), 40, 2):
             assert_within(net.value(x[:rows]).numpy(), whole[:rows], tolerance[:rows])
             (workspace,) = net._critic_alone._free
