@@ -92,17 +92,17 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
         stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     warm_mb = _resident_mb(me)
-    first, bytes_before, used_before = len(published_s), link.received.bytes, coordinator.ledger.used
+    first, bytes_before, used_before = len(published_s), link.received.bytes, coordinator.rollouts.ledger.used
     cpu_s, python_s, began_s = time.process_time(), time.thread_time(), time.monotonic()
     while time.monotonic() - began_s < seconds and len(published_s) < VERSIONS:
         stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     took_s = time.monotonic() - began_s
     cpu_s, python_s = time.process_time() - cpu_s, time.thread_time() - python_s
-    used = coordinator.ledger.used - used_before
+    used = coordinator.rollouts.ledger.used - used_before
     received_bytes = link.received.bytes - bytes_before
     growth_mb = _resident_mb(me) - warm_mb
-    counts = coordinator.ledger.counts()
+    counts = coordinator.rollouts.ledger.counts()
     lost = counts["lost"] + sum(counts[f"transitions_{why}"] for why in ("duplicate", "late", "invalid"))
     lost += counts["messages_bad"] + abs(counts["issued"] - counts["used"] - counts["outstanding"])
     for _ in range(2):  # so that the weights measured last arrive

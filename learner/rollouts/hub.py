@@ -260,7 +260,7 @@ class Hub:
         return HubSnapshot(
             progress=self._progress,
             version=coordinator.version,
-            ledger=coordinator.ledger.copy(),
+            ledger=coordinator.rollouts.ledger.copy(),
             incarnations=coordinator.rollouts.incarnations(),
             lags=self._lags,
             lag_counts=dict(self.weight_age.lags),

@@ -20,6 +20,6 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiti
         return_mean=progress.return_mean,
         lag_mean=progress.lag_mean,
         lag_max=progress.lag_max,
-        ledger=coordinator.ledger.counts(),
+        ledger=coordinator.rollouts.ledger.counts(),
         waiting=waiting,
     )

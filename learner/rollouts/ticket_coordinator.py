@@ -64,7 +64,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         super().__init__(membership, worker_timeout_s)
         self.run = run
         self.version = -1  # until `publish`
-        self.ledger = self.rollouts.ledger
         self._placement = LanePlacement(lanes, _by_joining)
         self.weights = SentWeights()
 
@@ -72,7 +71,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Count a message that could not be read, and answer it."""
-        self.ledger.messages_bad += 1
+        self.rollouts.ledger.messages_bad += 1
         return super().reject_message(peer, why, now)
 
     def reject_rollout(self, peer: bytes, rollout: Rollout, why: str, now: float) -> list[Outgoing]:
@@ -142,7 +141,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             self.rollouts.late(message)
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        self.ledger.late_actions += member.new_late_actions(heartbeat)
+        self.rollouts.ledger.late_actions += member.new_late_actions(heartbeat)
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import get_args
 
 import numpy as np
 
@@ -65,8 +66,9 @@ def messages(lanes: int) -> list[ToWorker]:
 
 def corpus(lanes: int = 2) -> bytes:
     """For each message: the number of its frames, then the length and the bytes of each. Numbers are `<u4`."""
-    parts = []
-    for message in messages(lanes):
+    parts, told = [], messages(lanes)
+    assert {type(message) for message in told} == set(get_args(ToWorker))
+    for message in told:
         frames = encode(message)
         parts.append(struct.pack("<I", len(frames)))
         parts += [struct.pack("<I", len(bytes(frame))) + bytes(frame) for frame in frames]

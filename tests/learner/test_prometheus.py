@@ -118,7 +118,7 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     process_ends(learning.coordinator, "a", "was killed")
     learning.coordinator.reject_message(B, "rubbish", 0.0)
     found = scraped.metrics()
-    ledger = learning.coordinator.ledger.counts()
+    ledger = learning.coordinator.rollouts.ledger.counts()
     assert ledger["lost"] > 0
     assert by(found, "millrace_tickets_total", "reason") == {name: ledger[name] for name in ("used", "lost")}
     assert found["millrace_tickets_issued_total", ()] == ledger["issued"]

@@ -50,7 +50,7 @@ SAVED: dict[type, set[str]] = {
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "ledger"},
+    TicketCoordinator: {"run", "worker_timeout_s", "evaluation"},
     RolloutTickets: {"_absent"},
     SentWeights: set(),
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
@@ -101,7 +101,7 @@ class Learner:
             if arrived.rollout.ticket not in waiting:
                 assert arrived.rollout is message, "a rollout that did not arrive was accepted"
                 self._accept(arrived)
-        rejected = self.coordinator.ledger.transitions_invalid
+        rejected = self.coordinator.rollouts.ledger.transitions_invalid
         assert rejected == 0, "a rollout of a worker that does all right was rejected"
         return out + self._learn()
 
@@ -168,7 +168,9 @@ class Learner:
         coordinator = self.coordinator
         incarnations = tuple(incarnation(lane, number) for lane, number in enumerate(coordinator.rollouts.incarnations()))
         accepted = tuple(_accepted(lane, number) for lane, (number, _, _) in enumerate(self.accepted))
-        self.checkpoints.append((ticket(coordinator.ledger.issued), coordinator.ledger.used, incarnations, accepted))
+        self.checkpoints.append(
+            (ticket(coordinator.rollouts.ledger.issued), coordinator.rollouts.ledger.used, incarnations, accepted)
+        )
         return []
 
     def _accept(self, arrived: AcceptedRollout) -> None:
@@ -186,7 +188,7 @@ class Learner:
         """Take the rollouts of an update, if there are enough."""
         if self.updating:
             return []
-        coordinator, ledger = self.coordinator, self.coordinator.ledger
+        coordinator, ledger = self.coordinator, self.coordinator.rollouts.ledger
         before = ledger.transitions_used
         taken = coordinator.rollouts.take()
         if taken is None:
@@ -204,7 +206,7 @@ class Learner:
 
     def check(self) -> None:
         """The rules that hold in every state."""
-        coordinator, ledger, rollouts = self.coordinator, self.coordinator.ledger, self.coordinator.rollouts
+        coordinator, ledger, rollouts = self.coordinator, self.coordinator.rollouts.ledger, self.coordinator.rollouts
         waiting = waiting_rollouts(coordinator)
         assert ledger.outstanding == len(rollouts.held) + len(waiting), "the ledger does not balance"
         waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
@@ -272,8 +274,8 @@ def saved(learner: Learner, now: float) -> Content:
     tickets = sorted(coordinator.rollouts.held.values(), key=lambda each: each.number)
     waiting_for = coordinator._placement._waiting_for
     return (
-        ticket(coordinator.ledger.issued),
-        coordinator.ledger.used,
+        ticket(coordinator.rollouts.ledger.issued),
+        coordinator.rollouts.ledger.used,
         coordinator.version,
         tuple(rounds._versions.values()),
         tuple(_lane(lane, rounds.next) for lane in lanes),
@@ -367,7 +369,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
         ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
     )
     coordinator.version = version
-    coordinator.ledger.transitions_received = len(ready)
+    coordinator.rollouts.ledger.transitions_received = len(ready)
     coordinator.rollouts.rounds._versions = dict(enumerate(versions))
     coordinator.rollouts._to_deal = set(to_deal)
     coordinator.weights.kept = {each: weights(each) for each in held}

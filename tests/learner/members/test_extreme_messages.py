@@ -65,8 +65,7 @@ RUN = run_spec(LANES)
 @cache
 def sayings() -> list[list[bytes]]:
     """Everything that the hostile worker says, each in a session that is filled in."""
-    rollout = fake_rollout(SESSION, 0, 1, 0, 0)
-    return [frames for message in real(rollout) for frames in extremes(message)]
+    return [frames for message in real(SESSION) for frames in extremes(message)]
 
 
 @pytest.fixture(autouse=True)
@@ -190,7 +189,7 @@ def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
         link.told.clear()
         link.now += TURN_S
     assert hub._server.unexpected_errors == 0
-    ledger = coordinator.ledger
+    ledger = coordinator.rollouts.ledger
     assert ledger.issued == ledger.used + ledger.outstanding + ledger.lost
     assert ledger.lost == 0
     assert not any(MARK in text for text in link.observed)
@@ -345,7 +344,7 @@ def test_fuzzed_bytes_change_nothing() -> None:
             link.says(next(fuzzed))
 
     for play in (used, answers):
-        fuzzed = hostile(5, real(fake_rollout(SESSION, 0, 1, 0, 0)))
+        fuzzed = hostile(5, real(SESSION))
         assert play(100, say) == play(100, silent)
 
 
@@ -360,6 +359,6 @@ def test_the_sayings_reach_every_field_and_some_of_every_kind_are_understood() -
             continue
         understood[type(message)] = understood.get(type(message), 0) + 1
     assert all(text.isprintable() and len(text) <= 500 for text in refusals)
-    assert set(understood) | {Inquire} == {type(message) for message in real(fake_rollout(7, 0, 1, 0, 0))}
+    assert set(understood) | {Inquire} == {type(message) for message in real(7)}
     assert min(understood.values()) > 20
     assert understood[Rollout] > 300

@@ -426,7 +426,7 @@ def test_invented_stage_names_are_not_kept() -> None:
         as_bytes(noisy, "a", Heartbeat(session, 0, (0,), (), 0, {f"stage {n}": 1.0 for n in range(45_000)}, 0))  # type: ignore[misc]
         as_bytes(noisy, "a", Heartbeat(session, 0, (0,), (), 0, {"[/red]": 1.0}, 0))  # type: ignore[dict-item]
     assert noisy.coordinator.membership.stages() == {}
-    assert noisy.coordinator.ledger.messages_bad == 10
+    assert noisy.coordinator.rollouts.ledger.messages_bad == 10
 
 
 def test_goodbyes_with_a_reason_of_a_megabyte_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:

@@ -50,7 +50,7 @@ def test_every_rule_holds_over_a_hostile_network(block: int) -> None:
 def test_without_faults_nothing_is_lost_or_said_twice() -> None:
     world = World(1, Faults(until_s=0.0), workers=2, lanes=4, max_lag=0)
     world.play(updates=200)
-    counts = world.coordinator.ledger.counts()
+    counts = world.coordinator.rollouts.ledger.counts()
     assert counts["lost"] == counts["transitions_duplicate"] == counts["transitions_late"] == 0
     assert counts["used"] == 4 * 200
 
@@ -83,5 +83,5 @@ def test_lost_messages_cost_no_transition() -> None:
     world = World(5, Faults(loss=0.05, until_s=0.0), workers=2, lanes=4, max_lag=1)
     world.coordinator.worker_timeout_s = 1e9
     world.play(updates=100, limit_s=4000.0)
-    assert world.coordinator.ledger.lost == 0
-    assert world.coordinator.ledger.used == 4 * (100 + world.updating)
+    assert world.coordinator.rollouts.ledger.lost == 0
+    assert world.coordinator.rollouts.ledger.used == 4 * (100 + world.updating)

@@ -8,7 +8,6 @@ import psutil
 
 from protocol.errors import BadMessage
 from protocol.wire.codec import decode_to_learner
-from tests.support.conversation.fake_ends import fake_rollout
 from tests.support.conversation.hostile_messages import Frames, hostile, real
 
 MESSAGES = 100_000
@@ -29,7 +28,7 @@ def test_a_hundred_thousand_hostile_messages_raise_one_error_and_leave_no_memory
     process = psutil.Process()
     refused = understood = 0
     before_mb = 0.0
-    for number, frames in enumerate(islice(hostile(1, real(fake_rollout(7, 0, 1, 0, 0))), MESSAGES)):
+    for number, frames in enumerate(islice(hostile(1, real(7)), MESSAGES)):
         if number == MESSAGES // 10:  # what is used once is there
             before_mb = process.memory_info().rss / 2**20
         says = _refusal(frames)

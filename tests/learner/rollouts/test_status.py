@@ -54,7 +54,7 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
         ("a", "far", 1, "active"),
     ]
     assert sorted(lane for worker in found.workers for lane in worker.lanes) == [0, 1, 2]
-    assert found.ledger == learner.coordinator.ledger.counts()
+    assert found.ledger == learner.coordinator.rollouts.ledger.counts()
     learner.coordinator.drain("done")
     assert {worker.state for worker in told(learner).workers} == {"draining"}
 

@@ -19,12 +19,8 @@ from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from protocol.messages import (
     PROTOCOL_VERSION,
-    Alive,
     Collect,
-    Described,
     Drain,
-    EpisodeRows,
-    Evaluated,
     Failure,
     Goodbye,
     Heartbeat,
@@ -36,16 +32,13 @@ from protocol.messages import (
     Refuse,
     Rejoin,
     Release,
-    Returned,
     Rollout,
-    Stepped,
     ToLearner,
     Weights,
     Welcome,
-    WorkerActivity,
 )
-from protocol.space_spec import EnvDescription, MultiBinarySpace
 from protocol.wire.codec import decode_to_worker, encode
+from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
 
 M = TypeVar("M")
@@ -156,7 +149,7 @@ class Learner:
         return taken
 
     def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
-        coordinator, ledger = self.coordinator, self.coordinator.ledger
+        coordinator, ledger = self.coordinator, self.coordinator.rollouts.ledger
         in_flight = len(coordinator.rollouts.held) + coordinator.rollouts.waiting()
         assert ledger.issued == ledger.used + ledger.lost + in_flight
         assert ledger.transitions_waiting == coordinator.rollouts.waiting()  # a fake rollout is one transition
@@ -194,7 +187,7 @@ def test_hello_is_answered_by_welcome_collect_and_weights_in_this_order() -> Non
 def test_before_the_first_weights_a_worker_is_welcomed_and_given_nothing() -> None:
     learner = Learner(publish=False)
     assert kinds(learner.joins(A), A) == [Welcome]
-    assert learner.coordinator.ledger.issued == 0
+    assert learner.coordinator.rollouts.ledger.issued == 0
     assert kinds(learner.publish(0), A) == [Collect, Weights]
 
 
@@ -203,7 +196,7 @@ def test_a_repeated_hello_is_answered_by_the_same_welcome() -> None:
     first = of(learner.joins(A), Welcome)
     again = learner.joins(A)
     assert again == [(A, first[0])]
-    assert learner.coordinator.ledger.lost == 0
+    assert learner.coordinator.rollouts.ledger.lost == 0
 
 
 def test_a_repeated_hello_is_a_sign_of_life() -> None:
@@ -220,7 +213,7 @@ def test_a_later_attempt_of_the_same_process_begins_a_new_session() -> None:
     learner.joins(A)
     outs = learner.joins(A, attempt=2)
     assert of(outs, Welcome) == [Welcome(101, 4_003, learner.coordinator.run)]
-    assert learner.coordinator.ledger.lost == 2
+    assert learner.coordinator.rollouts.ledger.lost == 2
     assert {permit.incarnation for permit in permits(outs)} == {1}
 
 
@@ -238,7 +231,7 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
     outs = learner.joins(A, pid=pid, host=host)
     assert kinds(outs, A) == [Welcome, Collect, Weights]
     assert learner.session(A) == 101
-    assert learner.coordinator.ledger.lost == 2
+    assert learner.coordinator.rollouts.ledger.lost == 2
     assert WorkerLeft("a", f"replaced by process {pid}", 2, False) in learner.coordinator.events
 
 
@@ -417,7 +410,7 @@ def test_a_ticket_is_used_once_and_a_repeat_is_counted() -> None:
     learner.says(A, rollout)
     assert [r.ticket for r in learner.take()] == [0]
     learner.says(A, rollout)
-    ledger = learner.coordinator.ledger
+    ledger = learner.coordinator.rollouts.ledger
     assert (ledger.used, ledger.transitions_used, ledger.transitions_duplicate) == (1, 1, 2)
 
 
@@ -427,7 +420,7 @@ def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() 
     rollout = learner.rollout_of(0)
     process_ends(learner.coordinator, "a", "killed")
     assert learner.says(A, rollout) == [(A, Rejoin(100))]
-    assert (learner.coordinator.ledger.transitions_late, learner.coordinator.rollouts.ready) == (1, {})
+    assert (learner.coordinator.rollouts.ledger.transitions_late, learner.coordinator.rollouts.ready) == (1, {})
 
 
 @pytest.mark.parametrize("change", [{"version": 0}, {"version": 2}, {"lane": 1}, {"sequence": 0}, {"sequence": 2}])
@@ -438,7 +431,7 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(chan
     number, other = learner.tickets()
     assert learner.coordinator.rollouts.held[number].version == learner.coordinator.rollouts.held[number].sequence == 1
     outs = learner.says(A, msgspec.structs.replace(learner.rollout_of(number), **change))
-    ledger = learner.coordinator.ledger
+    ledger = learner.coordinator.rollouts.ledger
     assert (learner.coordinator.rollouts.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
     assert permits(outs) == [Permit(other + 1, 0, 0, 2)]
     assert learner.coordinator.members[A].strikes == 1
@@ -505,7 +498,7 @@ def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
     assert learner.coordinator.rollouts.lanes[3].incarnation == 1
     learner.update()
     assert len(lanes_of(learner, A)) == len(lanes_of(learner, B)) == 2
-    assert learner.coordinator.ledger.lost == 0
+    assert learner.coordinator.rollouts.ledger.lost == 0
 
 
 def test_release_travels_before_what_the_lanes_new_owner_is_told() -> None:
@@ -663,7 +656,7 @@ def test_a_lost_collect_is_said_again_only_when_a_reply_said_after_it_has_been_s
     assert of(learner.beats(A, tickets=[], replies=1), Collect) == []  # the repeat may be on its way
     assert of(learner.beats(A, tickets=[], replies=2), Collect) == [first]  # reply 2 was said after it
     assert of(learner.beats(A, tickets=[0]), Collect) == []
-    assert learner.coordinator.ledger.issued == 1
+    assert learner.coordinator.rollouts.ledger.issued == 1
 
 
 def test_lost_weights_are_said_again_only_when_a_reply_said_after_them_has_been_seen() -> None:
@@ -711,7 +704,7 @@ def test_a_lost_rollout_is_asked_for_again() -> None:
     learner.beats(A)
     outs = learner.beats(A, tickets=[1])
     assert permits(outs) == [Permit(0, 0, 0, 0)]
-    assert learner.coordinator.ledger.lost == 0
+    assert learner.coordinator.rollouts.ledger.lost == 0
 
 
 def test_lost_collects_of_several_versions_are_said_again_each_under_its_own() -> None:
@@ -749,7 +742,7 @@ def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
     learner.joins(A)
     outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0))
     assert permits(outs) == [Permit(1, 0, 0, 1)]
-    ledger = learner.coordinator.ledger
+    ledger = learner.coordinator.rollouts.ledger
     assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
 
 
@@ -774,8 +767,8 @@ def test_a_worker_that_keeps_sending_rubbish_is_refused_and_what_it_held_is_deal
             outs = learner.balanced(learner.coordinator.reject_message(A, "not understood", 0.0))
     assert outs == [(A, Refuse("not understood"))]
     assert A not in learner.coordinator.members
-    assert learner.coordinator.ledger.outstanding == 0
-    assert learner.coordinator.ledger.messages_bad == (STRIKES if kind == "message" else 0)
+    assert learner.coordinator.rollouts.ledger.outstanding == 0
+    assert learner.coordinator.rollouts.ledger.messages_bad == (STRIKES if kind == "message" else 0)
     assert learner.coordinator.events[1:] == [WorkerRefused("a", "not understood", 1)]  # the one line about its end
 
 
@@ -792,7 +785,7 @@ def test_rubbish_of_a_stranger_is_counted_and_refused() -> None:
     learner = Learner()
     ((peer, refuse),) = learner.coordinator.reject_message(b"stranger", "no head", 0.0)
     assert isinstance(refuse, Refuse)
-    assert (peer, learner.coordinator.ledger.messages_bad, learner.coordinator.members) == (b"stranger", 1, {})
+    assert (peer, learner.coordinator.rollouts.ledger.messages_bad, learner.coordinator.members) == (b"stranger", 1, {})
 
 
 def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raising() -> None:
@@ -800,7 +793,7 @@ def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raisi
     learner.joins(A)
     bad = msgspec.structs.replace(learner.rollout_of(0), valid=np.full((1, 1), 9.0, np.float32))
     learner.balanced(learner.coordinator.reject_rollout(A, bad, "valid expected bool", 0.0))
-    assert learner.coordinator.ledger.transitions_invalid == 0
+    assert learner.coordinator.rollouts.ledger.transitions_invalid == 0
 
 
 def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the_same_number() -> None:
@@ -820,7 +813,7 @@ def test_a_rollout_whose_sequence_cannot_be_is_not_used(sequence: int) -> None:
     learner.joins(A)
     learner.says(A, learner.rollout_of(0, sequence=sequence))
     assert learner.coordinator.rollouts.lanes[0].out_of_order == set()
-    assert learner.coordinator.ledger.transitions_invalid == 1
+    assert learner.coordinator.rollouts.ledger.transitions_invalid == 1
 
 
 # -------------------------------------------------------------------- leaving
@@ -901,10 +894,10 @@ def test_drain_asks_everybody_to_leave_and_deals_no_more() -> None:
     learner.joins(B)
     assert learner.balanced(learner.coordinator.drain("finished")) == [(A, Drain("finished")), (B, Drain("finished"))]
     learner.deliver_all()
-    issued = learner.coordinator.ledger.issued
+    issued = learner.coordinator.rollouts.ledger.issued
     learner.take()
     assert learner.publish(1) == []
-    assert learner.coordinator.ledger.issued == issued
+    assert learner.coordinator.rollouts.ledger.issued == issued
 
 
 def test_what_a_draining_worker_still_delivers_is_counted_and_can_be_used() -> None:
@@ -960,7 +953,7 @@ def test_every_ticket_ends_as_used_or_lost() -> None:
     process_ends(learner.coordinator, "a", "killed")
     learner.joins(B)
     learner.update_round(2)
-    counts = learner.coordinator.ledger.counts()
+    counts = learner.coordinator.rollouts.ledger.counts()
     assert {name: counts[name] for name in ("issued", "used", "lost", "outstanding")} == {
         "issued": 12, "used": 4, "lost": 4, "outstanding": 4,
     }  # fmt: skip
@@ -976,7 +969,7 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
     learner.publish(1)
     learner.coordinator.reject_rollout(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
     learner.says(A, msgspec.structs.replace(rollout, session=5))  # late
-    counts = learner.coordinator.ledger.counts()
+    counts = learner.coordinator.rollouts.ledger.counts()
     named = ("used", "duplicate", "invalid", "late")
     assert [counts[f"transitions_{name}"] for name in named] == [1, 1, 1, 1]
     assert counts["transitions_received"] == 4
@@ -1007,7 +1000,7 @@ def test_no_life_is_lived_twice_across_resumes() -> None:
             lives |= fresh
             learner.update()
             process_ends(learner.coordinator, peer.decode(), "killed")
-        version, ledger = learner.coordinator.version, msgspec.structs.replace(learner.coordinator.ledger)
+        version, ledger = learner.coordinator.version, msgspec.structs.replace(learner.coordinator.rollouts.ledger)
         incarnations = learner.coordinator.rollouts.incarnations()
         ledger.lost += ledger.outstanding
 
@@ -1033,7 +1026,7 @@ def test_a_resumed_run_with_other_lanes_deals_tickets_from_there(before: int, la
         learner.deliver_round()
         assert sorted(rollout.lane for rollout in learner.take()) == list(range(lanes))
         learner.publish(100 + update)
-    assert learner.coordinator.ledger.used == 100 * before + 5 * lanes
+    assert learner.coordinator.rollouts.ledger.used == 100 * before + 5 * lanes
 
 
 def test_a_lane_that_is_given_up_and_comes_back_does_not_live_again() -> None:
@@ -1081,23 +1074,7 @@ def in_standing(standing: MemberState) -> Learner:
     return learner
 
 
-EVERY_MESSAGE: list[ToLearner] = [
-    Hello(PROTOCOL_VERSION, "a", "host", 1, 1001, "fake", 1),
-    fake_rollout(100, 0, 0, 0, 0),
-    Heartbeat(100, 0, (0,), (0,), 0, {}, 0),
-    Goodbye(100, "bye", ()),
-    Failure(100, "broke", "", None),
-    Stepped(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
-    Returned(100, 0, 0, 0, np.zeros(0, np.uint8), "", ""),
-    Described(100, EnvDescription(MultiBinarySpace((1,)), MultiBinarySpace((1,)), np.zeros(0, np.uint8), "", 0, "")),
-    EpisodeRows(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
-    Evaluated(100, 0, (), ()),
-    Alive((WorkerActivity("a", 1001, "stepping", 1.0, 1),), ()),
-]
-
-
-def test_every_message_to_a_learner_is_tried() -> None:
-    assert {type(message) for message in EVERY_MESSAGE} == set(ToLearner.__args__)
+EVERY_MESSAGE = to_learner(100, "a", 1001)
 
 
 @pytest.mark.parametrize("standing", MemberState)

@@ -71,7 +71,7 @@ def test_a_run_in_which_each_copy_crashes_once_in_two_hours_goes_on() -> None:
     for turn in range(20 * COPIES):  # 40 hours
         run.crashes(turn % COPIES, after_steps=True)
         run.updates(2 * HOUR_S / COPIES)
-    assert run.coordinator.ledger.used == 20 * COPIES * COPIES
+    assert run.coordinator.rollouts.ledger.used == 20 * COPIES * COPIES
 
 
 def test_a_run_in_which_a_copy_crashes_before_its_first_step_ends_at_the_fourth_crash() -> None:

@@ -47,7 +47,9 @@ class EvaluatingLearner(Learner):
         tickets, members = self.coordinator.evaluation, self.coordinator.members
         if not tickets.pending:
             return
-        assert self.coordinator.ledger.issued == self.barrier, "a ticket for a rollout was dealt during an evaluation"
+        assert self.coordinator.rollouts.ledger.issued == self.barrier, (
+            "a ticket for a rollout was dealt during an evaluation"
+        )
         assert tickets._version == self.coordinator.version, "an evaluation belongs to another version"
         held = [number - tickets._first for number in tickets.held]
         every = sorted([*tickets._undealt, *held, *tickets._played])
@@ -64,7 +66,7 @@ class EvaluatingLearner(Learner):
     def _publish(self, version: int) -> list[Outgoing]:
         coordinator, settings = self.coordinator, self.settings
         evaluates = version in settings.evaluated
-        self.barrier, self.rows = coordinator.ledger.issued, []
+        self.barrier, self.rows = coordinator.rollouts.ledger.issued, []
         if not evaluates:
             return super()._publish(version)
         coordinator.publish(version, PARAMETERS, BUFFERS)

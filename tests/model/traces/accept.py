@@ -141,7 +141,7 @@ def _learners(folder: Path, accepted: Acceptance) -> list[LearnerTrace]:
 
 
 def _check_checkpoint(name: str, coordinator: Any, moments: list[tuple[Any, ...]]) -> None:
-    ledger: Ledger = coordinator.ledger
+    ledger: Ledger = coordinator.rollouts.ledger
     began = tuple(coordinator.rollouts.incarnations()), ledger.issued, ledger.used
     if began not in moments:
         raise NotAccepted(

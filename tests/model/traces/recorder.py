@@ -38,6 +38,10 @@ METHODS = {
         *("next_work", "work_ended"),
     ),
 }
+NOT_RECORDED = {  # it changes nothing, or nobody calls it
+    "DescribeCoordinator": {"drain", "status"},
+    "Session": {"is_unwanted"},
+}
 MADE_BY_THE_COORDINATOR = ("Membership", "RolloutTickets", "EvaluationTickets")
 CHANGE_NOTHING_IF_EMPTY = ("tick", "heartbeat_if_due")
 

@@ -147,7 +147,7 @@ class Replay:
         result = getattr(called, record.method)(*given, **named)
         found = self._digests.result(result)
         if record.method == "incarnations":
-            found = tuple(result), coordinator.ledger.issued, coordinator.ledger.used
+            found = tuple(result), coordinator.rollouts.ledger.issued, coordinator.rollouts.ledger.used
         assert found == record.result, f"expected {record.result}, got {found}"
         if coordinator is not None:
             coordinator.membership.events.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import pickle
 import shutil
@@ -12,11 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from learner.members.describe_coordinator import DescribeCoordinator
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from tests.model.traces.accept import Acceptance, LearnerTrace, Moment, WorkerTrace, accept, check_order, processes_by_sender
 from tests.model.traces.record import Record, SaidRollout, read
-from tests.model.traces.recorder import FOLDER
+from tests.model.traces.recorder import FOLDER, METHODS, NOT_RECORDED
 from tests.model.traces.replay import NotAccepted
 from tests.system.stage.processes import ROOT, SMALL, TOY, Stage, free_port
+from workers.conversation.session import Session
 
 ADDRESS = "tcp://127.0.0.1:{}"
 UPDATES = 4
@@ -51,6 +55,12 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def accepted(traces: Path) -> Acceptance:
     return accept(traces)
+
+
+@pytest.mark.parametrize("part", [TicketCoordinator, DescribeCoordinator, Session])
+def test_every_method_that_a_shell_may_call_is_recorded_or_left_out_on_purpose(part: type) -> None:
+    public = {name for name, _ in inspect.getmembers(part, inspect.isfunction) if not name.startswith("_")}
+    assert public == {*METHODS[part.__name__], *NOT_RECORDED.get(part.__name__, ())}
 
 
 def test_the_run_is_one_of_the_model(accepted: Acceptance) -> None:

@@ -641,7 +641,7 @@ def test_rubbish_makes_few_lines_and_ends_a_session(net: Net, caplog: pytest.Log
     worker.send(encode(hello()))
     for _ in range(200):
         worker.send([b"rubbish"])
-    serve(hub, lambda: hub.coordinator.ledger.messages_bad == 200)
+    serve(hub, lambda: hub.coordinator.rollouts.ledger.messages_bad == 200)
     assert not hub.coordinator.members
     assert len([line for line in lines(caplog, "millrace.learner") if "message from" in line]) == 1
 

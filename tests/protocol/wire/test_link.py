@@ -19,83 +19,30 @@ from protocol.address import check_address, is_local
 from protocol.errors import BadMessage, UsageError
 from protocol.messages import (
     PROTOCOL_VERSION,
-    Alive,
-    Call,
-    Collect,
-    Described,
     Drain,
-    EpisodeRows,
-    Evaluate,
-    Evaluated,
-    Failure,
     Goodbye,
-    Heartbeat,
-    HeartbeatReply,
     Hello,
     Inquire,
-    LaneIncarnation,
-    Permit,
-    Received,
-    Refuse,
     Rejoin,
-    Release,
-    Reset,
-    Returned,
     Rollout,
-    Step,
-    Stepped,
     ToLearner,
     ToWorker,
     Weights,
-    Welcome,
-    WorkerActivity,
-    WorkerExit,
 )
-from protocol.rollout import Episode
-from protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
 from protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
 from protocol.wire.compression import Packing
 from protocol.wire.learner_link import LearnerLink
-from protocol.wire.plain_values import pack
 from protocol.wire.sockets import COPY_BELOW_BYTES
 from protocol.wire.worker_link import WorkerLink
-from tests.support.conversation.fake_ends import fake_rollout, run_spec
+from tests.support.conversation.every_message import to_learner, to_worker
+from tests.support.conversation.fake_ends import fake_rollout
 
 Context = zmq.Context[zmq.Socket[bytes]]
 
 DEADLINE_S = 10.0
 HELLO = Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)
 
-BOUNDS = (np.array(-1, np.float32), np.array(1, np.float32))
-PACKED = np.frombuffer(pack([(0, {"ünï": 1.5})]), np.uint8)
-
-TO_LEARNER: list[ToLearner] = [
-    HELLO,
-    fake_rollout(1, 2, 3, 4, 5),
-    Heartbeat(1, 2, (3, 4), (4, 5), 6, {"step": 0.5}, 7),
-    Goodbye(1, "told to stop", (4,)),
-    Failure(1, "ValueError: ünïcode", "Traceback: …", None),
-    Stepped(1, 2, 0, 1, (np.ones((3, 4), np.float32),), np.ones(3), np.zeros(3, bool), np.ones(3, bool), PACKED),
-    Returned(1, 2, 0, 1, PACKED, "ValueError: ünïcode", "Traceback: …"),
-    Alive((WorkerActivity("w0", 1, "stepping", 0.5, 7),), (WorkerExit("w1", 2, "was killed by SIGKILL", True),)),
-    Described(1, EnvDescription(BoxSpace((2,), "float32", *BOUNDS), DiscreteSpace(2, 0, "int64"), PACKED, "", 500, "")),
-    EpisodeRows(1, 2, 0, 0, (np.ones((3, 4)),), np.ones(2), np.ones(2), np.zeros(2, bool), np.ones(2, bool)),
-    Evaluated(1, 2, (Episode(1.5, 2, 0.1),), (False,)),
-]
-TO_WORKER: list[ToWorker] = [
-    Welcome(1, 1, run_spec()),
-    Refuse("no"),
-    Rejoin(1),
-    Weights(3, np.arange(5, dtype=np.float32), np.zeros(0, np.float32)),
-    Collect(1, 3, (Permit(7, 0, 1, 4),), (Received(0, 1, 4, (6,)),)),
-    Release(1, (LaneIncarnation(0, 1),)),
-    HeartbeatReply(1, 9, (Received(0, 1, 4, ()),)),
-    Drain("finished"),
-    Evaluate(1, 2, 3, (4, 5), True, 100, False, False),
-    Reset(1, 2, 0, 1, (0, 2), (7, None), PACKED),
-    Step(1, 3, 0, 1, (np.ones((3, 2), np.int64),)),
-    Call(1, 4, 0, 1, (1,), "gravity", True, PACKED),
-]
+TO_LEARNER, TO_WORKER = to_learner(1), to_worker(1)
 
 
 class Ends:

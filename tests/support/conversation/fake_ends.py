@@ -330,7 +330,7 @@ class World:
                 self._begin_evaluation()
             if self.random.random() < 0.3:
                 self.checkpoint = (
-                    msgspec.structs.replace(coordinator.ledger),
+                    msgspec.structs.replace(coordinator.rollouts.ledger),
                     self.updates,
                     coordinator.rollouts.incarnations(),
                 )
@@ -342,7 +342,7 @@ class World:
         draw, coordinator = self.random, self.coordinator
         seeds = tuple(draw.sample(range(1000), draw.randint(1, 9)))
         self.plan = EvaluationPlan(seeds, draw.randint(1, 3), most_steps=2, send_rows=draw.random() < 0.5)
-        self.rows, self.issued_at_barrier = [], coordinator.ledger.issued
+        self.rows, self.issued_at_barrier = [], coordinator.rollouts.ledger.issued
         on_rows = self._take_rows if self.plan.send_rows else None
         self.to_workers(coordinator.begin_evaluation(self.plan, on_rows))
 
@@ -414,7 +414,7 @@ class World:
     # ------------------------------------------------------------ the rules
 
     def check(self) -> None:
-        coordinator, ledger = self.coordinator, self.coordinator.ledger
+        coordinator, ledger = self.coordinator, self.coordinator.rollouts.ledger
         in_flight = len(coordinator.rollouts.held) + coordinator.rollouts.waiting()
         assert ledger.issued == ledger.used + ledger.lost + in_flight, "the ledger does not balance"
         assert ledger.transitions_waiting == sum(

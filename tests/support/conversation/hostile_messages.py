@@ -9,28 +9,11 @@ import msgpack
 import msgspec
 import numpy as np
 
-from protocol.messages import (
-    PROTOCOL_VERSION,
-    Alive,
-    Described,
-    EpisodeRows,
-    Evaluated,
-    Failure,
-    Goodbye,
-    Heartbeat,
-    Hello,
-    Inquire,
-    Returned,
-    Rollout,
-    Stepped,
-    WorkerActivity,
-    WorkerExit,
-)
-from protocol.rollout import Episode
-from protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiBinarySpace, TupleSpace
+from protocol.messages import Inquire, ToLearner
 from protocol.wire.codec import encode
 from protocol.wire.compression import Packing
-from protocol.wire.plain_values import pack
+from tests.support.conversation.every_message import to_learner
+from tests.support.conversation.fake_ends import fake_rollout
 
 Frames = list[bytes]
 
@@ -49,29 +32,11 @@ NONSENSE: list[Any] = [
 ]  # fmt: skip
 
 
-def real(rollout: Rollout) -> list[Any]:
+def real(session: int) -> list[ToLearner | Inquire]:
     """One good message of each kind that a learner can be told; the rollout also with frame stacks, which go packed."""
     frames = np.lib.stride_tricks.sliding_window_view(np.arange(16 + 4, dtype=np.uint8), 4)[:, None, :, None, None]
-    packed = np.frombuffer(pack([(0, {"key": [1.5, "text"]})]), np.uint8)
-    box = BoxSpace((2,), "float32", np.full(2, -1, np.float32), np.ones((), np.float32))
-    boxes = DictSpace(("a", "b"), (box, TupleSpace((MultiBinarySpace((3,)),))))
-    return [
-        Hello(PROTOCOL_VERSION, "mallory", "host", 1, 1, "fuzz", 1),
-        rollout,
-        msgspec.structs.replace(rollout, obs=(np.tile(frames, (8, 8)),)),
-        Alive((WorkerActivity("w0", 1, "stepping", 0.5, 7),), (WorkerExit("w1", 2, "was killed", True),)),
-        Described(rollout.session, EnvDescription(boxes, DiscreteSpace(2, 0, "int64"), packed, "{}", 500, "human")),
-        EpisodeRows(
-            rollout.session, 1, 0, 0, (np.ones((3, 4)),), np.ones(2), np.ones(2), np.zeros(2, bool), np.ones(2, bool)
-        ),
-        Evaluated(rollout.session, 1, (Episode(1.5, 2, 0.1),), (False,)),
-        Heartbeat(rollout.session, 0, (0,), (1, 2), 5, {"act": 0.1}, 0),
-        Goodbye(rollout.session, "bye", (1,)),
-        Failure(rollout.session, "error", "traceback", 0),
-        Stepped(rollout.session, 1, 0, 0, (np.ones((2, 4)),), np.ones(2), np.zeros(2, bool), np.ones(2, bool), packed),
-        Returned(rollout.session, 1, 0, 0, packed, "", ""),
-        Inquire(),
-    ]
+    packed = msgspec.structs.replace(fake_rollout(session, 0, 0, 0, 0), obs=(np.tile(frames, (8, 8)),))
+    return [*to_learner(session), packed, Inquire()]
 
 
 def hostile(seed: int, messages: Sequence[Any]) -> Iterator[Frames]:

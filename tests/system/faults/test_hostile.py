@@ -14,7 +14,6 @@ import zmq
 from protocol.errors import BadMessage
 from protocol.messages import Inquire, Status
 from protocol.wire.codec import decode_to_observer, encode
-from tests.support.conversation.fake_ends import fake_rollout
 from tests.support.conversation.hostile_messages import hostile, real
 from tests.system.stage.processes import START_S, Learner, Stage, free_port
 from tests.system.stage.runs import accounted
@@ -53,7 +52,7 @@ def pester(learner: Learner, address: str) -> float:
         strangers.append(stranger)
     sizes = []
     try:
-        for number, frames in enumerate(islice(hostile(3, real(fake_rollout(7, 0, 1, 0, 0))), MESSAGES)):
+        for number, frames in enumerate(islice(hostile(3, real(7)), MESSAGES)):
             stranger = strangers[number % STRANGERS]
             while stranger.poll(0):  # one that does not read its answers may be cut off, which is not what is tested here
                 stranger.recv_multipart()

@@ -15,7 +15,6 @@ import pytest
 from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
-    Call,
     Collect,
     Described,
     Drain,
@@ -33,7 +32,6 @@ from protocol.messages import (
     Release,
     Reset,
     Rollout,
-    Step,
     ToLearner,
     ToWorker,
     Weights,
@@ -41,6 +39,7 @@ from protocol.messages import (
 )
 from protocol.space_spec import DiscreteSpace, EnvDescription
 from protocol.specs import DescribeSpec, StepSpec
+from tests.support.conversation.every_message import to_worker
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 from workers.conversation.connection_rules import wait_limits_s
 from workers.conversation.held import KEPT_RESULTS
@@ -850,20 +849,7 @@ def test_a_worker_that_has_left_sends_nothing() -> None:
 
 # -------------------------------------------------------------------- the table
 
-EVERY_MESSAGE: list[ToWorker] = [
-    Welcome(SESSION, FIRST, RUN),
-    Refuse("no"),
-    Rejoin(SESSION),
-    weights(5),
-    collect((50, 0)),
-    Release(SESSION, (LaneIncarnation(0, 0),)),
-    HeartbeatReply(SESSION, 1, lanes(0)),
-    Drain("finished"),
-    Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8)),
-    Step(SESSION, 61, 0, 0, (np.zeros(1),)),
-    Call(SESSION, 62, 0, 0, (0,), "render_mode", False, np.zeros(0, np.uint8)),
-    Evaluate(SESSION, 63, 5, (1, 2), True, 100, False, False),
-]
+EVERY_MESSAGE = to_worker(SESSION, FIRST)
 
 
 def in_state(state: WorkerState) -> Session:
@@ -878,10 +864,6 @@ def in_state(state: WorkerState) -> Session:
         session.stop()
     assert session.state is state
     return session
-
-
-def test_every_message_to_a_worker_is_tried() -> None:
-    assert {type(message) for message in EVERY_MESSAGE} == set(ToWorker.__args__)
 
 
 @pytest.mark.parametrize("state", WorkerState)
