@@ -21,6 +21,7 @@ from protocol.messages import PROTOCOL_VERSION, Drain, Hello, Refuse
 from protocol.wire.codec import decode_to_learner, encode
 from tests.clients.messages_to_clients import corpus
 from tests.system.stage.processes import START_S, Running, Stage, free_port, wait_for
+from tests.system.stage.run_folders import policy_of
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]  # the first test also waits for the compiler
 
@@ -131,7 +132,7 @@ def test_the_weights_are_those_of_a_python_worker(stage: Stage, cpp: Path) -> No
         ends_well(worker)
         (found,) = (stage.tmp_path / name).iterdir()
         evaluation = json.loads((found / "summary.json").read_text())["evaluation"]
-        policies.append(((found / "policy.safetensors").read_bytes(), evaluation))
+        policies.append((policy_of(found), evaluation))
     assert policies[0] == policies[1]
 
 

@@ -218,7 +218,7 @@ def test_a_run_from_another_takes_it_once_and_gives_the_same_bits_for_any_number
     """A resumed run does not read the other folder again: whether that is there or gone, it continues the same."""
 
     def policy_of(run: millrace.Run) -> bytes:
-        return (run.path / "policy.safetensors").read_bytes()
+        return policy_of(run.path)
 
     more: dict[str, Any] = {"start_from": run, "run_dir": tmp_path / "new", "seed": 2, "steps": 128}
     one, two = (millrace.train("CartPole-v1", **more, **SMALL | {"workers": workers}) for workers in (1, 2))

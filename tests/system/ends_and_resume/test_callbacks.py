@@ -16,7 +16,7 @@ from learner.callbacks.callbacks import MOMENTS
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import Interrupted
 from millrace import Callback, Progress
-from tests.system.stage.run_folders import folder_of, saved, summary
+from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
 
 ENV = "workers.envs.toy:Identity-v0"
@@ -82,10 +82,6 @@ def rows(folder: Path) -> list[int]:
     return [int(row["time/iterations"]) for row in read_rows(folder / "metrics.jsonl")]
 
 
-def policy(folder: Path) -> bytes:
-    return (folder / "policy.safetensors").read_bytes()
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run without callbacks."""
@@ -95,7 +91,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_callbacks_are_told(tmp_path: Path, whole: Path) -> None:
     told = Acts()
     folder = run(tmp_path, told, eval_every=130)
-    assert policy(folder) == policy(whole), "callbacks that only look change nothing"
+    assert policy_of(folder) == policy_of(whole), "callbacks that only look change nothing"
     only = [(moment, n) for moment, n in told.told if moment != "on_checkpoint"]
     expected: list[tuple[str, int]] = [("on_start", 0)]
     for n in range(UPDATES):

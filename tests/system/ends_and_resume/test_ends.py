@@ -25,7 +25,7 @@ from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.training import train
 from protocol.errors import RunError, UsageError
-from tests.system.stage.run_folders import folder_of, saved, summary
+from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
 
 SMALL: dict[str, Any] = {
@@ -142,7 +142,7 @@ def test_an_update_that_fails_in_the_middle_is_taken_back(tmp_path: Path, monkey
     whole, broken = (folder_of(tmp_path / part / "runs") for part in ("whole", "broken"))
     assert saved(broken) == saved(whole) == 3
     assert torch.equal(parameters(whole), parameters(broken)), "a half update was saved"
-    assert (whole / "policy.safetensors").read_bytes() == (broken / "policy.safetensors").read_bytes()
+    assert policy_of(whole) == policy_of(broken)
     assert caught.value.__notes__ == how_to_go_on(broken)
     accounted(summary(broken), lanes=2, rows=16)
     assert summary(broken)["ledger"]["lost"] == 2, "the rollouts of the update that failed"

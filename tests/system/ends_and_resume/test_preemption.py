@@ -30,7 +30,7 @@ from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
 from millrace.launch.training import train
 from tests.system.stage.processes import START_S, Stage, crowding
-from tests.system.stage.run_folders import folder_of, summary
+from tests.system.stage.run_folders import folder_of, policy_of, summary
 
 ENV = "tests.system.ends_and_resume.restarting_env:Restarting-v0"
 T, LANES, ENVS = 16, 2, 4
@@ -136,7 +136,7 @@ def test_a_resumed_run_equals_one_whose_lanes_were_started_anew(tmp_path: Path, 
     assert_equal(reference, folder)
     if variant == "ppo":
         plain = run(tmp_path / "plain", **settings)
-        policies = [(one / "policy.safetensors").read_bytes() for one in (plain, folder)]
+        policies = [policy_of(one) for one in (plain, folder)]
         assert policies[0] != policies[1], "starting lanes anew changes nothing, so this shows nothing"
 
 

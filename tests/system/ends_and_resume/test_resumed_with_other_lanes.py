@@ -18,7 +18,7 @@ from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from tests.learner.config.test_resume_rules import content
 from tests.system.stage.run_folders import summary
-from tests.system.whole_runs.test_local_run import assert_balanced
+from tests.system.stage.runs import balanced
 
 GRADIENT_STEPS = 5
 SHAPES: dict[str, tuple[int, int]] = {  # lanes and envs
@@ -66,8 +66,7 @@ def goes_on_with(tmp_path: Path, algorithm: str, shapes: list[tuple[int, int]]) 
         now, new = summary(run), past(run)
         updates = now["updates"] - before["updates"]
         assert updates >= 5, "it does not go on"
-        ledger, used = now["ledger"], used + lanes * updates
-        assert_balanced(ledger)
+        ledger, used = balanced(now), used + lanes * updates
         assert ledger["used"] == used, "an update was not made of one rollout of each lane"
         assert ledger["transitions_used"] == now["env_steps"]
         assert ledger["outstanding"] <= lanes * (1 + max_lag), "more tickets than lanes and max_lag allow"

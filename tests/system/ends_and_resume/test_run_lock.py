@@ -22,6 +22,7 @@ from learner.run_folder.run_lock import LOCK_FILE
 from millrace.launch.training import train
 from tests.learner.config.test_resume_rules import content
 from tests.system.stage.processes import SMALL, START_S, TOY, Learner, Stage, free_port
+from tests.system.stage.run_folders import policy_of
 
 WITHOUT_FLOCK = """
 import errno, fcntl, runpy, sys
@@ -165,7 +166,7 @@ def test_four_runs_that_start_in_the_same_second_all_end_with_a_folder_of_their_
     with ThreadPoolExecutor(4) as threads:
         runs = list(threads.map(run, range(4)))
     assert len(set(runs)) == 4
-    policies = {(path / "policy.safetensors").read_bytes() for path in runs}
+    policies = {policy_of(path) for path in runs}
     assert len(policies) == 1, "runs of one seed hurt each other"
     for path in runs:
         assert (path / "summary.json").is_file()

@@ -12,6 +12,7 @@ import pytest
 import millrace
 from millrace import Callback, Progress
 from tests.system.stage.preloaded import command_line
+from tests.system.stage.run_folders import policy_of
 
 ENV = "tests.support.users_code.fact_envs:Facts-v0"
 SMALL: dict[str, Any] = {
@@ -49,10 +50,6 @@ def run(tmp_path: Path, callback: object, **settings: Any) -> Path:
     return Path(millrace.train(env, run_dir=str(tmp_path / "runs"), callbacks=[callback], **{**SMALL, **settings}))
 
 
-def policy(folder: Path) -> bytes:
-    return (folder / "policy.safetensors").read_bytes()
-
-
 @pytest.fixture(scope="module")
 def one_worker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(tmp_path_factory.mktemp("one"), Levels())
@@ -64,19 +61,19 @@ def test_an_attribute_takes_effect_with_the_next_weights(tmp_path: Path, one_wor
     # The rollouts of update n are of version n - 1, whose weights were sent after update n - 2 was told.
     assert levels.seen == {n: {-1.0 if n <= 2 else n - 2.0} for n in range(1, 10)}
     assert levels.evaluated == [0.0], "evaluation is on env copies as they are made"
-    assert policy(folder) == policy(one_worker)
-    assert policy(run(tmp_path / "no", Levels(first=5.0))) != policy(one_worker), "the level is in the rewards"
+    assert policy_of(folder) == policy_of(one_worker)
+    assert policy_of(run(tmp_path / "no", Levels(first=5.0))) != policy_of(one_worker), "the level is in the rewards"
 
 
 @pytest.mark.parametrize("workers", [2, 4])
 def test_the_bits_are_the_same_for_any_number_of_workers(tmp_path: Path, one_worker: Path, workers: int) -> None:
-    assert policy(run(tmp_path, Levels(), workers=workers)) == policy(one_worker)
+    assert policy_of(run(tmp_path, Levels(), workers=workers)) == policy_of(one_worker)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_bits_are_the_same_with_inference_learner(tmp_path: Path, one_worker: Path, workers: int) -> None:
     levels = Levels()
-    assert policy(run(tmp_path, levels, workers=workers, inference="learner")) == policy(one_worker)
+    assert policy_of(run(tmp_path, levels, workers=workers, inference="learner")) == policy_of(one_worker)
     assert levels.evaluated == [0.0]
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from tests.system.stage import preloaded
 from tests.system.stage.processes import ROOT
+from tests.system.stage.run_folders import policy_of
 
 OWN = '''
 import gymnasium, numpy as np
@@ -148,4 +149,4 @@ def test_a_run_of_a_function_in_a_module_is_found_again_by_every_command(tmp_pat
     again = millrace(tmp_path, "train", "--config", str(run_by_name / "config.toml"), "--run-dir", "again")
     assert again.returncode == 0, again.stderr
     (repeated,) = (tmp_path / "again").iterdir()
-    assert (repeated / "policy.safetensors").read_bytes() == (run_by_name / "policy.safetensors").read_bytes()
+    assert policy_of(repeated) == policy_of(run_by_name)

@@ -12,6 +12,7 @@ import pytest
 import millrace
 from examples import tasks_by_number
 from learner.run_folder.metrics_log import read_rows
+from tests.system.stage.run_folders import policy_of
 
 SMALL: dict[str, Any] = {
     "transport": "inproc", "rollout_steps": 32, "n_epochs": 1, "net": (8,), "steps": 1_000, "eval_episodes": 8,
@@ -26,7 +27,7 @@ def train(folder: Path, workers: int, **settings: Any) -> Path:
 
 def result(folder: Path) -> tuple[bytes, object]:
     """The policy, and the evaluation."""
-    return (folder / "policy.safetensors").read_bytes(), json.loads((folder / "summary.json").read_text())["evaluation"]
+    return policy_of(folder), json.loads((folder / "summary.json").read_text())["evaluation"]
 
 
 @pytest.fixture(scope="module")

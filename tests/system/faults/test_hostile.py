@@ -16,6 +16,7 @@ from protocol.messages import Inquire, Status
 from protocol.wire.codec import decode_to_observer, encode
 from tests.support.conversation.hostile_messages import hostile, real
 from tests.system.stage.processes import START_S, Learner, Stage, free_port
+from tests.system.stage.run_folders import policy_of
 from tests.system.stage.runs import accounted
 from workers.copies.env_copies import copy_seeds
 
@@ -26,7 +27,7 @@ GROWTH_MB = 20  # growth in the second half: by then the heap has the memory for
 def result(learner: Learner) -> tuple[bytes, dict[str, Any], list[dict[str, Any]]]:
     """Wait for the end of the run. Returns the policy, the summary and the rows of metrics."""
     assert learner.ends(START_S) == 0, learner.said()[-5_000:]
-    return (learner.folder / "policy.safetensors").read_bytes(), learner.summary(), learner.rows()
+    return policy_of(learner.folder), learner.summary(), learner.rows()
 
 
 def answered(stranger: zmq.Socket[bytes]) -> None:

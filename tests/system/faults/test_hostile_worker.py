@@ -37,6 +37,7 @@ from tests.support.conversation.extreme_messages import MARK
 from tests.system.faults.hostile_worker import FLOODS, NAME, Hostile, sayings
 from tests.system.stage.preloaded import start
 from tests.system.stage.processes import ROOT, SMALL, START_S, TOY, Learner, Stage, free_port, wait_for
+from tests.system.stage.run_folders import policy_of
 from tests.system.stage.runs import accounted
 
 LANES = 2
@@ -142,7 +143,7 @@ def learn(folder: Path, settings: Mapping[str, object], attack: Callable[[Hostil
         wait_for(far, END_S, "the end of training", every_s=0.1)
         seen.memory_mb = median(sizes[-5:])
         assert learner.ends(END_S) == 0, learner.said()[-5_000:]
-        seen.policy = (learner.folder / "policy.safetensors").read_bytes()
+        seen.policy = policy_of(learner.folder)
         if isinstance(learner, OnTerminal):
             seen.said = learner.all_said()
         else:

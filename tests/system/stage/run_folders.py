@@ -1,4 +1,4 @@
-"""Reads what a test needs of a run folder: its summary, and its newest checkpoint."""
+"""Reads what a test needs of a run folder: its summary, its policy, and its newest checkpoint."""
 
 from __future__ import annotations
 
@@ -19,6 +19,11 @@ def summary(folder: Path) -> dict[str, Any]:
     """Its summary.json."""
     found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     return found
+
+
+def policy_of(folder: Path) -> bytes:
+    """Its final policy."""
+    return (folder / "policy.safetensors").read_bytes()
 
 
 def saved(folder: Path) -> int:

@@ -72,13 +72,19 @@ def finish(learner: Learner, workers: Sequence[Running], **shape: int) -> dict[s
     return accounted(learner.summary(), **shape)
 
 
-def accounted(summary: dict[str, Any], lanes: int = LANES, rows: int = ROWS, max_lag: int = 0) -> dict[str, int]:
-    """Check that every ticket and every transition is accounted for. Returns the ledger. `rows`: T · N of a rollout."""
+def balanced(summary: dict[str, Any]) -> dict[str, int]:
+    """Check that the ledger is a whole: tickets and transitions have each one end. Returns it."""
     ledger: dict[str, int] = summary["ledger"]
     assert ledger["issued"] == ledger["used"] + ledger["outstanding"] + ledger["lost"]
     named = sum(ledger[f"transitions_{why}"] for why in ("used", "waiting", "duplicate", "late", "invalid"))
     assert ledger["transitions_received"] == named
     assert all(count >= 0 for count in ledger.values()), ledger
+    return ledger
+
+
+def accounted(summary: dict[str, Any], lanes: int = LANES, rows: int = ROWS, max_lag: int = 0) -> dict[str, int]:
+    """Check that every ticket and every transition is accounted for. Returns the ledger. `rows`: T · N of a rollout."""
+    ledger = balanced(summary)
     assert ledger["used"] == lanes * summary["updates"], "an update was not made of one rollout of each lane"
     assert ledger["transitions_used"] == summary["env_steps"], "a transition was learned from and not counted"
     assert ledger["outstanding"] <= lanes * (1 + max_lag)

@@ -25,6 +25,7 @@ from tests.system.stage.preloaded import (
     workers_of,
 )
 from tests.system.stage.processes import ROOT, Stage, wait_for
+from tests.system.stage.run_folders import policy_of
 from workers.supervise import worker_process
 
 WITHIN_S = 60.0
@@ -265,5 +266,5 @@ def test_a_run_gives_the_same_bits(tmp_path: Path) -> None:
         _, stderr = process.communicate(timeout=WITHIN_S)
         assert process.returncode == 0, stderr
         (folder,) = (tmp_path / name).iterdir()
-        found.append((folder / "policy.safetensors").read_bytes())
+        found.append(policy_of(folder))
     assert found[0] == found[1]

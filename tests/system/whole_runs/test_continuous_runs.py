@@ -18,6 +18,7 @@ from learner.run_folder.metrics_log import read_rows
 from millrace.launch.training import train
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, Learner, Stage
+from tests.system.stage.run_folders import policy_of
 
 SMALL: dict[str, Any] = {
     "preset": "none",
@@ -42,20 +43,16 @@ def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) 
     return train(config, resume, lambda _: None)
 
 
-def policy(folder: Path) -> bytes:
-    return (folder / "policy.safetensors").read_bytes()
-
-
 @ALGORITHMS
 def test_bits_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, algo: str) -> None:
     folders = [run(tmp_path, str(workers), algo=algo, workers=workers) for workers in (1, 2, 4)]
-    assert policy(folders[0]) == policy(folders[1]) == policy(folders[2])
+    assert policy_of(folders[0]) == policy_of(folders[1]) == policy_of(folders[2])
     for folder in folders:
         for row in read_rows(folder / "metrics.jsonl"):
             own = max(0, row["time/total_timesteps"] - 90)
             assert row["train/n_updates"] == int(0.3 * own + 1e-9), "the gradient steps that the ratio demands, no more"
     learner = run(tmp_path, "learner", algo=algo, workers=2, inference="learner")
-    assert policy(learner) == policy(folders[0])
+    assert policy_of(learner) == policy_of(folders[0])
 
 
 @ALGORITHMS
@@ -122,4 +119,4 @@ def test_it_learns_from_prior_data(tmp_path: Path, algo: str, monkeypatch: pytes
     assert rows[0]["train/n_updates"] == 20
     last = rows[-1]
     assert last["train/n_updates"] == 20 + int(0.3 * (last["time/total_timesteps"] - 90) + 1e-9)
-    assert policy(prior) != policy(first)
+    assert policy_of(prior) != policy_of(first)

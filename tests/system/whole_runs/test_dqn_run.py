@@ -12,6 +12,7 @@ from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
 from millrace.launch.training import train
 from protocol.errors import UsageError
+from tests.system.stage.run_folders import policy_of
 
 SMALL: dict[str, Any] = {
     "algo": "dqn",
@@ -45,7 +46,7 @@ def test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path:
     policies, found = {}, {}
     for workers in (1, 2, 4):
         folder = run(tmp_path, workers=workers, **settings)
-        policies[workers] = (folder / "policy.safetensors").read_bytes()
+        policies[workers] = policy_of(folder)
         found[workers] = ratios(folder)
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["updates"] > 20

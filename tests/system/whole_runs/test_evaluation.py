@@ -22,6 +22,7 @@ from millrace.launch.training import train
 from protocol.errors import EnvironmentFailed, UserFacingError
 from tests.support.in_process.collectors import TOY, random_weights, run_of
 from tests.system.stage.processes import START_S, Stage, crowding, wait_for
+from tests.system.stage.run_folders import policy_of
 
 EVERY_TRANSPORT: list[Literal["inproc", "ipc", "tcp"]] = ["inproc", "ipc", "tcp"]
 
@@ -113,7 +114,7 @@ def test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers(tmp_pa
         evaluations = [row["eval/mean_reward"] for row in rows if "eval/mean_reward" in row]
         assert len(evaluations) >= 2
         assert len(rows) == summary["updates"], "an evaluation has no row of its own"
-        found.append((evaluations, summary["evaluation"], summary["best"], (folder / "policy.safetensors").read_bytes()))
+        found.append((evaluations, summary["evaluation"], summary["best"], policy_of(folder)))
         assert summary["stages"]["learner_evaluate"] > 0
         assert summary["stages"]["worker_evaluate"] > 0
     assert found[0] == found[1] == found[2]

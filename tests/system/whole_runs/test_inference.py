@@ -8,31 +8,21 @@ import re
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import pytest
 
-import millrace
 from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
-from millrace.launch.training import train
-from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
-from tests.system.stage import preloaded
-from tests.system.stage.processes import Learner, Stage, free_port, wait_for
-from tests.system.stage.run_folders import summary
-from tests.system.whole_runs.test_local_run import assert_balanced, run, start, worker_processes
+from protocol.errors import EnvironmentFailed, UsageError
+from tests.system.stage.local_runs import SMALL, TOY, run, worker_processes
+from tests.system.stage.processes import Learner, Stage, free_port
+from tests.system.stage.run_folders import policy_of, summary
+from tests.system.stage.runs import balanced
 
-SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}
-TOY = "workers.envs.toy:"
 IN_LEARNER: dict[str, Any] = {"inference": "learner"}
-
-
-def policy_of(folder: Path) -> bytes:
-    return (folder / "policy.safetensors").read_bytes()
 
 
 # ---------------------------------------------------------------- the same weights
@@ -59,7 +49,7 @@ def test_the_weights_equal_those_of_inference_workers(tmp_path: Path, env: str, 
     for name in ("updates", "env_steps", "ledger", "return_mean_100", "evaluation", "lags"):
         assert summary(in_learner)[name] == summary(in_workers)[name]
     assert summary(in_learner)["updates"] >= 3
-    assert_balanced(summary(in_learner)["ledger"])
+    balanced(summary(in_learner))
     curves = [
         [row["rollout/ep_rew_mean"] for row in read_rows(folder / "metrics.jsonl")] for folder in (in_learner, in_workers)
     ]
@@ -90,11 +80,11 @@ def test_a_resumed_run_equals_one_with_inference_workers(tmp_path: Path) -> None
     for inference in ("workers", "learner"):
         folder = run(tmp_path, "CartPole-v1", steps=1_500, inference=inference, **settings)
         first = summary(folder)
-        train(resolve(resume=folder, steps=3_000), folder, lambda progress: None)
+        run(tmp_path, resume=folder, steps=3_000)
         second = summary(folder)
         assert first["env_steps"] < 1_500 < second["env_steps"] <= 3_000
         assert second["updates"] > first["updates"]
-        assert_balanced(second["ledger"])
+        balanced(second)
         policies.append(policy_of(folder))
     assert policies[0] == policies[1]
     assert 'inference = "learner"' in (folder / "config.toml").read_text()
@@ -111,24 +101,6 @@ def test_every_whole_episode_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
         steps.append((dataset.total_episodes, dataset.total_steps))
     assert steps[0] == steps[1]
     assert steps[0][0] > 20
-
-
-def test_an_environment_may_be_a_callable(tmp_path: Path) -> None:
-    def low_gravity(gravity: float = 9.8) -> gymnasium.Env[Any, Any]:
-        env = gymnasium.make("CartPole-v1")
-        env.unwrapped.gravity = gravity  # type: ignore[attr-defined]
-        return env
-
-    settings: dict[str, Any] = {
-        "steps": 1_000,
-        "run_dir": str(tmp_path),
-        "env_kwargs": {"gravity": 5.0},
-        **SMALL,
-        **IN_LEARNER,
-    }
-    assert summary(millrace.train(low_gravity, **settings).path)["env"] == "<low_gravity>"
-    with pytest.raises(UsageError, match="an environment factory is code"):
-        millrace.train(low_gravity, transport="tcp", **settings)
 
 
 # ---------------------------------------------------------------- thin workers
@@ -178,61 +150,11 @@ def test_images_dtype_is_refused_for_a_policy_without_images(tmp_path: Path) -> 
 # ---------------------------------------------------------------- faults
 
 
-def test_a_killed_worker_costs_only_the_episodes_of_its_copies(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    killed: list[int] = []  # pids
-    restored: list[int] = []  # updates with both workers after the kill
-
-    def watch(progress: Progress) -> None:
-        if progress.updates == 5:
-            victim = worker_processes()[0]
-            killed.append(victim.pid)
-            victim.kill()
-        if killed and progress.updates > 6 and progress.workers_alive == 2:
-            restored.append(progress.updates)
-
-    with caplog.at_level(logging.WARNING):
-        folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, **SMALL, **IN_LEARNER)
-    result = summary(folder)
-    assert killed
-    assert restored, "the killed worker was not replaced"
-    assert result["stop_reason"] == "all steps done"
-    assert "was killed by SIGKILL" in caplog.text
-    assert caplog.text.count("comes back truncated") == 2  # the killed worker had two of the four lanes
-    assert result["ledger"]["lost"] == 0
-    assert_balanced(result["ledger"])
-
-
-def test_an_environment_that_raises_ends_the_run_with_the_traceback_of_the_worker(tmp_path: Path) -> None:
-    with pytest.raises(
-        EnvironmentFailed, match=r"; failure .* (in a row|within an hour).*; max_env_failures allows 1"
-    ) as failure:
-        run(tmp_path, f"{TOY}Raises-v0", max_env_failures=1, **SMALL, **IN_LEARNER)
-    assert "toy.py" in failure.value.detail, "the traceback is not the worker's"
-    assert "\n" not in str(failure.value)
-    assert "its environment raised ValueError" in str(failure.value)
-
-
-def test_one_failure_of_an_environment_is_tolerated(tmp_path: Path) -> None:
-    kwargs: dict[str, Any] = {"once": str(tmp_path / "raised"), "after": 30}
-    folder = run(tmp_path, f"{TOY}Raises-v0", env_kwargs=kwargs, workers=1, steps=2_000, **SMALL, **IN_LEARNER)
-    result = summary(folder)
-    assert Path(kwargs["once"]).exists()
-    assert result["stop_reason"] == "all steps done"
-    assert result["ledger"]["lost"] == 4  # the tickets of the unfinished rollouts, one of each lane
-    assert_balanced(result["ledger"])
-
-
 def test_workers_that_die_again_and_again_end_the_run(tmp_path: Path) -> None:
     with pytest.raises(
         EnvironmentFailed, match=r"its process was killed by SIGKILL.*; failure 3 .*max_env_failures allows 2"
     ):
         run(tmp_path, f"{TOY}Dies-v0", max_env_failures=2, workers=1, **SMALL, **IN_LEARNER)
-
-
-@pytest.mark.parametrize(("env", "what"), [("NaNObservation", "observation"), ("NaNReward", "reward")])
-def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str, what: str) -> None:
-    with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
-        run(tmp_path, f"{TOY}{env}-v0", max_env_failures=0, **SMALL, **IN_LEARNER)
 
 
 def test_the_run_continues_after_an_environment_hung(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -245,31 +167,6 @@ def test_the_run_continues_after_an_environment_hung(tmp_path: Path, caplog: pyt
     assert "a step of its environment took longer than 3 s (--step-timeout-s)" in caplog.text
     named = re.compile(r"waiting \d+ s for lanes? .* \(worker w\d on .*: in step for [23] s\)")
     assert any(map(named.match, shown)), "meanwhile, the worker that steps is named"
-
-
-def test_the_run_fails_if_no_worker_joins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.supervise.worker_process.sys.executable", "/bin/false")
-    began_s = time.monotonic()
-    with pytest.raises(NoWorkers, match="waited 1 s for 1 worker"):
-        run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL, **IN_LEARNER)
-    assert time.monotonic() - began_s < 20
-
-
-def test_ctrl_c_while_an_environment_hangs_drains_saves_and_ends_all_workers(tmp_path: Path) -> None:
-    learner = start(tmp_path, "--inference", "learner")
-    wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")))
-    workers = preloaded.workers_of(learner.pid)
-    assert len(workers) == 2
-    for worker in workers:
-        worker.suspend()  # no step is answered from now on
-    learner.send_signal(signal.SIGINT)
-    _, stderr = learner.communicate(timeout=40)
-    assert learner.returncode == 130
-    assert b"--resume" in stderr
-    assert b"Traceback" not in stderr
-    assert not any(worker.is_running() for worker in workers), "a worker outlived its learner"
-    (folder,) = tmp_path.glob("runs/*")
-    assert summary(folder)["stop_reason"] == "interrupted"
 
 
 # ---------------------------------------------------------------- workers elsewhere, refusals
@@ -316,15 +213,6 @@ def test_the_run_ends_when_the_workers_elsewhere_have_left(stage: Stage) -> None
     assert "waited 5 s for 1 worker" in last
     assert "(the last one left: told to stop)" in last
     assert "env steps are saved" in last
-
-
-def test_an_occupied_port_leaves_no_folder(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/nowhere/learner"
-    command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, "--inference", "learner"]
-    refused = preloaded.run([*command, "--run-dir", str(tmp_path / "runs")], timeout=60)
-    assert refused.returncode == 2
-    assert refused.stderr.count("\n") == 1
-    assert not (tmp_path / "runs").exists()
 
 
 def test_unsupported_settings_are_refused_in_one_line() -> None:

@@ -32,27 +32,19 @@ from millrace.launch.training import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support.in_process.saved_policies import load_policy
 from tests.system.stage import preloaded
-from tests.system.stage.run_folders import summary
+from tests.system.stage.local_runs import SMALL, TOY, run, start, worker_processes
+from tests.system.stage.processes import START_S, wait_for
+from tests.system.stage.run_folders import policy_of, summary
+from tests.system.stage.runs import balanced
 from workers.envs.toy import Countdown
 from workers.slots import LIMIT_VARIABLE
 
-SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much
 
-
-def run(tmp_path: Path, env: str, watch: Any = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
-    return train(resolve(env, run_dir=str(tmp_path / f"runs{time.monotonic_ns()}"), **settings), resume, watch)
-
-
-def assert_balanced(ledger: dict[str, int]) -> None:
-    assert ledger["issued"] == ledger["used"] + ledger["outstanding"] + ledger["lost"]
-    dropped = sum(ledger[f"transitions_{why}"] for why in ("duplicate", "late", "invalid", "waiting"))
-    assert ledger["transitions_received"] == ledger["transitions_used"] + dropped
-    assert ledger["outstanding"] >= 0
-
-
-def worker_processes() -> list[psutil.Process]:
-    children = psutil.Process().children(recursive=True)
-    return [child for child in children if "workers" in preloaded.command_line(child)]
+@pytest.fixture(params=["workers", "learner"])
+def inference(request: pytest.FixtureRequest) -> str:
+    """Where the policy acts."""
+    where: str = request.param
+    return where
 
 
 @pytest.mark.parametrize(
@@ -69,14 +61,12 @@ def test_the_curve_does_not_depend_on_the_number_of_workers(tmp_path: Path, env:
         for transport in ("inproc", "ipc", "tcp"):
             folder = run(tmp_path, env, seed=3, workers=workers, transport=transport, eval_episodes=1, **settings)
             assert summary(folder)["updates"] >= 20
-            policies[workers, transport] = (folder / "policy.safetensors").read_bytes()
-    policies["again", "ipc"] = (
-        run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings) / "policy.safetensors"
-    ).read_bytes()
+            policies[workers, transport] = policy_of(folder)
+    policies["again", "ipc"] = policy_of(run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings))
     different = {key for key, policy in policies.items() if policy != policies[1, "inproc"]}
     assert not different
     other = run(tmp_path, env, seed=4, workers=2, eval_episodes=1, **settings)
-    assert (other / "policy.safetensors").read_bytes() != policies[1, "inproc"], "the seed changes nothing"
+    assert policy_of(other) != policies[1, "inproc"], "the seed changes nothing"
 
 
 class Uneven(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -95,7 +85,7 @@ def test_with_a_lag_the_curve_does_not_depend_on_who_is_fast(tmp_path: Path) -> 
             run_dir=str(tmp_path), seed=3, workers=workers, transport=transport, max_lag=max_lag, envs=4, rollout_steps=16,
             steps=640, eval_every=200, batch_size=64, **SMALL,
         ).path  # fmt: skip
-        policies.add((folder / "policy.safetensors").read_bytes())
+        policies.add(policy_of(folder))
         lags = [row["lag/max"] for row in read_rows(folder / "metrics.jsonl")]
         assert lags == [min(update, max_lag) for update in range(len(lags))]
     assert len(policies) == 1
@@ -128,14 +118,14 @@ def test_with_a_lag_a_lost_worker_leads_to_the_same_run_whoever_is_fast(tmp_path
         ).path  # fmt: skip
         assert died.exists()
         assert summary(folder)["ledger"]["lost"] in (1, 2)
-        policies.add((folder / "policy.safetensors").read_bytes())
+        policies.add(policy_of(folder))
     assert len(policies) == 1
 
 
 def test_compressing_rollouts_does_not_change_the_run(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
     plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
-    assert (plain / "policy.safetensors").read_bytes() == (compressed / "policy.safetensors").read_bytes()
+    assert policy_of(plain) == policy_of(compressed)
     assert config_from_toml((compressed / "config.toml").read_text()).compress == "zstd"
 
 
@@ -150,12 +140,12 @@ def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeyp
 def test_a_run_with_rounded_weights_learns(tmp_path: Path) -> None:
     """The run reaches a good return. Its weights differ from those of a run with exact weights, as expected."""
     settings: dict[str, Any] = {"steps": 12_000, "seed": 3, "eval_episodes": 5, "learning_rate": 0.003, "rollout_steps": 64}
-    env = "workers.envs.toy:Identity-v0"
+    env = f"{TOY}Identity-v0"
     folders = {dtype: run(tmp_path, env, weights_dtype=dtype, **settings) for dtype in ("float32", "bfloat16", "float16")}
     for folder in folders.values():
         assert summary(folder)["evaluation"]["return_mean"] == 10
         assert summary(folder)["return_mean_100"] > 8  # a random policy returns 2.5
-    assert len({(folder / "policy.safetensors").read_bytes() for folder in folders.values()}) == 3
+    assert len({policy_of(folder) for folder in folders.values()}) == 3
 
 
 def test_a_run_ends_when_its_weights_do_not_fit(tmp_path: Path) -> None:
@@ -249,7 +239,9 @@ def test_training_episodes_are_recorded_whole(
     assert dataset.total_steps + left_out == rows[-1]["time/total_timesteps"]
 
 
-def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> None:
+def test_a_killed_worker_is_replaced_and_the_run_ends_well(
+    tmp_path: Path, inference: str, caplog: pytest.LogCaptureFixture
+) -> None:
     killed, gone, back = False, False, False
 
     def watch(progress: Progress) -> None:
@@ -262,22 +254,28 @@ def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> No
         if killed and not back:
             time.sleep(0.1)  # the other worker's steps must not use up the run before the new one has started
 
-    folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, **SMALL)
+    caplog.set_level("WARNING")
+    folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, inference=inference, **SMALL)
     found = summary(folder)
     assert gone, "nobody noticed that the worker was killed"
     assert back, "the killed worker never came back"
     assert found["stop_reason"] == "all steps done"
     assert 20_000 - 256 < found["env_steps"] <= 20_000
-    assert_balanced(found["ledger"])
+    assert "was killed by SIGKILL" in caplog.text
+    balanced(found)
+    if inference == "learner":  # it costs only the episodes of its copies
+        assert caplog.text.count("comes back truncated") == 2, "the killed worker had two of the four lanes"
+        assert found["ledger"]["lost"] == 0
 
 
-def test_an_environment_that_raises_ends_the_run_with_its_own_traceback(tmp_path: Path) -> None:
-    with pytest.raises(EnvironmentFailed) as failure:
-        run(tmp_path, "workers.envs.toy:Raises-v0", max_env_failures=1, **SMALL)
+def test_an_environment_that_raises_ends_the_run_with_its_own_traceback(tmp_path: Path, inference: str) -> None:
+    expected = r"; failure .* (in a row|within an hour).*; max_env_failures allows 1"
+    with pytest.raises(EnvironmentFailed, match=expected) as failure:
+        run(tmp_path, f"{TOY}Raises-v0", max_env_failures=1, inference=inference, **SMALL)
     assert "toy.py" in failure.value.detail, "the traceback is not the worker's"
     assert "Traceback" in failure.value.detail
     assert "\n" not in str(failure.value)
-    assert "worker w" in str(failure.value)
+    assert re.search("worker w.*its environment raised ValueError", str(failure.value))
 
 
 class Unreachable(Countdown):
@@ -294,29 +292,27 @@ def test_an_environment_that_raises_at_each_reset_ends_a_run_of_many_copies_soon
     assert "in reset\n    raise ConnectionRefusedError" in failure.value.detail, "the traceback is not the worker's"
 
 
-def test_a_run_continues_after_an_environment_raised_once(tmp_path: Path) -> None:
+def test_a_run_continues_after_an_environment_raised_once(tmp_path: Path, inference: str) -> None:
     once = str(tmp_path / "raised")
-    folder = run(
-        tmp_path, "workers.envs.toy:Raises-v0", env_kwargs={"once": once, "after": 30}, workers=1, steps=2_000, **SMALL
-    )
-    found = summary(folder)
+    settings: dict[str, Any] = {"env_kwargs": {"once": once, "after": 30}, "workers": 1, "steps": 2_000, **SMALL}
+    found = summary(run(tmp_path, f"{TOY}Raises-v0", inference=inference, **settings))
     assert Path(once).exists()
     assert found["stop_reason"] == "all steps done"
-    assert found["ledger"]["lost"] > 0
-    assert_balanced(found["ledger"])
+    lost = balanced(found)["lost"]
+    assert lost == 4 if inference == "learner" else lost > 0  # tickets of the unfinished rollouts
 
 
-def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path) -> None:
-    for env, what in (("NaNObservation", "observation"), ("NaNReward", "reward")):
-        with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
-            run(tmp_path, f"workers.envs.toy:{env}-v0", max_env_failures=0, **SMALL)
+@pytest.mark.parametrize(("env", "what"), [("NaNObservation", "observation"), ("NaNReward", "reward")])
+def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str, what: str, inference: str) -> None:
+    with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
+        run(tmp_path, f"{TOY}{env}-v0", max_env_failures=0, inference=inference, **SMALL)
 
 
-def test_a_run_whose_workers_cannot_start_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_whose_workers_cannot_start_fails(tmp_path: Path, inference: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The workers cannot start. The run ends at its deadline and says what it waited for."""
     monkeypatch.setattr("workers.supervise.worker_process.sys.executable", "/bin/false")
     with pytest.raises(NoWorkers, match="waited 1 s for 1 worker"):
-        run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL)
+        run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, inference=inference, **SMALL)
 
 
 @pytest.mark.parametrize(
@@ -339,23 +335,29 @@ def test_a_run_learns_with_every_kind_of_space(tmp_path: Path, observation: str,
         "steps": 400,
         "normalize_observations": True,
     }
-    folder = run(tmp_path, "workers.envs.toy:Spaces-v0", **settings, **SMALL)
+    folder = run(tmp_path, f"{TOY}Spaces-v0", **settings, **SMALL)
     found = summary(folder)
     assert found["updates"] >= 2
     assert found["ledger"]["transitions_invalid"] == 0
     assert found["evaluation"]["episodes"] == 2
 
 
-def test_an_environment_may_be_a_callable_and_travels_to_local_workers_only(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("inference", "refusal"), [("workers", "ipc or inproc only"), ("learner", "an environment factory is code")]
+)
+def test_an_environment_may_be_a_callable_and_travels_to_local_workers_only(
+    tmp_path: Path, inference: str, refusal: str
+) -> None:
     def balance(gravity: float = 9.8) -> gymnasium.Env[Any, Any]:
         env = gymnasium.make("CartPole-v1")
         env.unwrapped.gravity = gravity  # type: ignore[attr-defined]
         return env
 
     settings: dict[str, Any] = {"steps": 1_000, "run_dir": str(tmp_path), "env_kwargs": {"gravity": 5.0}, **SMALL}
+    settings |= {"inference": inference}
     folder = millrace.train(balance, **settings).path
     assert summary(folder)["env"] == "<balance>"
-    with pytest.raises(UsageError, match="ipc or inproc only"):
+    with pytest.raises(UsageError, match=refusal):
         millrace.train(balance, transport="tcp", **settings)
 
 
@@ -385,10 +387,11 @@ def test_a_worker_without_a_learner_says_that_nobody_answers(tmp_path: Path) -> 
     assert "is the learner running" in worker.stderr
 
 
-def test_an_occupied_port_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
+def test_an_occupied_port_is_one_line_and_leaves_no_folder(tmp_path: Path, inference: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address]
+        command += ["--inference", inference]
         learner = preloaded.run([*command, "--run-dir", str(tmp_path / "runs")], timeout=60)
     assert learner.returncode == 2
     assert (
@@ -401,30 +404,21 @@ def test_an_occupied_port_is_one_line_and_leaves_no_folder(tmp_path: Path) -> No
 # ---------------------------------------------------------------- the learner as a process
 
 
-def start(tmp_path: Path, *flags: str) -> subprocess.Popen[bytes] | preloaded.ForkedProcess:
-    command = [sys.executable, "-m", "millrace", "train", "CartPole-v1", "--run-dir", str(tmp_path / "runs"), *flags]
-    return preloaded.start(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-
-
-def wait_for(condition: Any, within_s: float = 60.0) -> Any:
-    deadline = time.monotonic() + within_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.05)
-    return found
-
-
 def checkpoints(tmp_path: Path) -> list[Path]:
     return sorted(tmp_path.glob("runs/*/checkpoints/*.pt"))
 
 
-def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path) -> None:
-    learner = start(tmp_path)
-    wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")))
+def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path, inference: str) -> None:
+    """Also while no env step is answered."""
+    learner = start(tmp_path, "--inference", inference)
+    wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")), START_S, "10 updates")
     workers = preloaded.workers_of(learner.pid)
     assert len(workers) == 2
+    if inference == "learner":
+        for worker in workers:
+            worker.suspend()
     learner.send_signal(signal.SIGINT)
-    _, stderr = learner.communicate(timeout=30)
+    _, stderr = learner.communicate(timeout=40)
     assert learner.returncode == 130
     assert b"--resume" in stderr
     assert b"Traceback" not in stderr
@@ -437,7 +431,7 @@ def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path) -> None:
 
 def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: Path) -> None:
     learner = start(tmp_path, "--checkpoint-every-s", "0.2", "--steps", "100000000")
-    wait_for(lambda: len(checkpoints(tmp_path)) >= 3)
+    wait_for(lambda: len(checkpoints(tmp_path)) >= 3, START_S, "three checkpoints")
     workers = preloaded.workers_of(learner.pid)
     os.kill(learner.pid, signal.SIGKILL)
     learner.communicate(timeout=10)
@@ -454,12 +448,12 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
         first.append(progress)
 
     steps = saved + 4_000
-    train(resolve(resume=folder, steps=steps), folder, watch)
+    run(tmp_path, watch=watch, resume=folder, steps=steps)
     assert saved < first[0].env_steps <= saved + 256, "it did not go on from the newest checkpoint"
     assert first[0].wall_s > clock, "the clock began again"
     found = summary(folder)
     assert steps - 256 < found["env_steps"] <= steps
-    assert_balanced(found["ledger"])
+    balanced(found)
     curve = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
     assert curve == sorted(set(curve)), "the curve goes over the same steps twice"
 
@@ -475,7 +469,7 @@ def test_a_run_that_goes_on_has_no_summary_until_it_ends_again(tmp_path: Path) -
             assert ended.summary is None
             meanwhile.append(read_run(folder).results.stop_reason)
 
-    train(resolve(resume=folder, steps=1_536), folder, watch)
+    run(tmp_path, watch=watch, resume=folder, steps=1_536)
     assert meanwhile == ["not finished"]
     assert ended.summary.env_steps > 1_000
 
@@ -487,7 +481,7 @@ def test_a_worker_whose_environment_hangs_is_ended_and_replaced(
     caplog.set_level("INFO", "millrace")
     settings = {"step_timeout_s": 2.0, "worker_timeout_s": worker_timeout_s, "max_env_failures": 1, **SMALL}
     with pytest.raises(EnvironmentFailed, match=r"took longer than 2 s \(--step-timeout-s\), at .*toy.py.*; failure 2"):
-        run(tmp_path, "workers.envs.toy:Hangs-v0", workers=1, steps=100_000, **settings)
+        run(tmp_path, f"{TOY}Hangs-v0", workers=1, steps=100_000, **settings)
     said = [record.getMessage() for record in caplog.records]
     assert len([line for line in said if "joined" in line]) >= 2
     assert not [line for line in said if "silent" in line]
@@ -501,7 +495,9 @@ def training(tmp_path: Path, *flags: str) -> Iterator[tuple[subprocess.Popen[byt
     """A learner that trains, its run folder, and a function that runs `millrace status` of it; ended afterwards."""
     learner = start(tmp_path, "--steps", "100000000", "--workers", "2", *flags)
     try:
-        wait_for(lambda: any(len(read_rows(path)) > 3 for path in tmp_path.glob("runs/*/metrics.jsonl")))
+        wait_for(
+            lambda: any(len(read_rows(path)) > 3 for path in tmp_path.glob("runs/*/metrics.jsonl")), START_S, "3 updates"
+        )
         (folder,) = tmp_path.glob("runs/*")
 
         def status(*flags: str) -> subprocess.CompletedProcess[str]:

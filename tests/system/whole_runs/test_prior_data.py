@@ -25,6 +25,7 @@ from millrace.cli.main import main
 from millrace.launch.training import train
 from protocol.errors import UsageError
 from protocol.rollout import Batch
+from tests.system.stage.run_folders import policy_of
 
 minari = pytest.importorskip("minari")
 DATASET = "cartpole/random-v0"
@@ -103,15 +104,11 @@ def run(tmp_path: Path, name: str, resume: Path | None = None, base: dict[str, A
     return train(config, resume, lambda _: None)
 
 
-def policy(folder: Path) -> bytes:
-    return (folder / "policy.safetensors").read_bytes()
-
-
 def test_prior_data_changes_what_is_learned_and_the_number_of_workers_does_not(tmp_path: Path) -> None:
-    one, two = (policy(run(tmp_path, f"{workers}", workers=workers, prior_steps=50)) for workers in (1, 2))
+    one, two = (policy_of(run(tmp_path, f"{workers}", workers=workers, prior_steps=50)) for workers in (1, 2))
     assert one == two
-    assert policy(run(tmp_path, "none", workers=1, prior="")) != one
-    less = policy(run(tmp_path, "less", workers=1, prior_steps=50, prior_share=0.25))
+    assert policy_of(run(tmp_path, "none", workers=1, prior="")) != one
+    less = policy_of(run(tmp_path, "less", workers=1, prior_steps=50, prior_share=0.25))
     assert less != one
 
 
@@ -147,15 +144,15 @@ def test_gradient_steps_before_the_first_rollouts_can_be_interrupted_and_go_on(
         patched.setattr(DQN, "step", interrupted_step)
         run(tmp_path, "stopped", **settings)
     resumed = run(tmp_path, "stopped", resume=stopped.value.run, **settings)
-    assert policy(resumed) == policy(whole)
+    assert policy_of(resumed) == policy_of(whole)
 
 
 def test_a_clone_does_not_depend_on_the_number_of_workers_and_a_resumed_run_does_not_clone_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = (run(tmp_path, f"{workers}", base=CLONED, workers=workers) for workers in (1, 2))
-    assert policy(one) == policy(two)
-    assert policy(one) != policy(run(tmp_path, "none", base=CLONED, prior="", clone_epochs=0))
+    assert policy_of(one) == policy_of(two)
+    assert policy_of(one) != policy_of(run(tmp_path, "none", base=CLONED, prior="", clone_epochs=0))
     first, second, *_ = read_rows(one / "metrics.jsonl")
     assert (first["time/iterations"], second["time/iterations"]) == (0, 1)
     assert 0.4 < first["clone/accuracy"] < 0.7, "the actions are random"
@@ -176,7 +173,7 @@ def test_cloning_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: pytes
         patched.setattr(PPO, "cloning_loss", interrupted_loss)
         run(tmp_path, "stopped", base=CLONED)
     resumed = run(tmp_path, "stopped", resume=stopped.value.run, base=CLONED)
-    assert policy(resumed) == policy(whole)
+    assert policy_of(resumed) == policy_of(whole)
 
 
 def test_an_interrupt_while_the_dataset_is_read_leaves_no_run_folder(

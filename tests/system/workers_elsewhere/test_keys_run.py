@@ -20,6 +20,7 @@ from millrace.launch.training import train
 from protocol.wire import compression as packing
 from tests.system.stage import preloaded
 from tests.system.stage.processes import START_S, Learner, Stage, crowding
+from tests.system.stage.run_folders import policy_of
 from tests.system.stage.runs import accounted
 
 ANY_PORT = "tcp://127.0.0.1:*"
@@ -157,6 +158,6 @@ def test_packed_frame_stacks_train_the_same_policy_as_unpacked_ones(tmp_path: Pa
     monkeypatch.setattr(packing, "unpack_stack", unstacking)
     for number, way in enumerate(over):
         folder = millrace.train(stacks, run_dir=str(tmp_path / f"runs{number}"), eval_episodes=1, **settings, **way).path
-        policies.append((folder / "policy.safetensors").read_bytes())
+        policies.append(policy_of(folder))
         assert unpacked == [[61, 2, 4, 40, 40]] * 4 * number  # two updates of two lanes; none is dealt before the evaluation
     assert policies[0] == policies[1]

@@ -21,8 +21,8 @@ from learner.rollouts.evaluation_tickets import EvaluationPlan
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.launch.training import train
 from protocol.errors import UsageError
+from tests.system.stage.local_runs import worker_processes
 from tests.system.stage.processes import START_S, Running, Stage, crowding, free_port
-from tests.system.whole_runs.test_local_run import worker_processes
 
 ANY_PORT = "tcp://127.0.0.1:*"
 MILLRACE = (sys.executable, "-m", "millrace")
