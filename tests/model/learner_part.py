@@ -11,7 +11,6 @@ from typing import Self, TypeVar
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership, Outgoing
 from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_tickets import FIRST_TICKET
 from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.rollout_tickets import RolloutTickets
@@ -19,6 +18,7 @@ from learner.rollouts.rounds import Rounds
 from learner.rollouts.sent_weights import SentWeights
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.messages import ToLearner, WorkerExit
+from tests.model import membership_part
 from tests.model.conversation import Content
 from tests.model.message_content import (
     hello,
@@ -268,9 +268,8 @@ def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
 
 def saved(learner: Learner, now: float) -> Content:
     coordinator = learner.coordinator
-    coordinator.membership.events.clear()
     learner.check()
-    lanes, membership, rounds = coordinator.rollouts.lanes, coordinator.membership, coordinator.rollouts.rounds
+    lanes, rounds = coordinator.rollouts.lanes, coordinator.rollouts.rounds
     tickets = sorted(coordinator.rollouts.held.values(), key=lambda each: each.number)
     waiting_for = coordinator._placement._waiting_for
     return (
@@ -285,17 +284,12 @@ def saved(learner: Learner, now: float) -> Content:
             for number, of_round in sorted(coordinator.rollouts.ready.items())
             for lane, each in sorted(of_round.items())
         ),
-        tuple(
-            _member(member, now) for member in sorted(coordinator.members.values(), key=lambda member: member.join_number)
-        ),
+        membership_part.saved(coordinator.membership, now),
         tuple(sorted(coordinator._placement._unplaced)),
         coordinator._placement._settled,
         None if waiting_for is None else (session(waiting_for.session), tuple(sorted(waiting_for.lanes))),
         tuple(sorted(coordinator.rollouts._to_deal)),
         tuple(sorted(coordinator.weights.kept)),
-        session(membership._next_session),
-        max(0.0, membership._none_silent_before_s - now),
-        tuple(sorted(name(Kind.NONCE, nonce, worker_of(peer)) for peer, (nonce, _) in membership._refused.items())),
         learner.updating,
         tuple(learner.checkpoints),
         tuple(name(Kind.OLD_TICKET, number) for number in sorted(learner.used)),
@@ -332,40 +326,19 @@ def _ticket(each: Ticket, next_round: int) -> Content:
     return ticket(each.number), each.lane, number, each.sequence, each.round - next_round, each.version, worker
 
 
-def _member(member: CollectingMember, now: float) -> Content:
-    worker = worker_of(member.peer)
-
-    def replies(count: int) -> Name:
-        return name(Kind.REPLIES, count, member.session)
-
-    return (
-        _worker(worker),
-        name(Kind.NONCE, member.hello.process_nonce, worker),
-        name(Kind.ATTEMPT, member.hello.attempt, worker),
-        session(member.session),
-        max(member.heard_s - now, -TIMEOUT_S - 1.0),
-        tuple(sorted(member.lanes)),
-        tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items() if number < FIRST_TICKET),
-        replies(member.replies),
-        tuple((version, replies(sent_at)) for version, sent_at in sorted(member.versions.items())),
-        member.strikes,
-        member.takeovers,
-    )
-
-
 def without_checkpoints(content: Content) -> Content:
-    return (*content[:17], (), *content[18:])
+    return (*content[:14], (), *content[15:])
 
 
 def loaded(content: Content, settings: Settings) -> Learner:
     """A learner at the time 0 with this content."""
     issued, used, version, versions, lanes, tickets, ready, members, *rest = content
-    unplaced, settled, waiting_for, to_deal, held, next_session, none_silent, refused, *mine = rest
+    unplaced, settled, waiting_for, to_deal, held, *mine = rest
     coordinator = TicketCoordinator(
         settings.run,
         max_lag=settings.max_lag,
         worker_timeout_s=TIMEOUT_S,
-        first_session=next_session.value,
+        first_session=members[1].value,
         ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
     )
     coordinator.version = version
@@ -386,9 +359,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
         each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value))
         coordinator.rollouts.held[number.value] = each
         coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
-    _load_members(coordinator.membership, members)
-    coordinator.membership._none_silent_before_s = none_silent
-    coordinator.membership._refused = {peer_of(nonce.scope): (nonce.value, "refused") for nonce in refused}
+    membership_part.load(coordinator.membership, members, CollectingMember)
     placement = coordinator._placement
     placement._unplaced, placement._settled = set(unplaced), settled
     if waiting_for is not None:
@@ -402,20 +373,6 @@ def loaded(content: Content, settings: Settings) -> Learner:
     ]
     learner.lag = mine[4]
     return learner
-
-
-def _load_members(membership: Membership[CollectingMember], members: Content) -> None:
-    for join_number, fields in enumerate(members):
-        worker, nonce, attempt, number, heard, lanes, tickets, replies, versions, strikes, takeovers = fields
-        said = hello(worker.value, nonce.value, attempt.value)
-        member = CollectingMember(peer_of(worker.value), said, number.value, join_number, heard)
-        member.lanes = set(lanes)
-        member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
-        member.versions = {version: sent_at.value for version, sent_at in versions}
-        member.replies, member.strikes, member.takeovers = replies.value, strikes, takeovers
-        membership.members[member.peer] = member
-        membership._of_process[said.worker, said.process_nonce] = member
-    membership._joins = len(members)
 
 
 def _waiting_for(coordinator: TicketCoordinator, number: Name, lanes: Content) -> CollectingMember:

@@ -1,4 +1,4 @@
-"""Every interleaving of messages, faults and time in small runs: no rule is ever broken, and every run reaches its target.
+"""What the exploration of a training run rests on: its states, its reductions, and the fields that it saves.
 
 Rule: the real `TicketCoordinator` and the real `Session` are explored, not a description of them. Faults: a message is lost,
 repeated or delayed; a worker is killed, frozen or shut out; the learner restarts from any of its checkpoints. After all
@@ -7,7 +7,6 @@ faults one worker, or its link, may be gone for ever.
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import pytest
@@ -15,20 +14,28 @@ import pytest
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership
 from learner.rollouts.collecting_member import CollectingMember
+from learner.rollouts.evaluation_tickets import EvaluationTickets
 from learner.rollouts.lanes import Ticket, TicketedLane
 from learner.rollouts.rollout_tickets import RolloutTickets
 from learner.rollouts.rounds import Rounds
 from learner.rollouts.sent_weights import SentWeights
 from learner.rollouts.ticket_coordinator import TicketCoordinator
+from learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
 from tests.model import learner_part, worker_part
 from tests.model.conversation import Content
+from tests.model.evaluation import learner_half as of_evaluation
+from tests.model.evaluation import worker_half as evaluating_worker
 from tests.model.message_content import hello
 from tests.model.names import names_in, renamed, renaming
-from tests.model.search import Search, explore
+from tests.model.search import Search
 from tests.model.settings import Settings
 from tests.model.training import Training
+from tests.model.vector_env import learner_half as of_vector_env
+from tests.model.vector_env import worker_half as stepping_worker
+from tests.model.vector_env.stepping import Stepping
+from tests.model.worker_part import Worker
 from tests.model.world import GONE, World
-from workers.conversation.held import HeldRollouts, RolloutLane
+from workers.conversation.held import HeldEvaluations, HeldOrders, HeldRollouts, OrderLane, RolloutLane
 from workers.conversation.session import Session, WorkerIdentity, _SessionState
 
 SMALL = Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1)
@@ -53,35 +60,11 @@ def test_a_worker_holds_the_versions_that_its_tickets_name(searched: Search) -> 
     of, held = searched.world.parts, set()
     for _, *seats, _ in searched.states:
         for seat in seats:
-            worker = worker_part.loaded(of[of[seat].worker], 0, SMALL) if of[of[seat].worker] != GONE else None
+            worker = worker_part.loaded(of[of[seat].worker], 0, SMALL, Worker) if of[of[seat].worker] != GONE else None
             if worker is not None and worker.session is not None:
                 current = worker.session._current
                 held.add((tuple(current.weights), tuple(sorted(current.rollouts.versions()))))
     assert ((0, 1), (0, 1)) in held
-
-
-@pytest.mark.model
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize(
-    "training",
-    [
-        Training(workers=2, lanes=1, updates=2, faults=2),
-        Training(workers=2, lanes=1, updates=3, faults=1, max_lag=1),
-        Training(workers=2, lanes=1, updates=3, faults=1, max_lag=2),
-        Training(workers=2, lanes=2, updates=1, faults=1),
-        Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1),
-        Training(workers=1, lanes=1, updates=2, faults=3),
-        Training(workers=1, lanes=1, updates=3, faults=1),
-        Training(workers=1, lanes=1, updates=3, faults=2, max_lag=1),
-        Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
-        Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("drop up", "drop down")),
-    ],
-    ids=str,
-)
-def test_larger_runs(training: Training) -> None:
-    report = explore(training)
-    sys.stdout.write(f"\n{report}\n")
-    assert report.complete
 
 
 def test_the_reductions_leave_out_no_state_of_the_learner_or_of_a_worker(searched: Search) -> None:
@@ -129,3 +112,11 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     types = TicketCoordinator, Membership, CollectingMember, RolloutTickets, SentWeights, TicketedLane, Ticket, LanePlacement
     assert [type(each) for each in objects] == [*types, Rounds, Session, _SessionState, HeldRollouts, RolloutLane]
     assert {type(each): set(vars(each)) for each in objects} == known
+    assert set(vars(EvaluationTickets(settings.run.policy))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
+    assert set(vars(HeldEvaluations())) == evaluating_worker.SAVED
+    stepping = of_vector_env.Learner(Stepping(workers=1, lanes=1, calls=(), faults=0), 0, 0.0).coordinator
+    assert type(stepping) is OrderCoordinator
+    assert set(vars(stepping)) == of_vector_env.SAVED | of_vector_env.NOT_SAVED
+    assert set(vars(OrderedLane(0))) == {"number", "incarnation", "owner", "moving", "started"}  # no lane waits to move
+    assert set(vars(HeldOrders())) == stepping_worker.SAVED
+    assert set(vars(OrderLane(0))) == {"incarnation", "newest", "asked", "answered"}

@@ -7,13 +7,12 @@ from typing import Any, TypeVar
 
 from learner.members.membership import Outgoing
 from protocol.messages import Collect, Evaluate, Heartbeat, Weights
-from tests.model import learner_part, worker_part
+from tests.model import learner_part, process_part, worker_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner, first_learner
 from tests.model.message_content import content_of, message_of, worker_of
 from tests.model.settings import TICK_S, Settings
 from tests.model.worker_part import Worker
-from workers.conversation.worker_states import WorkerState as SessionState
 
 
 class Training(Settings):
@@ -30,7 +29,7 @@ class Training(Settings):
         return learner_part.saved(learner, now), [(worker_of(to), content_of(told, worker_of(to))) for to, told in out]
 
     def worker(self, content: Content, number: int, event: Event, message: Content | None) -> tuple[Content, list[Content]]:
-        worker = worker_part.loaded(content, number, self)
+        worker = worker_part.loaded(content, number, self, Worker)
         now = now_at(event)
         told = None if message is None else message_of(message, number, self.run)
         sent = [content_of(said, number) for said in worker.event(event, told, now)]
@@ -43,20 +42,10 @@ class Training(Settings):
         if isinstance(content[0], str):
             return Facts()
         if len(content) == 4:
-            nonce, (frozen, shut_out), fields, work = content
-            alive = fields is not None
-            rejoins = alive and fields[0] is SessionState.JOINING and fields[1] is not None
-            return Facts(
-                nonce=nonce.value,
-                alive=alive,
-                frozen=frozen,
-                shut_out=shut_out,
-                working=work is not None,
-                rejoins=rejoins,
-            )
-        members = tuple(member[0].value for member in content[7])
+            return process_part.facts(content)
+        members = tuple(member[0].value for member in content[7][0])
         reached = content[2] >= self.updates
-        return Facts(reached=reached, updating=content[16], checkpoints=len(content[17]), members=members)
+        return Facts(reached=reached, updating=content[13], checkpoints=len(content[14]), members=members)
 
 
 L = TypeVar("L", bound=Learner)

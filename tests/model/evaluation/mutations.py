@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 TICKETS = "learner.rollouts.evaluation_tickets"
 
-OF_THE_LEARNER = {
+MUTATIONS = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),
     "a ticket that was put back is lost": Mutation(
         TICKETS, "heapq.heappush(self._undealt, self._end(member, number))", "self._end(member, number)"
@@ -45,8 +45,6 @@ OF_THE_LEARNER = {
     "an evaluation that was played again is forgotten": Mutation(
         TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(member, answer.ticket)  # a message"
     ),
-}
-OF_THE_WORKER = {
     "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
     "an evaluation under any weights": Mutation(HELD, "if order.version == newest]", "if True]"),
@@ -59,7 +57,6 @@ OF_THE_WORKER = {
         SESSION, "return self.state not in goes_on or work.session != self.session", "return False"
     ),
 }
-MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 
 
 def runs() -> list[Conversation]:

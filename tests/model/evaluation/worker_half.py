@@ -80,7 +80,7 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
 def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWorker:
     """A worker at the time 0 with this content."""
     both, held, running = content
-    worker = EvaluatingWorker(**vars(worker_part.loaded(both, number, settings)))
+    worker = worker_part.loaded(both, number, settings, EvaluatingWorker)
     if worker.session is None:
         return worker
     orders, answers, played = held

@@ -12,8 +12,9 @@ from learner.members.membership import Member, Outgoing
 from learner.vector_env.order_coordinator import OrderCoordinator
 from learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from protocol.messages import ToLearner, WorkerExit
+from tests.model import membership_part
 from tests.model.conversation import Content, Event
-from tests.model.message_content import hello, incarnation, peer_of, session, ticket, worker_of
+from tests.model.message_content import incarnation, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, name
 from tests.model.settings import TIMEOUT_S
 from tests.model.vector_env.caller import Caller
@@ -89,11 +90,8 @@ def saved(learner: Learner) -> Content:
     """The members, the lanes, the orders, and the caller."""
     learner.check()
     coordinator, caller = learner.coordinator, learner.caller
-    coordinator.membership.events.clear()
-    membership, now = coordinator.membership, caller.now
-    members = sorted(coordinator.members.values(), key=lambda member: member.join_number)
     return (
-        tuple(_member(member, now) for member in members),
+        membership_part.saved(coordinator.membership, caller.now),
         tuple(
             (
                 incarnation(lane.number, lane.incarnation),
@@ -109,25 +107,7 @@ def saved(learner: Learner) -> Content:
         tuple(content_of(answer, 0) for _, answer in sorted(coordinator.answers.items())),
         tuple(sorted(coordinator.lost)),
         ticket(coordinator._tickets),
-        session(membership._next_session),
-        max(0.0, membership._none_silent_before_s - now),
-        tuple(sorted(name(Kind.NONCE, nonce, worker_of(peer)) for peer, (nonce, _) in membership._refused.items())),
         _caller(caller),
-    )
-
-
-def _member(member: Member, now: float) -> Content:
-    worker = worker_of(member.peer)
-    return (
-        name(Kind.WORKER, worker),
-        name(Kind.NONCE, member.hello.process_nonce, worker),
-        name(Kind.ATTEMPT, member.hello.attempt, worker),
-        session(member.session),
-        max(member.heard_s - now, -TIMEOUT_S - 1.0),
-        tuple(sorted(member.lanes)),
-        tuple((ticket(each), name(Kind.REPLIES, at, member.session)) for each, at in sorted(member.tickets.items())),
-        name(Kind.REPLIES, member.replies, member.session),
-        member.takeovers,
     )
 
 
@@ -155,20 +135,10 @@ def _caller(caller: Caller) -> Content:
 
 def loaded(content: Content, settings: Stepping, now: float) -> Learner:
     """A learner at this time, with the content that it had at the time 0."""
-    members, lanes, orders, answers, lost, tickets, next_session, none_silent, refused, of_caller = content
-    learner = Learner(settings, next_session.value, now)
+    members, lanes, orders, answers, lost, tickets, of_caller = content
+    learner = Learner(settings, members[1].value, now)
     coordinator, caller = learner.coordinator, learner.caller
-    membership = coordinator.membership
-    for join_number, fields in enumerate(members):
-        worker, nonce, attempt, number, heard, of_lanes, held, replies, takeovers = fields
-        said = hello(worker.value, nonce.value, attempt.value)
-        member = Member(peer_of(worker.value), said, number.value, join_number, heard, lanes=set(of_lanes))
-        member.tickets, member.replies = {each.value: at.value for each, at in held}, replies.value
-        member.takeovers = takeovers
-        membership.members[member.peer] = member
-        membership._of_process[said.worker, said.process_nonce] = member
-    membership._joins, membership._none_silent_before_s = len(members), none_silent
-    membership._refused = {peer_of(nonce.scope): (nonce.value, "refused") for nonce in refused}
+    membership_part.load(coordinator.membership, members, Member)
     for lane, (life, owner, started) in zip(coordinator.lanes, lanes, strict=True):
         lane.incarnation, lane.started = life.value, started
         lane.owner = None if owner is None else peer_of(owner.value)

@@ -23,7 +23,7 @@ LOST = "learner.vector_env.lost_lanes"
 SENT = "learner.vector_env.sent_lanes"
 SEND_RECV = "learner.vector_env.send_recv"
 
-OF_THE_LEARNER = {
+MUTATIONS = {
     "a lost order is not sent again": Mutation(
         COORDINATOR, "return [(member.peer, self.orders[ticket]) for ticket in lost]", "return []"
     ),
@@ -47,8 +47,6 @@ OF_THE_LEARNER = {
     ),
     "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),
     "a lane whose loss was reported is not reset": Mutation(LOST, "self.expect_reset(reported)", "pass"),
-}
-OF_THE_WORKER = {
     "a repeated order is executed again": Mutation(HELD, "order.ticket > lane.newest:", "order.ticket >= lane.newest:"),
     "an answer is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "two processes count their attempts to join alike": Mutation(
@@ -59,7 +57,6 @@ OF_THE_WORKER = {
     "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
     "an answered order stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
 }
-MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 
 
 def runs() -> list[Conversation]:

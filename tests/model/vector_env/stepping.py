@@ -13,15 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protocol.specs import StepSpec
+from tests.model import process_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.message_content import worker_of
 from tests.model.settings import TICK_S, TIMEOUT_S
 from tests.model.training import now_at
 from tests.model.vector_env import learner_half, worker_half
 from tests.model.vector_env.learner_half import Learner
-from tests.model.vector_env.order_content import content_of, step_spec
+from tests.model.vector_env.order_content import content_of, message_of, step_spec
 from tests.model.vector_env.worker_half import Worker
-from workers.conversation.worker_states import WorkerState as SessionState
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Stepping:
         return 2 + 3 * self.faults
 
     def start(self) -> tuple[Content, list[Content]]:
-        workers = [worker_half.saved(Worker(number, 0), 0.0) for number in range(self.workers)]
+        workers = [worker_half.saved(Worker(self, number, 0), 0.0) for number in range(self.workers)]
         return learner_half.saved(Learner(self, 0, 0.0)), workers
 
     def learner(self, content: Content, event: Event, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
@@ -60,7 +60,8 @@ class Stepping:
 
     def worker(self, content: Content, number: int, event: Event, message: Content | None) -> tuple[Content, list[Content]]:
         worker, now = worker_half.loaded(content, number, self), now_at(event)
-        sent = [content_of(said, number) for said in worker.event(event, message, self, now)]
+        told = None if message is None else message_of(message, number, self.run)
+        sent = [content_of(said, number) for said in worker.event(event, told, now)]
         return worker_half.saved(worker, now), sent
 
     def without_checkpoints(self, learner: Content) -> Content:
@@ -70,19 +71,11 @@ class Stepping:
         if isinstance(content[0], str):
             return Facts()
         if len(content) == 4:
-            nonce, (frozen, shut_out), fields, work = content
-            return Facts(
-                nonce=nonce.value,
-                alive=fields is not None,
-                frozen=frozen,
-                shut_out=shut_out,
-                working=work is not None,
-                rejoins=fields is not None and fields[0] is SessionState.JOINING and fields[1] is not None,
-            )
+            return process_part.facts(content)
         members, *_, caller = content
         reached = caller[0] == len(self.calls)
         going_on = caller[1] is None and not reached
-        return Facts(reached=reached, updating=going_on, checkpoints=1, members=tuple(each[0].value for each in members))
+        return Facts(reached=reached, updating=going_on, checkpoints=1, members=tuple(each[0].value for each in members[0]))
 
     def __str__(self) -> str:
         return f"{self.workers} workers, {self.lanes} lanes, {', '.join(self.calls)}, {self.faults} faults"

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from protocol.messages import Answer, Call, Reset, Step, ToLearner
-from tests.model.conversation import Content, Event
-from tests.model.message_content import incarnation, session, ticket
-from tests.model.names import ATTEMPTS, MASK, Kind, name
-from tests.model.settings import FOR_EVER_S, TIMEOUT_S
+from tests.model import process_part
+from tests.model.conversation import Content
+from tests.model.message_content import incarnation, ticket
+from tests.model.process_part import Process
 from tests.model.vector_env.order_content import (
     NEW,
     Copy,
@@ -24,19 +24,8 @@ from tests.model.vector_env.order_content import (
     order_content,
     order_of,
 )
-from tests.model.worker_part import PAUSE_S
 from workers.conversation.held import OrderLane
-from workers.conversation.session import (
-    CloseLanes,
-    Leave,
-    SendMessage,
-    Session,
-    SharedOrders,
-    StartSession,
-    WorkerEffect,
-    WorkerIdentity,
-)
-from workers.conversation.worker_states import WorkerState
+from workers.conversation.session import CloseLanes, Leave, SendMessage, SharedOrders, StartSession, WorkerEffect
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping
@@ -46,61 +35,28 @@ SAVED = {"_lanes"}
 
 
 @dataclass
-class Worker:
+class Worker(Process):
     """One state of a worker, which an event changes."""
 
-    number: int
-    nonce: int
-    """of its process; a later process has a larger one"""
-    session: Session | None = None
-    """None: its process has ended"""
+    settings: Stepping
     work: Answer | None = None
     """the answer to the order that is executed"""
     copies: dict[int, tuple[int, Copy]] = field(default_factory=dict)
     """by lane: incarnation and state"""
     newest: tuple[int, int] = (-1, -1)
     """session and ticket of the order that was executed last"""
-    frozen: bool = False
-    shut_out: bool = False
 
-    def event(self, event: Event, message: Content | None, run: Stepping, now: float) -> list[ToLearner]:
-        """What the worker says after this event."""
-        current = self.session
-        match event:
-            case "handle", _:
-                assert message is not None
-                assert current is not None
-                return self._turn(current.handle(message_of(message, self.number, run.run), now), now)
-            case ("start",):
-                self.nonce += ATTEMPTS
-                self.shut_out = False
-                who = WorkerIdentity(f"w{self.number}", "host", 1, self.nonce, "model")
-                self.session = Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
-                return self._turn([], now)
-            case ("finish",):
-                assert current is not None
-                assert self.work is not None
-                done, self.work = self.work, None
-                return self._turn(current.work_ended([done]), now)
-            case ("time",):
-                return [] if current is None or self.frozen else self._turn([], now)
-            case ("told",):
-                assert current is not None
-                return self._turn(current.refused("its key was revoked"), now)
-            case ("end",):
-                self._end()
-            case ("shut out",):
-                self.shut_out = True
-            case ("freeze",) | ("thaw",):
-                self.frozen = event == ("freeze",)
-        return []
+    def finish(self, now: float) -> list[ToLearner]:
+        assert self.session is not None
+        assert self.work is not None
+        done, self.work = self.work, None
+        return self.turn(self.session.work_ended([done]), now)
 
-    def _end(self) -> None:
-        self.session = self.work = None
-        self.copies, self.newest, self.frozen = {}, (-1, -1), False
+    def end(self) -> None:
+        super().end()
+        self.work, self.copies, self.newest = None, {}, (-1, -1)
 
-    def _turn(self, effects: list[WorkerEffect], now: float) -> list[ToLearner]:
-        """Do what the program does after each event."""
+    def turn(self, effects: list[WorkerEffect], now: float) -> list[ToLearner]:
         current = self.session
         assert current is not None
         sent = self._do(effects)
@@ -131,7 +87,7 @@ class Worker:
                     for lane in lanes:
                         self.copies.pop(lane.lane, None)
                 case Leave():
-                    self._end()
+                    self.end()
         return sent
 
 
@@ -140,25 +96,14 @@ class Worker:
 
 def saved(worker: Worker, now: float) -> Content:
     """The process, its session, the orders that it holds, its copies, and what it executes."""
-    nonce = name(Kind.NONCE, worker.nonce, worker.number)
-    flags = worker.frozen, worker.shut_out
-    current = worker.session
-    if current is None:
-        return nonce, flags, None, None
-    held = current._current
-    fields = (
-        current.state,
-        None if current.run is None else session(current.session),
-        name(Kind.ATTEMPT, current._attempt, worker.number),
-        max(current._unanswered_s - now, -TIMEOUT_S - 1.0),
-        max(current.due_s - now, 0.0),
-        tuple(_lane(number, lane) for number, lane in sorted(held.orders._lanes.items())),
-        held.in_progress,
-        None if current.run is None else name(Kind.REPLIES, held.replies, current.session),
-        tuple((lane, incarnation(lane, life), state) for lane, (life, state) in sorted(worker.copies.items())),
-        None if worker.newest[0] != current.session else ticket(worker.newest[1]),
-    )
-    return nonce, flags, fields, None if worker.work is None else content_of(worker.work, worker.number)
+    current, more = worker.session, ()
+    if current is not None:
+        more = (
+            tuple(_lane(number, lane) for number, lane in sorted(current._current.orders._lanes.items())),
+            tuple((lane, incarnation(lane, life), state) for lane, (life, state) in sorted(worker.copies.items())),
+            None if worker.newest[0] != current.session else ticket(worker.newest[1]),
+        )
+    return process_part.saved(worker, now, more, None if worker.work is None else content_of(worker.work, worker.number))
 
 
 def _lane(number: int, lane: OrderLane) -> Content:
@@ -170,22 +115,13 @@ def _lane(number: int, lane: OrderLane) -> Content:
 
 def loaded(content: Content, number: int, run: Stepping) -> Worker:
     """A worker at the time 0 with this content."""
-    nonce, (frozen, shut_out), fields, work = content
-    worker = Worker(number, nonce.value, frozen=frozen, shut_out=shut_out)
-    if fields is None:
+    worker, more = process_part.loaded(Worker, content, number, run)
+    current = worker.session
+    if current is None:
         return worker
-    state, of_session, attempt, heard, due, lanes, in_progress, replies, copies, newest = fields
-    who = WorkerIdentity(f"w{number}", "host", 1, nonce.value, "model")
-    current = worker.session = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
-    current.session = MASK  # before its first session: not that of any message
-    current.state, current._attempt = WorkerState(state), attempt.value
-    current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
-    held = current._current
-    held.in_progress = in_progress
-    if of_session is not None:
-        current.run, current.session, held.replies = run.run, of_session.value, replies.value
+    (lanes, copies, newest), work = more, content[3]
     for lane, life, newest_of_lane, order, kept in lanes:
-        here = held.orders._lanes[lane] = OrderLane(life.value, newest_of_lane.value)
+        here = current._current.orders._lanes[lane] = OrderLane(life.value, newest_of_lane.value)
         if order is not None:
             here.asked[here.newest] = order_of(current.session, order)
         if kept is not None:

@@ -1,0 +1,68 @@
+"""The members of a learner's coordinator, to tuples and back: what is the same whatever their work is."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from learner.members.membership import Member, Membership
+from learner.rollouts.collecting_member import CollectingMember
+from learner.rollouts.evaluation_tickets import FIRST_TICKET
+from tests.model.conversation import Content
+from tests.model.message_content import hello, peer_of, session, ticket, worker_of
+from tests.model.names import Kind, Name, name
+from tests.model.settings import TIMEOUT_S
+
+M = TypeVar("M", bound=Member)
+
+
+def saved(membership: Membership[M], now: float) -> Content:
+    """The members in the order in which they joined, the next session, and who is not to be given up or let in."""
+    membership.events.clear()
+    return (
+        tuple(_member(member, now) for member in sorted(membership.members.values(), key=lambda each: each.join_number)),
+        session(membership._next_session),
+        max(0.0, membership._none_silent_before_s - now),
+        tuple(sorted(name(Kind.NONCE, nonce, worker_of(peer)) for peer, (nonce, _) in membership._refused.items())),
+    )
+
+
+def _member(member: Member, now: float) -> Content:
+    worker = worker_of(member.peer)
+
+    def replies(count: int) -> Name:
+        return name(Kind.REPLIES, count, member.session)
+
+    return (
+        name(Kind.WORKER, worker),
+        name(Kind.NONCE, member.hello.process_nonce, worker),
+        name(Kind.ATTEMPT, member.hello.attempt, worker),
+        session(member.session),
+        max(member.heard_s - now, -TIMEOUT_S - 1.0),
+        tuple(sorted(member.lanes)),
+        tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items() if number < FIRST_TICKET),
+        replies(member.replies),
+        member.takeovers,
+        (
+            (tuple((version, replies(sent_at)) for version, sent_at in sorted(member.versions.items())), member.strikes)
+            if isinstance(member, CollectingMember)
+            else ()
+        ),
+    )
+
+
+def load(membership: Membership[M], content: Content, kind: type[M]) -> None:
+    """Give a new membership this content."""
+    members, _, none_silent, refused = content
+    for join_number, fields in enumerate(members):
+        worker, nonce, attempt, number, heard, lanes, tickets, replies, takeovers, collecting = fields
+        said = hello(worker.value, nonce.value, attempt.value)
+        member = kind(peer_of(worker.value), said, number.value, join_number, heard)
+        member.lanes = set(lanes)
+        member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
+        member.replies, member.takeovers = replies.value, takeovers
+        if isinstance(member, CollectingMember):
+            member.versions, member.strikes = {version: sent_at.value for version, sent_at in collecting[0]}, collecting[1]
+        membership.members[member.peer] = member
+        membership._of_process[said.worker, said.process_nonce] = member
+    membership._joins, membership._none_silent_before_s = len(members), none_silent
+    membership._refused = {peer_of(nonce.scope): (nonce.value, "refused") for nonce in refused}

@@ -1,0 +1,102 @@
+"""Every interleaving of messages, faults and time in small runs: of training, of evaluations, and of vector environments.
+
+Rule: the program itself is explored, not a description of it. In training every rule of tickets, lanes and weights holds,
+and the run reaches its target; each evaluation is of one version, its episodes count once, and no ticket for a rollout is
+dealt meanwhile; each order of a vector environment is executed once, a lost lane is reported once and reset before it
+steps, and every call returns, or is made again. Mistakes that are made on purpose are found.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from tests.model import mutations
+from tests.model.conversation import Conversation
+from tests.model.evaluation import mutations as of_evaluation
+from tests.model.evaluation.evaluating import Evaluating
+from tests.model.mutations import check_that_they_fit, find
+from tests.model.search import explore
+from tests.model.training import Training
+from tests.model.vector_env import mutations as of_vector_env
+from tests.model.vector_env.stepping import Stepping
+
+LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_evaluation, of_vector_env)}
+SMALL: list[Conversation] = [
+    Evaluating(workers=1, lanes=1, updates=1, faults=1),
+    Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
+    Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=1),
+]
+LARGE: list[Conversation] = [
+    Training(workers=2, lanes=1, updates=2, faults=2),
+    Training(workers=2, lanes=1, updates=3, faults=1, max_lag=1),
+    Training(workers=2, lanes=1, updates=3, faults=1, max_lag=2),
+    Training(workers=2, lanes=2, updates=1, faults=1),
+    Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1),
+    Training(workers=1, lanes=1, updates=2, faults=3),
+    Training(workers=1, lanes=1, updates=3, faults=1),
+    Training(workers=1, lanes=1, updates=3, faults=2, max_lag=1),
+    Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
+    Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("drop up", "drop down")),
+    Evaluating(workers=2, lanes=1, updates=1, faults=1),
+    Evaluating(workers=2, lanes=1, updates=1, faults=1, evaluated=(1,)),
+    Evaluating(workers=2, lanes=1, updates=1, faults=1, episodes=1, rows=True),
+    Evaluating(workers=1, lanes=2, updates=2, faults=1, max_lag=1, evaluated=(1, 2)),
+    Evaluating(workers=2, lanes=1, updates=2, faults=1, max_lag=1, evaluated=(1,)),
+    Evaluating(workers=1, lanes=1, updates=1, faults=2),
+    Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=2),
+    Stepping(workers=2, lanes=1, calls=("reset", "step"), faults=2),
+    Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
+    Stepping(workers=1, lanes=2, calls=("reset", "step", "call", "step"), faults=1),
+    Stepping(workers=2, lanes=2, calls=("reset", "step", "step"), faults=1),
+]
+
+
+@pytest.mark.parametrize("run", SMALL, ids=str)
+def test_one_worker_one_fault_of_any_kind(run: Conversation) -> None:
+    report = explore(run)
+    assert report.complete
+    assert report.states > 1_000, f"the model has lost most of its states: {report}"
+
+
+@pytest.mark.model
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("run", LARGE, ids=str)
+def test_larger_runs(run: Conversation) -> None:
+    report = explore(run)
+    sys.stdout.write(f"\n{report}\n")
+    assert report.complete
+
+
+def test_a_mistake_is_found_and_told_as_a_story() -> None:
+    """One mistake that only liveness shows, in every `make test`, so that it is known that the checker can fail."""
+    story = find("a lost Collect is not sent again")
+    assert "Collect(session 0, 0, ((ticket 0, 0, incarnation 0:0, 0),)," in story
+    assert " to worker 0 is lost." in story
+    assert story.endswith("Then: and so on: the run never reaches its target")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "rule"),
+    [
+        (of_evaluation.__name__, "a ticket that was put back is lost", "a ticket of an evaluation is not in one place"),
+        (of_vector_env.__name__, "a lost order is not sent again", "a worker that is heard does not answer"),
+    ],
+)
+def test_a_mistake_is_found_in_each_conversation(module: str, name: str, rule: str) -> None:
+    assert find(name, module).endswith(rule)
+
+
+@pytest.mark.model
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize(("module", "name"), [(module, name) for module, names in LISTS.items() for name in names])
+def test_every_mistake_is_found(module: str, name: str) -> None:
+    find(name, module)
+
+
+@pytest.mark.parametrize("module", LISTS)
+def test_every_mutation_fits_the_program(module: str) -> None:
+    of = [each.module.partition(".")[0] for each in LISTS[module].values()]
+    assert min(of.count("learner"), of.count("workers")) >= 5, "one of the two halves has too few"
+    check_that_they_fit(LISTS[module])
