@@ -34,6 +34,7 @@ from tests.model.message_content import (
 from tests.model.names import Kind, Name, name
 from tests.model.settings import TIMEOUT_S, Settings
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
+from tests.support.conversation.rules import check_tickets, waiting_rollouts
 
 SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},
@@ -206,28 +207,8 @@ class Learner:
 
     def check(self) -> None:
         """The rules that hold in every state."""
-        coordinator, ledger, rollouts = self.coordinator, self.coordinator.rollouts.ledger, self.coordinator.rollouts
-        waiting = waiting_rollouts(coordinator)
-        assert ledger.outstanding == len(rollouts.held) + len(waiting), "the ledger does not balance"
-        waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
-        assert ledger.transitions_waiting == waiting_steps, "transitions do not balance"
-        members = coordinator.members
+        check_tickets(self.coordinator, self.settings.max_lag)
         self._check_rounds()
-        for lane in coordinator.rollouts.lanes:
-            owners = [member.peer for member in members.values() if lane.number in member.lanes]
-            assert owners == ([] if lane.owner is None else [lane.owner]), (
-                "a lane has two owners, or its owner does not know"
-            )
-            mine = {number for number, each in rollouts.held.items() if each.lane == lane.number}
-            assert mine == lane.outstanding, "a lane does not know its tickets"
-            assert not lane.due or lane.number in rollouts._to_deal, "a lane gets no more tickets"
-        for number, each in rollouts.held.items():
-            assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
-            assert rollouts.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
-        held = sorted([*rollouts.held, *coordinator.evaluation.held])
-        assert held == sorted(number for member in members.values() for number in member.tickets), "a ticket has two holders"
-        processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
-        assert coordinator.membership._of_process == processes, "the processes are not those of the members"
 
     def _check_rounds(self) -> None:
         """Each lane has every open round once: due, with a worker, or waiting. Round u acts under what `rounds.py` says."""
@@ -256,11 +237,6 @@ class Learner:
         needed = {coordinator.version, *versions.values()}
         assert needed.issuperset(coordinator.weights.kept) or self.updating, "the learner keeps weights that nobody needs"
         assert set(coordinator.weights.kept).issuperset(needed - {-1}), "weights that are needed are dropped"
-
-
-def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
-    """Those that have come and were not taken."""
-    return [arrived for of_round in coordinator.rollouts.ready.values() for arrived in of_round.values()]
 
 
 # -------------------------------------------------------------------- to tuples and back

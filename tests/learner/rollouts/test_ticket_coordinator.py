@@ -40,6 +40,7 @@ from protocol.messages import (
 from protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
+from tests.support.conversation.rules import check_tickets
 
 M = TypeVar("M")
 A, B, C = b"a", b"b", b"c"
@@ -65,7 +66,7 @@ class Learner:
             ledger=ledger,
             incarnations=incarnations,
         )
-        self.now = 0.0
+        self.now, self.max_lag = 0.0, max_lag
         if publish:
             self.publish(0)
 
@@ -149,10 +150,7 @@ class Learner:
         return taken
 
     def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
-        coordinator, ledger = self.coordinator, self.coordinator.rollouts.ledger
-        in_flight = len(coordinator.rollouts.held) + coordinator.rollouts.waiting()
-        assert ledger.issued == ledger.used + ledger.lost + in_flight
-        assert ledger.transitions_waiting == coordinator.rollouts.waiting()  # a fake rollout is one transition
+        check_tickets(self.coordinator, self.max_lag)
         return outs
 
 

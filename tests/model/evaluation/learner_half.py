@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_tickets import FIRST_TICKET, HELD_AT_ONCE, EvaluationTickets
+from learner.rollouts.evaluation_tickets import FIRST_TICKET, EvaluationTickets
 from protocol.messages import EpisodeRows, ToLearner
 from tests.model import learner_part
 from tests.model.conversation import Content
@@ -44,22 +44,10 @@ class EvaluatingLearner(Learner):
 
     def check(self) -> None:
         super().check()
-        tickets, members = self.coordinator.evaluation, self.coordinator.members
-        if not tickets.pending:
-            return
-        assert self.coordinator.rollouts.ledger.issued == self.barrier, (
-            "a ticket for a rollout was dealt during an evaluation"
-        )
-        assert tickets._version == self.coordinator.version, "an evaluation belongs to another version"
-        held = [number - tickets._first for number in tickets.held]
-        every = sorted([*tickets._undealt, *held, *tickets._played])
-        assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
-        for number, member in tickets.held.items():
-            assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"
-            assert number in member.tickets, "a worker does not know its ticket of an evaluation"
-        for member in tickets.players:
-            mine = [number for number in member.tickets if number >= FIRST_TICKET]
-            assert len(mine) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"
+        if self.coordinator.evaluation.pending:
+            assert self.coordinator.rollouts.ledger.issued == self.barrier, (
+                "a ticket for a rollout was dealt during an evaluation"
+            )
 
     # ---------------------------------------------------------------- inside
 

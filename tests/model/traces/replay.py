@@ -16,8 +16,8 @@ from learner.members.describe_coordinator import DescribeCoordinator, accept_any
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from tests.model import learner_part
-from tests.model.learner_part import waiting_rollouts
 from tests.model.traces.record import Digests, Record, SaidMember, message_of
+from tests.support.conversation.rules import waiting_rollouts
 from workers.conversation.session import Session
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
@@ -76,12 +76,6 @@ class Rules:
         for arrived in accepted:
             self._learner._accept(arrived)
         self._learner.check()
-        evaluation = self._coordinator.evaluation
-        if evaluation.pending:
-            held = [number - evaluation._first for number in evaluation.held]
-            every = sorted([*evaluation._undealt, *held, *evaluation._played])
-            assert every == list(range(len(evaluation._seeds))), "a ticket of an evaluation is not in one place"
-            assert evaluation._version == self._coordinator.version, "an evaluation belongs to another version"
 
 
 class Replay:

@@ -25,6 +25,7 @@ from protocol.env_spec import EnvSpec
 from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker, WorkerExit
 from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
+from tests.support.conversation.rules import check_tickets
 from workers.conversation.session import (
     EvaluationTask,
     Leave,
@@ -414,24 +415,10 @@ class World:
     # ------------------------------------------------------------ the rules
 
     def check(self) -> None:
-        coordinator, ledger = self.coordinator, self.coordinator.rollouts.ledger
-        in_flight = len(coordinator.rollouts.held) + coordinator.rollouts.waiting()
-        assert ledger.issued == ledger.used + ledger.lost + in_flight, "the ledger does not balance"
-        assert ledger.transitions_waiting == sum(
-            arrived.rollout.env_steps for of_round in coordinator.rollouts.ready.values() for arrived in of_round.values()
-        ), "transitions do not balance"
+        check_tickets(self.coordinator, self.max_lag)
         if self.plan is not None:
-            assert ledger.issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
-        assert in_flight <= self.run.lanes * (1 + self.max_lag), "more tickets than the bound allows"
-        for lane in coordinator.rollouts.lanes:
-            owners = [member for member in coordinator.members.values() if lane.number in member.lanes]
-            assert len(owners) == (lane.owner is not None), "a lane has two owners"
-            assert all(owner.peer == lane.owner for owner in owners)
-        for number, ticket in coordinator.rollouts.held.items():
-            assert number in coordinator.members[ticket.peer].tickets, "an outstanding ticket is with nobody"
-            assert coordinator.rollouts.lanes[ticket.lane].owner == ticket.peer, (
-                "a ticket of a lane that its worker does not own"
-            )
+            issued = self.coordinator.rollouts.ledger.issued
+            assert issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
         if self.epoch == 0:
             for worker in self.workers.values():
                 holds = held_count(worker.session)

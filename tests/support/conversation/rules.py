@@ -1,0 +1,53 @@
+"""What holds of a learner's tickets after every event, whatever happened: of rollouts, lanes, members and evaluations."""
+
+from __future__ import annotations
+
+from learner.rollouts.evaluation_tickets import FIRST_TICKET, HELD_AT_ONCE
+from learner.rollouts.lanes import AcceptedRollout
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+
+
+def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
+    """Those that have come and were not taken."""
+    return [arrived for of_round in coordinator.rollouts.ready.values() for arrived in of_round.values()]
+
+
+def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
+    """The ledger balances, a lane has one owner, and each ticket is with the owner of its lane."""
+    rollouts, members = coordinator.rollouts, coordinator.members
+    ledger, waiting = rollouts.ledger, waiting_rollouts(coordinator)
+    assert ledger.outstanding == len(rollouts.held) + len(waiting), "the ledger does not balance"
+    waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
+    assert ledger.transitions_waiting == waiting_steps, "transitions do not balance"
+    assert ledger.outstanding <= len(rollouts.lanes) * (1 + max_lag), "more tickets than the bound allows"
+    for lane in rollouts.lanes:
+        owners = [member.peer for member in members.values() if lane.number in member.lanes]
+        assert owners == ([] if lane.owner is None else [lane.owner]), "a lane has two owners, or its owner does not know"
+        mine = {number for number, each in rollouts.held.items() if each.lane == lane.number}
+        assert mine == lane.outstanding, "a lane does not know its tickets"
+        assert not lane.due or lane.number in rollouts._to_deal, "a lane gets no more tickets"
+    for number, each in rollouts.held.items():
+        assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
+        assert rollouts.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
+    held = sorted([*rollouts.held, *coordinator.evaluation.held])
+    assert held == sorted(number for member in members.values() for number in member.tickets), "a ticket has two holders"
+    processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
+    assert coordinator.membership._of_process == processes, "the processes are not those of the members"
+    check_evaluation(coordinator)
+
+
+def check_evaluation(coordinator: TicketCoordinator) -> None:
+    """While an evaluation is pending, it is of the newest version, and each of its tickets is in one place."""
+    tickets, members = coordinator.evaluation, coordinator.members
+    if not tickets.pending:
+        return
+    assert tickets._version == coordinator.version, "an evaluation belongs to another version"
+    held = [number - tickets._first for number in tickets.held]
+    every = sorted([*tickets._undealt, *held, *tickets._played])
+    assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
+    for number, member in tickets.held.items():
+        assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"
+        assert number in member.tickets, "a worker does not know its ticket of an evaluation"
+    for member in tickets.players:
+        mine = [number for number in member.tickets if number >= FIRST_TICKET]
+        assert len(mine) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"
