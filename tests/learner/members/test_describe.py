@@ -28,7 +28,6 @@ from protocol.messages import (
     Failure,
     Goodbye,
     Heartbeat,
-    HeartbeatReply,
     Hello,
     Refuse,
     Rejoin,
@@ -85,13 +84,6 @@ def test_the_first_description_is_the_run_s_and_all_members_say_hello_again() ->
     assert made.described.observation_space == spaces.Discrete(3)
     assert made.described.max_episode_steps == 7
     assert made.finish() == [(A, Rejoin(one)), (B, Rejoin(two))]
-
-
-def test_a_description_of_another_session_is_not_used() -> None:
-    made = coordinator()
-    session = join(made, A)
-    assert made.receive(A, Described(session + 7, DESCRIPTION), 1.0) == [(A, Rejoin(session + 7))]
-    assert made.described is None
 
 
 def test_a_description_that_cannot_be_read_gets_its_sender_refused_and_another_is_used() -> None:
@@ -193,16 +185,6 @@ def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
     assert [event for event in made.events if isinstance(event, Failed)] == [failed]
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 2, why, failed=True),)), 1.0)
     assert [event for event in made.events if isinstance(event, Failed)] == [failed, failed]
-
-
-def test_heartbeats_are_answered_and_silence_is_the_end() -> None:
-    made = coordinator()
-    session = join(made, A)
-    assert made.receive(A, Heartbeat(session, 0, (), (), 0, {}, 0), 4.0) == [(A, HeartbeatReply(session, 1, ()))]
-    made.remove_silent(8.9)
-    assert made.membership.members
-    made.remove_silent(9.1)
-    assert not made.membership.members
 
 
 def test_the_status_says_who_is_here() -> None:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from learner.members.held_up import LONG_S
-from learner.members.member_server import AWAY_S
 from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.hub import LOG_WAITING_AFTER_S, POLL_S, PULSE_S, Hub, HubSettings
+from learner.rollouts.hub import LOG_WAITING_AFTER_S, PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.errors import RunError
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Weights
@@ -42,13 +41,6 @@ def hub_with_a_worker(
     link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
     hub.wait_for(1)
     return link, hub, Heartbeat(1, 0, (), (), 0, {}, 0)
-
-
-def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
-    until_s = link.now + seconds
-    while link.now < until_s:
-        hub.pulse()
-        link.now += POLL_S
 
 
 def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
@@ -81,32 +73,6 @@ def test_weights_that_do_not_fit_are_not_published() -> None:
     with pytest.raises(RunError, match="weights_dtype float16: parameter 1: expected an absolute value below 65520"):
         hub.publish(0, np.array([1, -70_000], np.float32), np.zeros(0, np.float32))
     assert (hub.coordinator.version, link.sent) == (-1, [])
-
-
-def test_a_silent_worker_is_given_up_while_the_learner_listens() -> None:
-    link, hub, _ = hub_with_a_worker()
-    listen(hub, link, WORKER_TIMEOUT_S - 2 * POLL_S)
-    assert hub.coordinator.members
-    listen(hub, link, 4 * POLL_S)
-    assert not hub.coordinator.members
-
-
-def test_a_learner_that_was_stopped_listens_before_it_judges() -> None:
-    """Its inbox is empty when it wakes, because what fills it was stopped too."""
-    link, hub, heartbeat = hub_with_a_worker()
-    link.now += 2 * WORKER_TIMEOUT_S
-    hub.pulse()
-    assert hub.coordinator.members, "the worker was given up before what it had said could arrive"
-    link.inbox.append((b"w0", heartbeat))
-    listen(hub, link, 2 * AWAY_S)
-    assert hub.coordinator.members
-
-
-def test_a_learner_that_was_stopped_judges_after_a_while() -> None:
-    link, hub, _ = hub_with_a_worker()
-    link.now += 2 * WORKER_TIMEOUT_S
-    listen(hub, link, AWAY_S + 2 * POLL_S)
-    assert not hub.coordinator.members
 
 
 def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixture) -> None:

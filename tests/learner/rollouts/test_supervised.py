@@ -23,7 +23,6 @@ from tests.support.conversation.fake_link import FakeLink
 
 A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
 NONCE = 1000 * len("host") + 1  # as `Learner.joins` makes it
-OVER_S = TIMEOUT_S + 0.1
 
 
 def activity(doing: Doing = "stepping", for_s: float = 0.0, calls: int = 0, nonce: int = NONCE) -> WorkerActivity:
@@ -50,12 +49,18 @@ def test_a_worker_in_environment_code_is_not_silent(doing: Doing) -> None:
         assert is_member_after(learner, 0.4)
 
 
-@pytest.mark.parametrize("doing", ["starting", "waiting"])
-def test_a_worker_in_our_own_code_must_speak_for_itself(doing: Doing) -> None:
+@pytest.mark.parametrize(
+    "said",
+    [
+        *(activity(doing) for doing in ("starting", "waiting")),  # a worker in our own code must speak for itself
+        *(activity(nonce=NONCE + 1), WorkerActivity("b", NONCE, "stepping", 0.0, 0)),  # who does not know the nonce
+    ],
+)
+def test_what_is_said_for_a_silent_worker_and_does_not_count(said: WorkerActivity) -> None:
     learner = Learner()
     learner.joins(A)
     learner.now += TIMEOUT_S - 0.5
-    speaks(learner, activity(doing))
+    speaks(learner, said)
     assert not is_member_after(learner, 0.6)
 
 
@@ -76,15 +81,6 @@ def test_a_supervisor_that_falls_silent_speaks_for_nobody() -> None:
     speaks(learner, activity())
     assert is_member_after(learner, TIMEOUT_S - 0.1)
     assert not is_member_after(learner, 0.2)
-
-
-@pytest.mark.parametrize("said", [activity(nonce=NONCE + 1), WorkerActivity("b", NONCE, "stepping", 0.0, 0)])
-def test_who_does_not_know_the_nonce_is_not_believed(said: WorkerActivity) -> None:
-    learner = Learner()
-    learner.joins(A)
-    learner.now += TIMEOUT_S - 0.5
-    speaks(learner, said)
-    assert not is_member_after(learner, 0.6)
 
 
 @pytest.mark.parametrize(("key", "believed"), [(b"aa", True), (b"bb", False), (b"", False)])

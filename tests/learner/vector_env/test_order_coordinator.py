@@ -18,13 +18,11 @@ from protocol.messages import (
     Answer,
     Call,
     Failure,
-    Goodbye,
     Heartbeat,
     Hello,
     LaneIncarnation,
     Order,
     Refuse,
-    Rejoin,
     Returned,
     Step,
     Stepped,
@@ -184,14 +182,6 @@ def test_where_an_end_is_known_otherwise_nobody_is_silent() -> None:
     made.worker_timeout_s = float("inf")
     made.remove_silent(1e9)
     assert made.lost == {}
-
-
-def test_a_worker_that_was_given_up_is_told_to_join_again() -> None:
-    made = order_coordinator(A)
-    session = made.members[A].session
-    made.remove_silent(TIMEOUT_S + 1)
-    assert made.receive(A, Heartbeat(session, 0, (), (), 0, {}, 0), 9.0) == [(A, Rejoin(session))]
-    assert made.receive(A, Goodbye(session, "told to stop", ()), 9.0) == []
 
 
 def test_one_whose_key_was_revoked_is_told_so_and_forgotten() -> None:

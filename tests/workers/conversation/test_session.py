@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -135,6 +135,11 @@ def collected(session: Session) -> list[Rollout]:
     return sent(session.work_ended(fake_rollouts(task_of(session))), Rollout)
 
 
+def drained(session: Session) -> list[WorkerEffect]:
+    """The learner asks the worker to leave."""
+    return session.handle(Drain("finished"), 0.1)
+
+
 def hello_attempt(effects: Sequence[WorkerEffect]) -> int:
     (hello,) = sent(effects, Hello)
     return hello.attempt
@@ -160,13 +165,6 @@ def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
     assert gaps[:5] == [0.25, 0.5, 1.0, 2.0, 4.0]
     assert set(gaps[4:]) == {HELLO_MOST_S}
     assert attempts == {FIRST}
-
-
-def test_next_due_s_is_the_time_of_the_next_hello() -> None:
-    session = joining()
-    assert session.due_s == 0.0
-    session.tick(0.0)
-    assert session.due_s == HELLO_FIRST_S
 
 
 def test_joining_again_raises_the_attempt_and_resets_the_backoff() -> None:
@@ -318,11 +316,6 @@ def test_a_late_repeat_of_a_ticket_whose_rollout_was_received_is_ignored() -> No
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=1)), 1.0)
     assert session.handle(collect((0, 0), received=lanes(0, below=1)), 1.1) == []
     assert session.next_work() is None
-
-
-def test_the_sequence_counts_the_rollouts_of_an_incarnation_of_the_lane() -> None:
-    session = ready(collect((0, 0), (1, 0), (2, 0)))
-    assert [rollout.sequence for _ in range(3) for rollout in collected(session)] == [0, 1, 2]
 
 
 def test_the_next_rollout_of_every_lane_is_collected_together_in_lane_order() -> None:
@@ -538,10 +531,6 @@ def test_a_heartbeat_lists_the_ticket_in_progress_and_no_finished_one() -> None:
     assert sent(session.tick(2.0), Heartbeat)[0].tickets == (8,)
 
 
-def test_before_the_first_weights_a_heartbeat_lists_no_version() -> None:
-    assert versions_held(ready(version=None)) == ()
-
-
 # -------------------------------------------------------------------- lanes
 
 
@@ -651,14 +640,6 @@ def test_a_message_of_another_session_is_ignored() -> None:
     assert sent(session.tick(1.0), Heartbeat)[0].replies == 0
 
 
-def test_rejoin_is_answered_by_hello_at_once() -> None:
-    session = ready(collect((0, 0)))
-    effects = session.handle(Rejoin(SESSION), 3.0)
-    assert session.state is WorkerState.JOINING
-    assert effects[0] == CloseLanes((LaneIncarnation(0, 0),))
-    assert hello_attempt(effects) == FIRST + 1
-
-
 def test_a_worker_joins_a_silent_learner_again() -> None:
     session = ready(collect((0, 0)))
     assert sent(session.tick(1.0), Heartbeat)
@@ -714,15 +695,14 @@ def test_an_evaluation_in_progress_is_not_finished_by_a_worker_that_drains() -> 
     assert session.work_ended([]) == [SendMessage(Goodbye(SESSION, "told to stop", (8,))), Leave(0, "told to stop")]
 
 
-def test_stop_without_work_in_progress_leaves_at_once() -> None:
+@pytest.mark.parametrize(("stop", "why"), [(Session.stop, "told to stop"), (drained, "finished")])
+def test_who_is_asked_to_leave_without_work_in_progress_leaves_at_once(
+    stop: Callable[[Session], list[WorkerEffect]], why: str
+) -> None:
+    assert stop(joining()) == [Leave(0, why)]
     session = ready(collect((0, 0)))
-    assert session.stop() == [SendMessage(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
+    assert stop(session) == [SendMessage(Goodbye(SESSION, why, (0,))), Leave(0, why)]
     assert session.state is WorkerState.LEFT
-
-
-def test_stop_while_joining_leaves_at_once() -> None:
-    session = joining()
-    assert session.stop() == [Leave(0, "told to stop")]
 
 
 def test_two_stops_leave_at_once() -> None:
@@ -742,16 +722,6 @@ def test_drain_finishes_the_rollout_in_progress_and_then_leaves() -> None:
     effects = session.work_ended(fake_rollouts(task))
     assert len(sent(effects, Rollout)) == 1
     assert effects[-2:] == [SendMessage(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
-
-
-def test_drain_without_work_in_progress_leaves_at_once() -> None:
-    session = ready()
-    assert session.handle(Drain("finished"), 0.1) == [SendMessage(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
-
-
-def test_drain_while_joining_leaves_with_exit_code_0() -> None:
-    session = joining()
-    assert session.handle(Drain("finished"), 0.1) == [Leave(0, "finished")]
 
 
 def test_no_ticket_is_accepted_while_draining() -> None:
