@@ -216,17 +216,13 @@ def test_a_run_from_another_takes_it_once_and_gives_the_same_bits_for_any_number
     run: millrace.Run, tmp_path: Path
 ) -> None:
     """A resumed run does not read the other folder again: whether that is there or gone, it continues the same."""
-
-    def policy_of(run: millrace.Run) -> bytes:
-        return policy_of(run.path)
-
     more: dict[str, Any] = {"start_from": run, "run_dir": tmp_path / "new", "seed": 2, "steps": 128}
     one, two = (millrace.train("CartPole-v1", **more, **SMALL | {"workers": workers}) for workers in (1, 2))
-    assert policy_of(one) == policy_of(two)
+    assert policy_of(one.path) == policy_of(two.path)
     assert (one.config.start_from, one.config.from_parts) == (str(run.path), "auto")
     one.resume(steps=192, progress=False)
     taken = rf"starts from {re.escape(str(run.path))} \(CartPole-v1\): policy, statistics, after \d+ env steps"
     assert re.fullmatch(taken, check_format(one.path).started_from), "a resumed run keeps it"
     shutil.rmtree(run.path)
     two.resume(steps=192, workers=1, progress=False)
-    assert policy_of(one) == policy_of(two)
+    assert policy_of(one.path) == policy_of(two.path)

@@ -127,7 +127,8 @@ class Worker(Process):
 
 
 def saved(worker: Worker, now: float) -> Content:
-    task, more = worker.task, ()
+    task = worker.task
+    more: Content = ()
     if worker.session is not None:
         held = worker.session._current
         lanes = tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items())

@@ -96,7 +96,8 @@ class Worker(Process):
 
 def saved(worker: Worker, now: float) -> Content:
     """The process, its session, the orders that it holds, its copies, and what it executes."""
-    current, more = worker.session, ()
+    current = worker.session
+    more: Content = ()
     if current is not None:
         more = (
             tuple(_lane(number, lane) for number, lane in sorted(current._current.orders._lanes.items())),

@@ -22,7 +22,7 @@ def run(
     tmp_path: Path, env: str = "", watch: Any = lambda progress: None, resume: Path | None = None, **settings: Any
 ) -> Path:
     """Train in this process, in a new run folder or in one that is resumed. Returns the run folder."""
-    run_dir = {} if resume else {"run_dir": str(tmp_path / f"runs{time.monotonic_ns()}")}
+    run_dir: dict[str, Any] = {} if resume else {"run_dir": str(tmp_path / f"runs{time.monotonic_ns()}")}
     return train(resolve(env, resume=resume, **run_dir, **settings), resume, watch)
 
 
