@@ -16,6 +16,7 @@ from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_format import check_format
 from millrace.cli.main import main
 from tests.support.in_process.collectors import TOY
+from tests.system.stage.run_folders import policy_of
 
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "envs": 4, "lanes": 2, "rollout_steps": 16, "n_epochs": 2, "net": (8,),
