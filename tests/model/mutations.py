@@ -137,7 +137,7 @@ MUTATIONS = {
         COORDINATOR, "out = self._placement.place(self.members.values())", "out: list[Outgoing] = []"
     ),
     "a repeated Welcome starts the session again": Mutation(
-        SESSION, "self.state is State.READY and message.session == self.session", "False"
+        SESSION, "self.state is WorkerState.READY and message.session == self.session", "False"
     ),
     "a worker that joins again repeats its Hello": Mutation(
         SESSION, "self._attempt += 1", "self._attempt = self.identity.process_nonce + 1"

@@ -40,7 +40,7 @@ from protocol.messages import (
 from protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
-from tests.support.conversation.rules import check_tickets
+from tests.support.conversation.rules import check_ledger
 
 M = TypeVar("M")
 A, B, C = b"a", b"b", b"c"
@@ -66,7 +66,7 @@ class Learner:
             ledger=ledger,
             incarnations=incarnations,
         )
-        self.now, self.max_lag = 0.0, max_lag
+        self.now = 0.0
         if publish:
             self.publish(0)
 
@@ -150,7 +150,7 @@ class Learner:
         return taken
 
     def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
-        check_tickets(self.coordinator, self.max_lag)
+        check_ledger(self.coordinator)
         return outs
 
 

@@ -123,7 +123,7 @@ class Replay:
             named["accept"] = accept_any
         made = self.parts[part] = CLASSES[part](*given, **named)
         if part == "TicketCoordinator":
-            self._rules = Rules(made, named["max_lag"], {each for each in used if each < made.ledger.issued})
+            self._rules = Rules(made, named["max_lag"], {each for each in used if each < made.rollouts.ledger.issued})
 
     def _call(self, record: Record, given: list[Any], named: dict[str, Any]) -> None:
         coordinator: Any = self.parts.get("TicketCoordinator", self.parts.get("DescribeCoordinator"))

@@ -12,13 +12,18 @@ def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
     return [arrived for of_round in coordinator.rollouts.ready.values() for arrived in of_round.values()]
 
 
+def check_ledger(coordinator: TicketCoordinator) -> None:
+    """Each ticket and each transition is in one place."""
+    rollouts, waiting = coordinator.rollouts, waiting_rollouts(coordinator)
+    assert rollouts.ledger.outstanding == len(rollouts.held) + len(waiting), "the ledger does not balance"
+    waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
+    assert rollouts.ledger.transitions_waiting == waiting_steps, "transitions do not balance"
+
+
 def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
     """The ledger balances, a lane has one owner, and each ticket is with the owner of its lane."""
-    rollouts, members = coordinator.rollouts, coordinator.members
-    ledger, waiting = rollouts.ledger, waiting_rollouts(coordinator)
-    assert ledger.outstanding == len(rollouts.held) + len(waiting), "the ledger does not balance"
-    waiting_steps = sum(arrived.rollout.env_steps for arrived in waiting)
-    assert ledger.transitions_waiting == waiting_steps, "transitions do not balance"
+    rollouts, members, ledger = coordinator.rollouts, coordinator.members, coordinator.rollouts.ledger
+    check_ledger(coordinator)
     assert ledger.outstanding <= len(rollouts.lanes) * (1 + max_lag), "more tickets than the bound allows"
     for lane in rollouts.lanes:
         owners = [member.peer for member in members.values() if lane.number in member.lanes]
