@@ -166,7 +166,7 @@ MUTATIONS = {
         "again",
     ),
     "an asked-for rollout is not sent again": Mutation(
-        SESSION, "return [Send(answer) for answer in again if answer is not None]", "return []"
+        SESSION, "return [SendMessage(answer) for answer in again if answer is not None]", "return []"
     ),
     "a finished ticket is forgotten": Mutation(
         HELD, " or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):", ":"
