@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -53,7 +52,7 @@ class Echo(gymnasium.Env[Any, Any]):
         if self.steps == self.fails_at:
             raise RuntimeError("the spring broke\nin two")
         right: Any = float(action == self.number)
-        right = {"reward": float("nan"), "text": "one", "vector": np.ones(2), "list": [right]}.get(self.bad, right)
+        right = {"reward": float("nan"), "text": "one"}.get(self.bad, right)
         observation = {"shape": np.zeros(2, np.int64), "outside": 7}.get(self.bad, self._next())
         return observation, right, not self.endless and self.steps == self.longest, False, {}
 
@@ -225,101 +224,6 @@ def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]
 def test_an_unusable_value_is_named(bad: str, says: str) -> None:
     with pytest.raises(EnvironmentFailed, match=says):
         play(Evaluator(echo_run(bad=bad), Repeats()), order(1))
-
-
-class Counts(gymnasium.Env[Any, Any]):
-    """Counts its steps in an observation of bytes, which it returns as int64."""
-
-    def __init__(self, first: int = 0) -> None:
-        self.observation_space = spaces.Box(0, 255, (2,), np.uint8)
-        self.action_space = spaces.Discrete(2)
-        self.first = first
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.array([self.first, 0]), {}
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        self.steps += 1
-        return np.array([self.first, self.steps]), 1.0, self.steps == 3, False, {}
-
-
-@pytest.mark.parametrize("first", [255, 256])
-def test_integers_of_another_dtype_are_taken_as_in_training_if_they_keep_their_values(first: int) -> None:
-    spec = EnvSpec.of(lambda: Counts(first))
-    policy = PolicySpec(observation_leaves(Counts().observation_space), action_spec(spaces.Discrete(2)))
-    run = RunSpec(spec, policy, rollout_steps=4, copies=1, lanes=1, seed=1)
-    evaluator = Evaluator(run, random_policy(policy))
-    collector = Collector(run, random_policy(policy))
-    if first < 256:
-        assert figures(play(evaluator, order(1))) == [(3.0, 3)]
-        (rollout,) = collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
-        assert rollout.obs[0][:, 0].tolist() == [[255, 0], [255, 1], [255, 2], [255, 3], [255, 0]]
-        return
-    says = r"expected uint8\[2\] as its space says, got int64\[2\] with the value 256"
-    with pytest.raises(EnvironmentFailed, match=f"copy 0, first reset: observation: {says}"):
-        play(evaluator, order(1))
-    with pytest.raises(EnvironmentFailed, match=says):
-        collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
-
-
-class Parts(gymnasium.Env[Any, Any]):
-    """A Dict observation, of which one part is missing after so many steps."""
-
-    def __init__(self, lost_after: int = 9) -> None:
-        self.observation_space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(2)})
-        self.action_space = spaces.Discrete(2)
-        self.lost_after, self.steps = lost_after, 0
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        return self.show(), {}
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        self.steps += 1
-        return self.show(), 1.0, False, False, {}
-
-    def show(self) -> dict[str, int]:
-        return {"left": 1} | ({} if self.steps >= self.lost_after else {"right": 1})
-
-
-@pytest.mark.parametrize(("lost_after", "where"), [(0, "reset"), (2, "step 1")])
-def test_a_part_of_an_observation_that_is_missing_is_named(lost_after: int, where: str) -> None:
-    policy = PolicySpec(observation_leaves(Parts().observation_space), action_spec(spaces.Discrete(2)))
-    run = RunSpec(EnvSpec.of(lambda: Parts(lost_after)), policy, rollout_steps=4, copies=1, lanes=1, seed=1)
-    says = f"copy 0, {where}: observation: expected the structure of its space, got a dict of 'left'"
-    with pytest.raises(EnvironmentFailed, match=says):
-        play(Evaluator(run, random_policy(policy)), order(1))
-
-
-def test_a_vector_reward_gets_the_advice_of_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = "copy 0, step 0: reward: expected a number, got an array of shape (2,)"
-    line += "; wrap the environment so that it returns one number"
-    for module, advice in ((None, ""), (sys, ", as --wrapper mo_gymnasium.wrappers:LinearReward does")):
-        if module is not None:  # the package is imported
-            monkeypatch.setitem(sys.modules, "mo_gymnasium", module)
-        with pytest.raises(EnvironmentFailed) as caught:
-            play(Evaluator(echo_run(bad="vector"), Repeats()), order(1))
-        assert str(caught.value) == f"while the policy was evaluated: {line}{advice}"
-
-
-def test_a_reward_of_one_element_is_a_number_as_in_training() -> None:
-    in_lists = play(Evaluator(echo_run(bad="list"), Repeats()), order(1, 2))
-    assert figures(in_lists) == figures(play(Evaluator(echo_run(), Repeats()), order(1, 2)))
-
-
-def test_an_observation_that_is_not_finite_is_named() -> None:
-    class Drifts(gymnasium.Wrapper[Any, Any, Any, Any]):
-        def step(self, action: Any) -> Any:
-            observation, *rest = self.env.step(action)
-            return observation * np.float32("inf"), *rest
-
-    run = run_of("CartPole-v1")
-    spec = EnvSpec.of(lambda: Drifts(gymnasium.make("CartPole-v1")))
-    run = msgspec.structs.replace(run, env=spec)
-    with pytest.raises(EnvironmentFailed, match="observation: expected finite values, got inf at step 1, copy 0"):
-        play(Evaluator(run, random_policy(run.policy)), order(1, 2))
 
 
 class Shows(Smooth):
