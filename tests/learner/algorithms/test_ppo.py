@@ -17,7 +17,6 @@ from tests.support.numbers.batches import (
     DISCRETE,
     GAUSSIAN,
     batch,
-    identity_batch,
     no_pulse,
     normal,
 )
@@ -190,16 +189,3 @@ def test_a_step_with_clipped_values_follows_the_gradient_of_the_usual_loss(befor
     allowed = gradient_tolerance(algorithm, rows, Errors(target=ELEMENTWISE * UNIT * abs(before)))  # it is rounded
     algorithm.step(rows)
     assert_within(algorithm.net.flat_grad[critic].numpy(), expected[critic].numpy(), allowed[critic])
-
-
-@pytest.mark.parametrize(("spec", "start", "goal"), [(normal(DISCRETE), 0.5, 0.95), (normal(GAUSSIAN), -1.5, -0.35)])
-def test_it_learns_the_identity(spec: PolicySpec, start: float, goal: float) -> None:
-    algorithm = ppo(PPOConfig(learning_rate=0.01, n_epochs=5, gamma=0.9), spec)
-    generator = np.random.default_rng(0)
-    scores = []
-    for _ in range(40):
-        rows, score = identity_batch(algorithm, generator)
-        scores.append(score)
-        algorithm.update(rows, no_pulse)
-    assert scores[0] < start
-    assert np.mean(scores[-3:]) > goal

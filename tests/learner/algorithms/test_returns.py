@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -122,68 +121,6 @@ def test_lambda_1_is_the_monte_carlo_return_less_the_value(r: Rows, gamma: float
                 k += 1
             expected[t, n] = g - r.values[t, n] if r.valid[t, n] else 0
     assert_within(r.gae(gamma, 1.0), expected, gae_tolerance(r, gamma, 1.0))
-
-
-@given(rows())
-@settings(max_examples=100, deadline=None)
-def test_a_batch_with_boundaries_is_its_episodes_put_together(r: Rows) -> None:
-    T, N = r.reward.shape
-    whole = r.gae()
-    for n in range(N):
-        ends = [t for t in range(T) if r.terminated[t, n] or r.truncated[t, n]]
-        starts = [t for t in range(T) if r.valid[t, n] and (t == 0 or not r.valid[t - 1, n])]
-        for start in starts:
-            stop = next((end + 1 for end in ends if end >= start), T)
-            cut = [array[start:stop, n : n + 1] for array in (r.reward, r.terminated, r.truncated, r.valid)]
-            alone = Rows(cut[0], r.values[start : stop + 1, n : n + 1], *cut[1:])
-            np.testing.assert_array_equal(whole[start:stop, n], alone.gae()[:, 0])
-
-
-def one_ending(terminated: bool, truncated: bool) -> Rows:
-    """Three steps of one copy that end at t = 1, and the row that resets it."""
-    flags = np.zeros((4, 1), bool)
-    flags[1] = True
-    reward = np.array([[1.0], [2.0], [99.0], [4.0]], np.float32)
-    values = np.array([[10.0], [20.0], [30.0], [40.0], [50.0]], np.float32)
-    return Rows(reward, values, *lawful(flags & terminated, flags & truncated, np.array([True])))
-
-
-def test_termination_does_not_bootstrap() -> None:
-    np.testing.assert_allclose(one_ending(True, False).gae()[1], 2 - 20)
-
-
-def test_truncation_bootstraps_from_the_final_observation() -> None:
-    np.testing.assert_allclose(one_ending(False, True).gae()[1], 2 + GAMMA * 30 - 20)
-
-
-def test_terminated_wins_when_both_flags_are_set() -> None:
-    np.testing.assert_array_equal(one_ending(True, True).gae(), one_ending(True, False).gae())
-
-
-@pytest.mark.parametrize(("terminated", "truncated"), [(True, False), (False, True), (True, True)])
-def test_an_end_cuts(terminated: bool, truncated: bool) -> None:
-    """Even where no reset row stands between two episodes."""
-    r = one_ending(terminated, truncated)
-    r = r._replace(valid=np.ones_like(r.valid))
-    reward, values = r.reward.copy(), r.values.copy()
-    reward[3:] += 7
-    values[4:] += 5
-    later = r._replace(reward=reward, values=values)
-    assert r.gae()[2] != later.gae()[2]
-    np.testing.assert_array_equal(r.gae()[:2], later.gae()[:2])
-
-
-@given(rows(), st.sampled_from([0.0, 1e30, np.nan]))
-@settings(max_examples=100, deadline=None)
-def test_a_row_that_is_not_valid_changes_nothing(r: Rows, rubbish: float) -> None:
-    reward, values = r.reward.copy(), r.values.copy()
-    reward[~r.valid] = rubbish
-    before = np.zeros_like(r.valid)
-    before[1:] = r.truncated[:-1] & ~r.terminated[:-1]
-    values[:-1][~r.valid & ~before] = rubbish  # the value of a reset row's obs is used only to bootstrap a truncation
-    found = r._replace(reward=reward, values=values).gae()
-    np.testing.assert_array_equal(found, r.gae())
-    assert not found[~r.valid].any()
 
 
 @given(rows(), st.floats(0, 1))

@@ -1,8 +1,9 @@
-"""V-trace and whole episodes against slow sums that look like the papers, over random episode boundaries."""
+"""V-trace and whole episodes against slow sums that look like the papers; and what V-trace and GAE share at ends."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -131,12 +132,23 @@ def test_on_policy_advantages_are_those_of_gae_for_any_lambda(r: Rows, gamma: fl
     assert_within(target, np.where(r.valid, r.gae(gamma, lam) + r.values[:-1], 0), 2 * of_target)
 
 
-@given(off_policy())
+Estimate = Callable[[OffPolicy], tuple[Array, ...]]
+
+
+def gae_of(o: OffPolicy) -> tuple[Array, ...]:
+    return (o.rows.gae(),)
+
+
+BOTH = pytest.mark.parametrize("estimate", [gae_of, OffPolicy.vtrace])
+
+
+@BOTH
+@given(o=off_policy())
 @settings(max_examples=100, deadline=None)
-def test_a_batch_with_boundaries_is_its_episodes_put_together(o: OffPolicy) -> None:
+def test_a_batch_with_boundaries_is_its_episodes_put_together(estimate: Estimate, o: OffPolicy) -> None:
     r = o.rows
     T, N = r.reward.shape
-    whole = o.vtrace()
+    whole = estimate(o)
     for n in range(N):
         ends = [t for t in range(T) if r.terminated[t, n] or r.truncated[t, n]]
         for start in [t for t in range(T) if r.valid[t, n] and (t == 0 or not r.valid[t - 1, n])]:
@@ -145,13 +157,14 @@ def test_a_batch_with_boundaries_is_its_episodes_put_together(o: OffPolicy) -> N
             alone = OffPolicy(
                 Rows(reward, r.values[start : stop + 1, n : n + 1], *flags), o.log_ratio[start:stop, n : n + 1]
             )
-            for array, expected in zip(whole, alone.vtrace(), strict=True):
+            for array, expected in zip(whole, estimate(alone), strict=True):
                 np.testing.assert_array_equal(array[start:stop, n], expected[:, 0])
 
 
-@given(off_policy(), st.sampled_from([0.0, 1e30, np.nan]))
+@BOTH
+@given(o=off_policy(), rubbish=st.sampled_from([0.0, 1e30, np.nan]))
 @settings(max_examples=100, deadline=None)
-def test_a_row_that_is_not_valid_changes_nothing(o: OffPolicy, rubbish: float) -> None:
+def test_a_row_that_is_not_valid_changes_nothing(estimate: Estimate, o: OffPolicy, rubbish: float) -> None:
     r = o.rows
     reward, values, log_ratio = r.reward.copy(), r.values.copy(), o.log_ratio.copy()
     reward[~r.valid] = log_ratio[~r.valid] = rubbish
@@ -159,8 +172,8 @@ def test_a_row_that_is_not_valid_changes_nothing(o: OffPolicy, rubbish: float) -
     before[1:] = r.truncated[:-1] & ~r.terminated[:-1]
     values[:-1][~r.valid & ~before] = rubbish  # the value of a reset row's obs is used only to bootstrap a truncation
     with np.errstate(over="ignore"):
-        found = OffPolicy(r._replace(reward=reward, values=values), log_ratio).vtrace()
-    for array, expected in zip(found, o.vtrace(), strict=True):
+        found = estimate(OffPolicy(r._replace(reward=reward, values=values), log_ratio))
+    for array, expected in zip(found, estimate(o), strict=True):
         np.testing.assert_array_equal(array, expected)
         assert not array[~r.valid].any()
 
@@ -175,23 +188,26 @@ def three_steps(terminated: bool, truncated: bool, ratio: float = 1.0) -> OffPol
     return OffPolicy(Rows(reward, values, *lawful(flags & terminated, flags & truncated, np.array([True]))), log_ratio)
 
 
+@BOTH
 @pytest.mark.parametrize(("terminated", "truncated", "after"), [(True, False, 0.0), (False, True, 30.0), (True, True, 0.0)])
-def test_what_stands_for_the_value_after_an_end(terminated: bool, truncated: bool, after: float) -> None:
+def test_what_stands_for_the_value_after_an_end(estimate: Estimate, terminated: bool, truncated: bool, after: float) -> None:
     """Nothing after termination, V of the true final observation after truncation, and terminated wins."""
-    target, advantage = three_steps(terminated, truncated).vtrace()
-    np.testing.assert_allclose(target[1], 2 + GAMMA * after, rtol=1e-6)
+    *target, advantage = estimate(three_steps(terminated, truncated))
     np.testing.assert_allclose(advantage[1], 2 + GAMMA * after - 20, rtol=1e-6)
+    for each in target:
+        np.testing.assert_allclose(each[1], 2 + GAMMA * after, rtol=1e-6)
 
 
+@BOTH
 @pytest.mark.parametrize(("terminated", "truncated"), [(True, False), (False, True), (True, True)])
-def test_an_end_cuts(terminated: bool, truncated: bool) -> None:
+def test_an_end_cuts(estimate: Estimate, terminated: bool, truncated: bool) -> None:
     """Even where no reset row stands between two episodes."""
     o = three_steps(terminated, truncated)
     r = o.rows._replace(valid=np.ones_like(o.rows.valid))
     reward, values = r.reward.copy(), r.values.copy()
     reward[3:] += 7
     values[4:] += 5
-    found, later = on_policy(r).vtrace(), on_policy(r._replace(reward=reward, values=values)).vtrace()
+    found, later = (estimate(on_policy(each)) for each in (r, r._replace(reward=reward, values=values)))
     for a, b in zip(found, later, strict=True):
         assert a[2] != b[2]
         np.testing.assert_array_equal(a[:2], b[:2])

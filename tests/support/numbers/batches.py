@@ -7,6 +7,8 @@ from typing import Literal, Protocol
 import msgspec
 import numpy as np
 
+from learner.algorithm_check import toy_batches
+from learner.algorithm_check.toy_batches import ToyActor
 from protocol.arrays import Array
 from protocol.policy.distributions import distribution
 from protocol.policy.numpy_policy import NumpyPolicy
@@ -92,31 +94,5 @@ def batch(algorithm: Acting, seed: int, fresh: bool = False, steps: int = T) -> 
 
 
 def identity_batch(algorithm: Acting, generator: np.random.Generator) -> tuple[Batch, float]:
-    """The identity environment: the right action is the observation; each episode is one step, then the copy resets."""
-    steps, N, spec = 32, 8, algorithm.policy
-    choice = generator.integers(0, 4, (steps + 1, N))
-    obs = np.eye(4, dtype=np.float32)[choice]
-    over = distribution(spec)
-    valid = np.zeros((steps, N), bool)
-    valid[::2] = True
-    params = remembering(algorithm, obs[:-1], valid, np.zeros((N, spec.state_size), np.float32))
-    action = over.sample(params, over.noise(generator, (steps, N)))
-    if spec.action.kind == "box":
-        reward = -np.square(action - obs[:-1, :, :2]).sum(-1)
-    else:
-        reward = (action == choice[:-1]).astype(np.float32)
-    rows = Batch(
-        obs=(obs,),
-        action=action,
-        log_prob=over.log_prob(params, action),
-        reward=np.where(valid, reward, 50).astype(np.float32),
-        terminated=valid.copy(),
-        truncated=np.zeros((steps, N), bool),
-        valid=valid,
-        state=np.zeros((N, spec.state_size), np.float32),
-        lane=np.repeat(np.arange(2), 4),
-        fresh=np.zeros(N, bool),
-        copies=4,
-        episodes=(),
-    )
-    return rows, float(reward[valid].mean())
+    """The identity environment, acted on with the algorithm's weights; and the mean reward."""
+    return toy_batches.identity_batch(ToyActor(algorithm.policy, *algorithm.weights()), 32, generator)
