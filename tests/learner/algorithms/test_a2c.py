@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from learner.algorithms.a2c import A2C
-from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
 from learner.algorithms.returns import EpisodeEnds, gae
@@ -19,7 +18,7 @@ from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows, gae_tolerance
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
-from tests.support.numbers.steps import Errors, only_step
+from tests.support.numbers.steps import Errors, only_step, watched
 
 FREE: dict[str, Any] = {"max_grad_norm": 1e9, "gamma": 0.9, "ent_coef": 0.01, "normalize_rewards": False}
 
@@ -43,20 +42,13 @@ def whole(rows: Batch) -> Batch:
     return msgspec.structs.replace(rows, terminated=terminated, truncated=np.zeros_like(terminated))
 
 
-def test_an_update_is_one_step_on_all_valid_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_update_is_one_step_on_all_valid_rows() -> None:
     algorithm = a2c(gamma=0.9, gae_lambda=0.7)
     rows = batch(algorithm, 0)
     values = algorithm.values(algorithm.observations(rows), no_pulse)
     expected = gae(rows.reward, values, EpisodeEnds.of(rows), 0.9, 0.7)
     assert algorithm.vf_coef > 0
-    minibatches: list[Minibatch] = []
-    step = algorithm.step
-
-    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
-        minibatches.append(minibatch)
-        return step(minibatch)
-
-    monkeypatch.setattr(algorithm, "step", recorded_step)
+    minibatches = watched(algorithm)
     algorithm.update(rows, no_pulse)
     (only,) = minibatches
     np.testing.assert_array_equal(only.features, rows.obs[0][:-1][rows.valid])

@@ -32,7 +32,7 @@ from tests.support.numbers.batches import (
     shared,
 )
 from tests.support.numbers.rounding import ELEMENTWISE, SAMPLES, UNIT, assert_within, tolerance_of
-from tests.support.numbers.steps import gradient_tolerance, usual_rows
+from tests.support.numbers.steps import gradient_tolerance, usual_rows, watched
 
 NAMES = ["a2c", "impala", "reinforce"]
 
@@ -60,6 +60,16 @@ def test_a_batch_without_a_valid_row_changes_nothing(name: str) -> None:
     empty = msgspec.structs.replace(batch(a, 0), valid=np.zeros((T, LANES * COPIES), bool))
     assert a.update(empty, no_pulse) == {}
     assert first_difference(a.state_dict(), b.state_dict()) is None
+
+
+@pytest.mark.parametrize(("name", "settings"), [("ppo", {"batch_size": 1}), ("impala", {"minibatches": 1000})])
+def test_a_minibatch_of_one_row_is_learned_from(name: str, settings: dict[str, Any]) -> None:
+    algorithm = make(name, **settings)
+    seen = watched(algorithm)
+    metrics = algorithm.update(batch(algorithm, 0, steps=2), no_pulse)
+    assert {len(each.features) for each in seen} == {1}
+    assert np.isfinite(algorithm.weights()[0]).all()
+    assert np.isfinite(metrics["train/value_loss"])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -21,7 +21,7 @@ from tests.learner.algorithms.test_returns import Rows
 from tests.learner.algorithms.test_vtrace import OffPolicy, on_policy, slow_vtrace, vtrace_tolerances
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
 from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, in_double, in_float64, sampled
-from tests.support.numbers.steps import Errors, only_step, usual_distribution
+from tests.support.numbers.steps import Errors, only_step, usual_distribution, watched
 
 GAMMA = 0.9
 
@@ -105,20 +105,6 @@ def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spe
     assert step.metrics["train/rho"] < 0.9
 
 
-def watch(algorithm: Impala, monkeypatch: pytest.MonkeyPatch) -> list[Minibatch]:
-    """The minibatches of each step that the algorithm makes from now on."""
-    assert algorithm.vf_coef > 0
-    minibatches: list[Minibatch] = []
-    step = algorithm.step
-
-    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
-        minibatches.append(minibatch)
-        return step(minibatch)
-
-    monkeypatch.setattr(algorithm, "step", recorded_step)
-    return minibatches
-
-
 def by_row(given: list[Minibatch]) -> list[tuple[float, ...]]:
     """Rows of minibatches, sorted: features, advantage, target."""
     return sorted(
@@ -126,10 +112,10 @@ def by_row(given: list[Minibatch]) -> list[tuple[float, ...]]:
     )
 
 
-def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out() -> None:
     whole, shared_out = impala(), impala(minibatches=4)
     rows = batch(impala(seed=1), 0)
-    once, parts = watch(whole, monkeypatch), watch(shared_out, monkeypatch)
+    once, parts = watched(whole), watched(shared_out)
     pulses: list[int] = []
     whole.update(rows, no_pulse)
     shared_out.update(rows, lambda: pulses.append(1))
@@ -141,21 +127,14 @@ def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out(monkeypatch
     assert parts[0].features.tolist() != sorted(parts[0].features.tolist())
 
 
-def test_vtrace_is_computed_anew_for_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vtrace_is_computed_anew_for_each_epoch() -> None:
     algorithm = impala(n_epochs=2, learning_rate=0.05, optimizer="adam")
-    seen = watch(algorithm, monkeypatch)
+    seen = watched(algorithm)
     rows = batch(algorithm, 0)
     algorithm.update(rows, no_pulse)
     first, second = seen
     assert sorted(first.features.tolist()) == sorted(second.features.tolist())
     assert by_row([first]) != by_row([second])
-
-
-def test_more_minibatches_than_rows_is_one_for_each_row() -> None:
-    algorithm = impala(minibatches=1000)
-    metrics = algorithm.update(batch(algorithm, 0, steps=2), no_pulse)
-    assert np.isfinite(algorithm.weights()[0]).all()
-    assert np.isfinite(metrics["train/value_loss"])
 
 
 @pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN)])

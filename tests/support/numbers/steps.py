@@ -63,6 +63,19 @@ def only_step(algorithm: ActorCritic, batch: Batch, errors: Errors = NO_ERRORS) 
     return Step(algorithm.net.flat_grad.numpy().copy(), tolerance, metrics)
 
 
+def watched(algorithm: ActorCritic) -> list[Minibatch]:
+    """The minibatches of each step that the algorithm makes from now on."""
+    minibatches: list[Minibatch] = []
+    step = algorithm.step
+
+    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
+        minibatches.append(minibatch)
+        return step(minibatch)
+
+    algorithm.step = recorded_step  # type: ignore[method-assign]
+    return minibatches
+
+
 def gradient_tolerance(algorithm: ActorCritic, minibatch: Minibatch, errors: Errors = NO_ERRORS) -> Array:
     """How far two float32 gradients [P] of the loss of a minibatch of B rows may differ.
 
