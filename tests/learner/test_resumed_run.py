@@ -1,4 +1,4 @@
-"""A run that goes on from a checkpoint makes the same next update as one that did not stop: bit for bit."""
+"""What a resumed run takes from its checkpoint: rollouts, tickets and their reason to stop; and what is refused."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
-import numpy as np
 import pytest
 
 from learner.algorithms.ppo import PPO
@@ -25,62 +24,14 @@ from learner.run_state import RunState, restore
 from learner.train import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import CheckpointError
-from protocol.policy.policy import make_policy
-from protocol.rollout import Batch, Rollout, stack_rollouts
-from protocol.specs import RunSpec
+from protocol.rollout import Batch, stack_rollouts
 from tests.support.conversation.fake_ends import fake_rollout
 from tests.support.in_process.described import run_spec
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
 
 
 def ppo(config: Config) -> PPOConfig:
     assert isinstance(config.algorithm, PPOConfig)
     return config.algorithm
-
-
-def record(run: RunSpec, algorithm: PPO, batches: int) -> list[Batch]:
-    """Batches as workers would have sent them (all under the first weights: what is compared is the learner)."""
-    collector = Collector(run, make_policy(run.policy))
-    collector.load(*algorithm.weights())
-    recorded: list[list[Rollout]] = []
-    for sequence in range(batches):
-        lanes = [Assignment(sequence * run.lanes + lane, lane, 0, sequence) for lane in range(run.lanes)]
-        recorded.append(collector.collect(lanes, 0, 1, lambda: None))
-    collector.lanes.close_all()
-    return [stack_rollouts(rollouts) for rollouts in recorded]
-
-
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
-def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str) -> None:
-    everything: dict[str, Any] = {
-        "rollout_steps": 16, "learning_rate_schedule": "linear", "clip_range_schedule": "linear",
-        "normalize_observations": True, "normalize_rewards": True, "batch_size": 32, "run_dir": str(tmp_path),
-    }  # fmt: skip
-    config = resolve(env, **everything)
-    run = run_spec(config, EnvSpec(env))
-
-    def algorithm() -> PPO:
-        return PPO(ppo(config), run.policy, total_steps=10_000, seed=1)
-
-    straight = algorithm()
-    first, second, third = record(run, straight, 3)
-    folder = RunFolder.create(config)
-    straight.update(first, lambda: None)
-    straight.update(second, lambda: None)
-    checkpoint.save(folder.path, RunState(version=2).checkpoint_content(straight), env_steps=2, keep=3)
-    metrics = straight.update(third, lambda: None)
-
-    resumed = algorithm()
-    state = restore(folder, resumed)
-    assert state.version == 2
-    metrics_again = resumed.update(third, lambda: None)
-    assert metrics_again == metrics
-    for expected, got in zip(straight.weights(), resumed.weights(), strict=True):
-        assert np.array_equal(expected, got)
-    not_resumed = algorithm()
-    not_resumed.update(third, lambda: None)
-    assert not np.array_equal(not_resumed.weights()[0], straight.weights()[0]), "the checkpoint changes nothing"
 
 
 def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.replay.continuous import Continuous
 from learner.config.config import Config
@@ -93,19 +94,6 @@ def statistics(algorithm: Any) -> dict[str, Any]:
     }
 
 
-def assert_same(got: Any, expected: Any) -> None:
-    """Plain data and tensors, bit for bit."""
-    match expected:
-        case torch.Tensor():
-            assert torch.equal(got, expected)
-        case dict():
-            assert got.keys() == expected.keys()
-            for name in expected:
-                assert_same(got[name], expected[name])
-        case _:
-            assert got == expected
-
-
 # ------------------------------------------------------------------------------------------------------ what is taken
 
 
@@ -119,13 +107,13 @@ def test_the_policy_and_the_statistics_are_taken_and_all_else_starts_anew(tmp_pa
     assert np.array_equal(algorithm.weights()[0], before.weights()[0])
     assert not np.array_equal(algorithm.weights()[0], made(algo, tmp_path)[1].weights()[0])
     state, theirs = algorithm.state_dict(), before.state_dict()
-    assert_same(state.pop("observations"), theirs["observations"])
-    assert_same(state.pop("rewards"), {"moments": theirs["rewards"]["moments"], "returns": {}})
+    assert first_difference(state.pop("observations"), theirs["observations"]) is None
+    assert first_difference(state.pop("rewards"), {"moments": theirs["rewards"]["moments"], "returns": {}}) is None
     for name in ("parameters", "target"):
         if name in state:
-            assert_same(state.pop(name), torch.cat([theirs["parameters"][:P], fresh[name][P:]]))
+            assert first_difference(state.pop(name), torch.cat([theirs["parameters"][:P], fresh[name][P:]])) is None
     assert state.pop("acts_at_once", True)
-    assert_same(state, {name: fresh[name] for name in state})
+    assert first_difference(state, {name: fresh[name] for name in state}) is None
 
 
 @ALL
@@ -139,9 +127,9 @@ def test_all_weights_are_taken_with_the_critic_and_the_moments_of_optimizers_wit
         algorithm, said = started(algo, tmp_path, run, from_parts=parts, learning_rate=0.25)
         assert f" policy, statistics, critic{', optimizers' * (parts == 'all')}, after " in said
         state = algorithm.state_dict()
-        assert_same({name: state[name] for name in weights}, {name: theirs[name] for name in weights})
+        assert first_difference({name: state[name] for name in weights}, {name: theirs[name] for name in weights}) is None
         for name in optimizers:
-            assert_same(state[name]["state"], kept[name]["state"])
+            assert first_difference(state[name]["state"], kept[name]["state"]) is None
             assert state[name]["param_groups"][0]["lr"] == 0.25
         assert (algorithm.env_steps, algorithm.version) == (0, 0)
         algorithm.update(rows(algorithm, 3), no_pulse)
@@ -214,7 +202,7 @@ def test_the_best_policy_is_that_of_the_best_evaluation(tmp_path: Path) -> None:
 def test_another_algorithm_with_the_same_layout_takes_policy_and_critic(tmp_path: Path) -> None:
     run, before = earlier_run("ppo", tmp_path)
     algorithm, _ = started("a2c", tmp_path, run, from_parts="critic")
-    assert_same(algorithm.state_dict()["parameters"], before.state_dict()["parameters"])
+    assert first_difference(algorithm.state_dict()["parameters"], before.state_dict()["parameters"]) is None
 
 
 # ------------------------------------------------------------------------------------------------------ what is refused

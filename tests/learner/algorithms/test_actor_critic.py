@@ -72,14 +72,19 @@ def test_a_minibatch_of_one_row_is_learned_from(name: str, settings: dict[str, A
     assert np.isfinite(metrics["train/value_loss"])
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_learning_rate_follows_the_steps_used(name: str) -> None:
-    algorithm, used = make(name, learning_rate=0.01, learning_rate_schedule="linear"), 0
+@pytest.mark.parametrize("name", ["ppo", *NAMES])
+def test_schedules_follow_the_steps_used(name: str) -> None:
+    schedules: dict[str, Any] = {"learning_rate_schedule": "linear"} | (
+        {"clip_range_schedule": "linear"} if name == "ppo" else {}
+    )
+    algorithm, used = make(name, learning_rate=0.01, **schedules), 0
     for seed in range(3):
         left = 1 - used / 10_000
         rows = batch(algorithm, seed)
         metrics = algorithm.update(rows, no_pulse)
         assert metrics["train/learning_rate"] == pytest.approx(0.01 * left)
+        if name == "ppo":
+            assert metrics["train/clip_range"] == pytest.approx(0.2 * left)
         assert algorithm.version == seed + 1
         used += int(rows.valid.sum())
     assert 0 < left < 1

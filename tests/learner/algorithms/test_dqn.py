@@ -129,19 +129,6 @@ def test_targets_on_a_chain_by_hand(double: bool, n_step: int, end: str, from_0:
     np.testing.assert_allclose(made.targets(made.transitions(drawn)).numpy(), expected, rtol=1e-6)
 
 
-def test_a_step_moves_the_value_of_the_action_taken_towards_its_target() -> None:
-    made = chain(double=False, learning_rate=0.01)
-    made.replay.add(walk(terminated=True))
-    drawn = made.replay.sample(50)
-    before = made.net.flat.clone().numpy()
-    made.step(made.transitions(drawn))
-    moved = named_views(made.net.flat.numpy() - before, made.net.fields)["q.out.weight"]
-    assert moved[1, 0] > 0  # Q(0, 1) = 3 → 26
-    assert moved[0, 1] < 0  # Q(1, 0) = 5 → 3
-    moved[1, 0] = moved[0, 1] = 0
-    assert not moved.any()
-
-
 # -------------------------------------------------------------------- a gradient step
 
 
@@ -245,21 +232,6 @@ def test_a_hard_target_is_a_copy_every_so_many_gradient_steps() -> None:
         copies.append(torch.equal(made.target.flat, made.net.flat))
         assert torch.equal(made.target.flat, start) == (seed < 1)
     assert copies == [False, True, False, True, False, True, False]
-
-
-def test_the_next_action_is_chosen_by_the_network_if_double_and_by_the_target_if_not() -> None:
-    for double in (False, True):
-        made = dqn(changed(PLAIN, double=double))
-        made.replay.add(batch(0))
-        made.target.flat.mul_(-1)
-        drawn = made.replay.sample(64)
-        following = torch.from_numpy(drawn.next_leaves[0])
-        with torch.no_grad():
-            values, best = made.target.params(following), made.net.params(following).argmax(1)
-        value = values[torch.arange(64), best] if double else values.amax(1)
-        expected = torch.from_numpy(drawn.reward) + torch.from_numpy(drawn.discount) * value
-        torch.testing.assert_close(made.targets(made.transitions(drawn)), expected)
-        assert (value < values.amax(1)).any() == double
 
 
 def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,18 +91,6 @@ def test_it_learns_from_the_known_returns_alone(
     assert metrics["train/rows_dropped"] == rows.valid.sum() - len(expected)
 
 
-def test_rows_of_an_episode_that_goes_on_change_nothing() -> None:
-    a, b = reinforce(), reinforce()
-    clean, rubbish = batch(a, 0), batch(b, 0)
-    known = np.zeros_like(clean.valid)
-    for t, n, _ in slow_returns(clean, None):
-        known[t, n] = True
-    rubbish.reward[~known] = 1e6
-    rubbish.action[~known] = 3
-    assert a.update(clean, no_pulse) == b.update(rubbish, no_pulse)
-    assert torch.equal(a.net.flat, b.net.flat)
-
-
 def test_without_a_baseline_the_critic_stays_as_it_is() -> None:
     algorithm = reinforce(baseline=False)
     before = algorithm.net.flat.clone()

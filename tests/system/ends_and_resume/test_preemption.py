@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import learner.interrupts
+from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms.ppo import PPO
 from learner.config.layers import resolve
 from learner.interrupts import Interrupts
@@ -81,19 +81,6 @@ def interrupts_at(update: int) -> Watch:
     return watch
 
 
-def same(left: Any, right: Any) -> bool:
-    """Bit for bit; NaN equals NaN."""
-    match left:
-        case dict():
-            return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
-        case list() | tuple():
-            return len(left) == len(right) and all(map(same, left, right))
-        case torch.Tensor():
-            return bool(left.dtype == right.dtype and left.numpy().tobytes() == right.numpy().tobytes())
-        case _:
-            return bool(left == right)
-
-
 MAY_DIFFER = {"wall_s", "ledger"}
 """Of the counters in a checkpoint: the time, and the tickets that were lost with the old learner or the old worker."""
 
@@ -103,13 +90,13 @@ def assert_equal(one: Path, other: Path) -> None:
     (a, _), (b, _) = checkpoint.newest(one), checkpoint.newest(other)
     assert a.env_steps == b.env_steps
     for part in ("algorithm", "best_policy"):
-        assert same(a.state[part], b.state[part]), part
+        assert first_difference(a.state[part], b.state[part]) is None, part
     past, other_past = a.state["past"], b.state["past"]
     assert past.keys() == other_past.keys()
     for of_one in (past, other_past):
         of_one["episodes"] = [(reward, length) for reward, length, *_ in of_one["episodes"]]  # without their seconds
     for name in past.keys() - MAY_DIFFER:
-        assert same(past[name], other_past[name]), name
+        assert past[name] == other_past[name], name
     for file in ("policy.safetensors", "best.safetensors"):
         assert (one / file).read_bytes() == (other / file).read_bytes(), file
     for name in ("env_steps", "updates", "stop_reason", "return_mean_100", "evaluation", "best"):
@@ -235,7 +222,7 @@ def test_an_update_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch: 
     folder, seconds = interrupted_in_an_update(tmp_path, monkeypatch, 4.0, grace_s=30.0)
     assert 15 <= seconds <= 20, "it is given up when half of the grace time is over"
     (whole, _), (broken, _) = (checkpoint.newest(one) for one in (folder_of(tmp_path / "whole"), folder))
-    assert same(whole.state["algorithm"], broken.state["algorithm"])
+    assert first_difference(whole.state["algorithm"], broken.state["algorithm"]) is None
     assert broken.state["past"]["version"] == 3
     ledger = summary(folder)["ledger"]
     assert ledger["lost"] == LANES, "the rollouts of the update that was taken back"
