@@ -329,7 +329,7 @@ def test_no_folder_is_a_drawer_for_everything() -> None:
 
 def test_no_folder_holds_too_many_files() -> None:
     found: dict[Path, int] = defaultdict(int)
-    for source in sources(*PACKAGES):
+    for source in sources(*PACKAGES, "tests"):
         found[Path(source).parent] += not source.endswith("__init__.py")
     assert not {str(folder): count for folder, count in found.items() if count > MOST_FILES}
 
