@@ -47,7 +47,7 @@ A2C = ACTOR_CRITIC | {
 }  # fmt: skip
 DQN = COMMON | {
     "algo": "dqn", "envs": 8, "rollout_steps": 32, "gamma": 0.99, "learning_rate": 2.3e-3, "batch_size": 64,
-    "gradient_steps": 128, "learning_starts": 1000, "replay_size": 100_000, "net": [256, 256], "target": "hard",
+    "gradient_steps": 128, "learning_starts": 1000, "replay_size": 100_000, "net": [256, 256],
     "target_every": 128, "double": False, "epsilon_steps": 8000, "epsilon_end": 0.04, "max_grad_norm": 10.0,
 }  # fmt: skip
 LEAST_S = 0.05  # between two calls of `look`

@@ -52,7 +52,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     ),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
-    "per": (f"train CartPole-v1 --algo dqn --replay prioritized --n-step 3 --normalize-observations {REPLAY}",),
+    "per": (f"train CartPole-v1 --algo dqn --priority-alpha 0.6 --n-step 3 --normalize-observations {REPLAY}",),
     "prior": (f"train CartPole-v1 --algo dqn --prior {RECORDED} --prior-steps 20 {REPLAY}",),
     "record": (
         f"train CartPole-v1 --algo a2c --record {RECORDED} {ON_POLICY}",

@@ -106,10 +106,8 @@ class DQN(OffPolicy):
 
     def _update_target(self) -> None:
         """Update the target network after a gradient step."""
-        if self.config.target == "polyak":
+        if self.gradient_steps % self.config.target_every == 0:
             self.target.flat.lerp_(self.net.flat, self.config.tau)
-        elif self.gradient_steps % self.config.target_every == 0:
-            self.target.flat.copy_(self.net.flat)
 
     def weights(self) -> tuple[Floats, Floats]:
         """Copies of the Q-network's parameters [P] and of the buffers: the observation statistics, then ε."""

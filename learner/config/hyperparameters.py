@@ -189,10 +189,10 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
     the place of one.
     """
-    replay: Fixed[Literal["uniform", "prioritized"]] = "uniform"
-    """How transitions are drawn from the replay buffer. prioritized: by their last TD error."""
-    priority_alpha: Fixed[Fraction] = 0.6
-    """α of prioritized replay. 0: uniform. 1: in proportion to the TD error."""
+    priority_alpha: Fixed[Fraction] = 0.0
+    """α of prioritized replay: how far its last TD error decides how often a transition is drawn from the replay buffer.
+    0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
+    """
     priority_beta: Free[Fraction] = 0.4
     """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
     prior_share: Free[Fraction] = 0.5
@@ -224,10 +224,12 @@ class DQNConfig(OffPolicyConfig, frozen=True):
     """Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: Fixed[bool] = False
     """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
-    target: Free[Literal["polyak", "hard"]] = "hard"
-    """How the target network is updated. polyak: a little in each gradient step. hard: a copy every target_every steps."""
     target_every: Free[Count] = 250
-    """Number of gradient steps between two hard updates of the target network."""
+    """Number of gradient steps between two updates of the target network."""
+    tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 1.0
+    """Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one, such as
+    0.005, take target_every 1 (polyak averaging).
+    """
     epsilon_start: Free[Fraction] = 1.0
     """Initial probability ε of a random action."""
     epsilon_end: Free[Fraction] = 0.05

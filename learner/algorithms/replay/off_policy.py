@@ -72,7 +72,7 @@ class OffPolicy(GradientDescent):
             n_step=config.n_step,
             gamma=config.gamma,
             seed=seed,
-            alpha=config.priority_alpha if config.replay == "prioritized" else None,
+            alpha=config.priority_alpha or None,
             action=policy.action,
         )
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates

@@ -256,13 +256,13 @@ def values(net: Any, obs: Array) -> Array:
 
 @pytest.mark.parametrize("n_step", [1, 3])
 @pytest.mark.parametrize("double", [False, True])
-@pytest.mark.parametrize("replay", ["uniform", "prioritized"])
+@pytest.mark.parametrize("priority_alpha", [0.0, 0.6])
 @pytest.mark.parametrize("small", [True, False])
 def test_targets_are_the_best_of_the_allowed_actions_of_the_next_observation(
-    n_step: int, double: bool, replay: Any, small: bool, monkeypatch: pytest.MonkeyPatch
+    n_step: int, double: bool, priority_alpha: float, small: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trained_networks, "is_small", lambda *_: small)
-    algorithm = dqn(n_step=n_step, double=double, replay=replay)
+    algorithm = dqn(n_step=n_step, double=double, priority_alpha=priority_alpha)
     for seed in range(3):
         algorithm.replay.add(true_masks(masked_batch(algorithm, seed)))
     sample = algorithm.replay.sample(200)

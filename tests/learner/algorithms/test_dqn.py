@@ -146,7 +146,7 @@ def test_the_gradient_of_a_loss_is_autograds(name: str) -> None:
 
 @pytest.mark.parametrize("dueling", [False, True])
 def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
-    made = dqn(changed(PLAIN, dueling=dueling, replay="prioritized", double=False))
+    made = dqn(changed(PLAIN, dueling=dueling, priority_alpha=0.6, double=False))
     made.replay.add(batch(0))
     made.target.flat.mul_(1.5)
     first = made.replay.sample(30)
@@ -215,7 +215,7 @@ def test_optimizers_differ_as_they_should() -> None:
 
 
 def test_a_polyak_target_follows_at_every_gradient_step() -> None:
-    made = dqn(changed(PLAIN, target="polyak", tau=0.25, gradient_steps=1))
+    made = dqn(changed(PLAIN, target_every=1, tau=0.25, gradient_steps=1))
     for seed in range(3):
         before = made.target.flat.clone()
         made.update(batch(seed), no_pulse)
@@ -235,7 +235,7 @@ def test_a_hard_target_is_a_copy_every_so_many_gradient_steps() -> None:
 
 
 def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = dqn(changed(PLAIN, replay="prioritized", gradient_steps=1, priority_beta=0.4))
+    made = dqn(changed(PLAIN, priority_alpha=0.6, gradient_steps=1, priority_beta=0.4))
     betas: list[float] = []
     seen: list[tuple[Ints, Floats]] = []
     sample, told = made.replay.sample, made.replay.update_priorities
@@ -386,7 +386,13 @@ def corridor(made: DQN, generator: np.random.Generator, ends: str) -> Batch:
     )
 
 
-@pytest.mark.parametrize("settings", [{}, {"replay": "prioritized", "n_step": 3, "dueling": True, "target": "polyak"}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"target_every": 20},
+        {"target_every": 1, "tau": 0.05, "priority_alpha": 0.6, "n_step": 3, "dueling": True},
+    ],
+)
 @pytest.mark.parametrize("ends", ["terminated", "truncated"])
 def test_it_learns_a_corridor_and_what_its_end_is_worth(ends: str, settings: dict[str, Any]) -> None:
     """Leaving pays 1 once if the task ends there; if only the clock does, it pays for ever: the copy would go on."""
@@ -398,8 +404,6 @@ def test_it_learns_a_corridor_and_what_its_end_is_worth(ends: str, settings: dic
         gradient_steps=32,
         epsilon_steps=1000,
         epsilon_end=0.3,
-        target_every=20,
-        tau=0.05,
         replay_size=5000,
         **settings,
     )

@@ -29,8 +29,8 @@ REPLAY: dict[str, Any] = {
     "learning_starts": 0,
     "replay_size": 150,  # which the second batch overwrites
 }
-MORE_REPLAY = ALL | {"replay": "prioritized", "n_step": 3, "normalize_observations": True}
-MORE_DQN = {"dueling": True, "target": "polyak", "optimizer": "adamw", "amsgrad": True, "max_grad_norm": 1.0}
+MORE_REPLAY = ALL | {"priority_alpha": 0.6, "n_step": 3, "normalize_observations": True}
+MORE_DQN = {"dueling": True, "target_every": 1, "tau": 0.005, "optimizer": "adamw", "amsgrad": True, "max_grad_norm": 1.0}
 ON_POLICY: dict[str, tuple[PolicySpec, dict[str, Any]]] = {
     "discrete": (normal(DISCRETE), {"optimizer": "adam"}),
     "Gaussian": (normal(GAUSSIAN), {"optimizer": "rmsprop"}),

@@ -38,8 +38,6 @@ def another_value(algo: str, name: str, value: Any) -> Any:
             return "relu" if value == "tanh" else "tanh"
         case "optimizer", _:
             return OTHER_OPTIMIZER[algo]
-        case "replay", _:
-            return "prioritized"
         case "core", _:
             return "gru"
         case "ent_coef", None:
@@ -85,7 +83,7 @@ def test_what_weights_or_state_depend_on_is_fixed() -> None:
     assert {"env", "env_kwargs", "algo", "seed"} <= set(fixed(Config))
     every = {"net", "activation", "encoder", "normalize_observations", "gamma"}
     some = {"shared_net", "normalize_rewards", "core", "core_size", "optimizer", "amsgrad", "dueling"}
-    some |= {"replay", "replay_size", "priority_alpha"}
+    some |= {"replay_size", "priority_alpha"}
     for record in HYPERPARAMETERS.values():
         own = every | some & set(record.__struct_fields__)
         assert own <= set(fixed(record))

@@ -250,8 +250,8 @@ def test_the_value_of_an_algorithms_own_flag_is_not_the_environment(asked: list[
 
 
 def test_a_named_run_takes_its_algorithms_own_flags(asked: list[Any]) -> None:
-    assert main(["train", "--preset", "cartpole-dqn", "--target", "hard", "--tau", "0.5"]) == 0
-    assert asked[0][0] == resolve(preset="cartpole-dqn", target="hard", tau=0.5)
+    assert main(["train", "--preset", "cartpole-dqn", "--target-every", "9", "--tau", "0.5"]) == 0
+    assert asked[0][0] == resolve(preset="cartpole-dqn", target_every=9, tau=0.5)
 
 
 def test_a_resumed_run_reads_its_own_file(asked: list[Any], capsys: Captured) -> None:

@@ -49,7 +49,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "impala": {"algo": "impala", **NORMAL},
     "reinforce": {"algo": "reinforce", **NORMAL, "rollout_steps": 31, "steps": 12 * 31 * ENVS, "eval_every": 200},
     "dqn, uniform": {**DQN, "normalize_observations": True},
-    "dqn, prioritized": {**DQN, "replay": "prioritized", "n_step": 3, "amsgrad": True, "dueling": True},
+    "dqn, prioritized": {**DQN, "priority_alpha": 0.6, "n_step": 3, "amsgrad": True, "dueling": True},
 }
 STOP = 6  # the update after which a run is interrupted
 Watch = Callable[[Progress], None]

@@ -35,7 +35,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "a2c": {"algo": "a2c", "rollout_steps": 16, "normalize_rewards": True},
     "dqn": {
         "algo": "dqn", "rollout_steps": 16, "learning_starts": 0, "gradient_steps": GRADIENT_STEPS, "batch_size": 8,
-        "replay_size": 400, "replay": "prioritized", "n_step": 3, "max_lag": 1,
+        "replay_size": 400, "priority_alpha": 0.6, "n_step": 3, "max_lag": 1,
     },
     "impala": {"algo": "impala", "rollout_steps": 16, "normalize_rewards": True, "max_lag": 2},
     "reinforce": {"algo": "reinforce", "rollout_steps": 501},

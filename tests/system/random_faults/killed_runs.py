@@ -51,7 +51,7 @@ PPO: dict[str, object] = {"n-epochs": 2, "batch-size": 32}
 TARGET = 9  # a return that an evaluation of a policy at random reaches in nearly every run
 VARIANTS: dict[str, dict[str, object]] = {
     "ppo": {**PPO, "checkpoint-every-updates": 1, "workers": 2},
-    "dqn, prioritized": {**DQN, "replay": "prioritized", "checkpoint-every-updates": 1, "workers": 1},
+    "dqn, prioritized": {**DQN, "priority-alpha": 0.6, "checkpoint-every-updates": 1, "workers": 1},
     "a2c, lag 1": {"algo": "a2c", "max-lag": 1, "checkpoint-every-updates": 2, "workers": 2},
     "impala, lag 2": {"algo": "impala", "max-lag": 2, "checkpoint-every-updates": 1, "workers": 1},
     "reinforce": {
