@@ -40,7 +40,7 @@ def rollout_spec(
     `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
     `masked`: whether workers read masks of the allowed actions.
     """
-    if masked and config.chosen_vector() == "envpool":
+    if masked and config.vector == "envpool":
         raise UsageError(
             "vector envpool: its environments report no action masks; use --vector loop, or --action-masks none"
         )
@@ -57,13 +57,13 @@ def rollout_spec(
         copies=config.envs // config.lanes,
         lanes=config.lanes,
         seed=config.seed,
-        vector=config.chosen_vector(),
+        vector=config.vector,
         compress=config.compress,
         images_dtype=config.images_dtype,
         masked=masked,
         extras=extras,
         facts=config.fact_names(),
-        heartbeat_s=config.heartbeat_s,
+        heartbeat_s=config.heartbeat_s(),
     )
     _check_weights_can_be_sent(env.id, policy, config)
     check_can_be_sent(env.id, run)
@@ -109,7 +109,7 @@ def open_hub(
         coordinator.evaluation.most_copies = min(limits) - run.lanes * run.copies
     settings = HubSettings(
         config.no_workers_timeout_s,
-        config.stall_timeout_s,
+        config.stall_timeout_s(),
         config.max_env_failures,
         config.weights_dtype,
         config.call_timeouts(),
@@ -122,7 +122,7 @@ def describe_settings(config: RolloutConfig, steps: int = 0) -> DescribeSettings
     return DescribeSettings(
         worker_timeout_s=config.worker_timeout_s,
         no_workers_timeout_s=config.no_workers_timeout_s,
-        stall_timeout_s=config.stall_timeout_s,
+        stall_timeout_s=config.stall_timeout_s(),
         max_env_failures=config.max_env_failures,
         steps=steps,
         launched_workers=config.launched_workers,

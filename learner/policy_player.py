@@ -126,7 +126,7 @@ class PolicyPlayer:
             seed=0,
             facts=policy.facts,
             masked=policy.masked,
-            heartbeat_s=settings.heartbeat_s,
+            heartbeat_s=settings.heartbeat_s(),
         )
         hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
         hub.wait_for(1)

@@ -132,12 +132,10 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
             if resume is not None and policy is not None:
                 check_spaces(resume.run, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found, config.action_masks))
 
-        described = describe(
-            DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
-        )
+        described = describe(DescribeSpec(env, config.vector, heartbeat_s=config.heartbeat_s()), check_interrupt, accept)
         evaluation = described
         if env.eval_kwargs:
-            spec = DescribeSpec(env.for_evaluation(), heartbeat_s=config.heartbeat_s)
+            spec = DescribeSpec(env.for_evaluation(), heartbeat_s=config.heartbeat_s())
             evaluation = describe(spec, check_interrupt, lambda found: None)
             check_evaluation_spaces(config, described, evaluation)
         imports.wait(check_interrupt)

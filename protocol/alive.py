@@ -68,17 +68,15 @@ class Alive(Message, frozen=True):
 class CallTimeouts:
     """How many seconds one call of an env copy may take. 0: any time. The fields are named as the flags are."""
 
-    construct_s: float = 600.0
-    reset_s: float = 600.0
+    start_s: float = 600.0
+    """making or resetting it"""
     step_s: float = 600.0
 
     def limit_s(self, doing: Doing) -> float:
         """The limit of what a worker does; infinite if it has none."""
         match doing:
-            case "describing" | "making":
-                limit = self.construct_s
-            case "resetting":
-                limit = self.reset_s
+            case "describing" | "making" | "resetting":
+                limit = self.start_s
             case "stepping" | "evaluating":
                 limit = self.step_s
             case "closing":
@@ -87,11 +85,15 @@ class CallTimeouts:
                 limit = 0.0
         return limit or float("inf")
 
+    def longest_s(self) -> float:
+        """The longest time that a call may take; infinite if one of them may take any time."""
+        return max(self.limit_s("making"), self.limit_s("stepping"))
+
     def reason(self, doing: Doing) -> str:
         """Why a worker is ended that exceeds its limit. The line names the flag."""
-        flag = {"describing": "construct", "making": "construct", "resetting": "reset"}.get(doing, "step")
+        flag = "step" if doing in ("stepping", "evaluating") else "start"
         named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
         return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"
 
 
-NO_TIMEOUTS = CallTimeouts(0.0, 0.0, 0.0)
+NO_TIMEOUTS = CallTimeouts(0.0, 0.0)

@@ -170,9 +170,9 @@ class Stalled(RunError):
 
     >>> import millrace
     >>> try:
-    ...     run = millrace.train("CartPole-v1", steps=500, workers=1, stall_timeout_s=60, progress=False)
+    ...     run = millrace.train("CartPole-v1", steps=500, workers=1, progress=False)
     ... except millrace.Stalled as error:
-    ...     print(error)  # no worker made progress for a minute; the run can be resumed
+    ...     print(error)  # no worker made progress for ten minutes; the run can be resumed
     """
 
 

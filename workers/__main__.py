@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
     logging.basicConfig(
         level=logging.INFO, format=f"%(asctime)s worker {shown.replace('%', '%%')}: %(message)s", stream=sys.stderr
     )
-    timeouts = CallTimeouts(flags.construct_timeout_s, flags.reset_timeout_s, flags.step_timeout_s)
+    timeouts = CallTimeouts(flags.start_timeout_s, flags.step_timeout_s)
     signals = _count_signals()
     try:
         _check(flags)
@@ -103,7 +103,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         help="leave when no learner has answered for S seconds (default: %(default)g; with --stay: never); a worker that "
         f"had joined waits for its learner to come back, {REJOIN_TIMEOUT_S:g} s or S if that is longer",
     )
-    for call, what in (("construct", "making one env copy, or the policy"), ("reset", "a reset"), ("step", "a step")):
+    for call, what in (("start", "making or resetting one env copy, or making the policy"), ("step", "a step")):
         faults.add_argument(
             f"--{call}-timeout-s",
             type=float,
@@ -127,7 +127,7 @@ def _check(flags: argparse.Namespace) -> None:
         raise UsageError(f"address {flags.address}: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process")
     check_at_least("processes", flags.processes, 1)
     check_worker_name(flags.name if flags.processes == 1 else f"{flags.name}-w{flags.processes - 1}")
-    for name in ("join_timeout_s", "construct_timeout_s", "reset_timeout_s", "step_timeout_s"):
+    for name in ("join_timeout_s", "start_timeout_s", "step_timeout_s"):
         if not getattr(flags, name) >= 0:  # also true for NaN
             raise UsageError(f"{name}: expected a number of seconds >= 0, got {getattr(flags, name):g}")
     if flags.core is not None and flags.core not in (allowed := os.sched_getaffinity(0)):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import math
 import os
 import signal
 import socket
@@ -55,8 +56,8 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
         raise
     if flags.core is not None:
         os.sched_setaffinity(0, {flags.core})
-    limits = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
-    watchdog = Watchdog(max(limits) + AFTER_SUPERVISOR_S) if all(limits) else None
+    longest_s = timeouts.longest_s()
+    watchdog = Watchdog(longest_s + AFTER_SUPERVISOR_S) if math.isfinite(longest_s) else None
     threading.Thread(target=_end_after_supervisor, args=(flags.parent, flags.address), daemon=True).start()
     join_timeout_s, rejoin_timeout_s = wait_limits_s(flags.join_timeout_s, stay=flags.stay)
     session = Session(

@@ -34,8 +34,7 @@ GROUPS = {
     ),
     "network": ("transport", "bind", "advertise", "keys", "insecure", "compress", "weights_dtype"),
     "timeout and failure": (
-        "heartbeat_s", "worker_timeout_s", "no_workers_timeout_s", "construct_timeout_s", "reset_timeout_s",
-        "step_timeout_s", "stall_timeout_s", "grace_s", "max_env_failures",
+        "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
     ),
     "file and log": (
         "checkpoint_every_s", "checkpoint_every_episodes", "checkpoint_every_updates", "keep_checkpoints", "record", "prior",

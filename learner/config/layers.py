@@ -100,7 +100,10 @@ def lower_layers(
             raise UsageError(f"preset {name}: {config.algo} has none of this name{hint}")
         config = override(config, by_env.get(name, {}), str(PRESETS))
         config = override(config, {**whole_run, "algo": config.algo}, f"preset {preset}")
-    if table.keys() >= {"env", "algo", "seed", "run_dir", "heartbeat_s"}:  # all settings of a run: its tables are whole, too
+    if table.keys() >= {*Config.__struct_fields__} - {
+        "algorithm",
+        *TABLES,
+    }:  # all settings of a run: its tables are whole, too
         config = msgspec.structs.replace(config, **{name: {} for name in TABLES})
     config = _override_from_toml(config, {**table, "algo": config.algo}, where)
     if resume is not None:

@@ -22,6 +22,9 @@ Natural = Annotated[int, Meta(ge=0)]
 Seconds = Annotated[float, Meta(gt=0)]
 SecondsOrNever = Annotated[float, Meta(ge=0)]
 
+HEARTBEAT_S = 1.0
+STALL_TIMEOUT_S = 600.0
+
 
 class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The settings of collecting rollouts."""
@@ -57,10 +60,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
     turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
     """
-    vector: Free[Literal["auto", "loop", "native", "envpool"]] = "auto"
+    vector: Free[Vector] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install 'millrace-rl[envpool]'). auto: loop. native and envpool use other random numbers than
-    loop.
+    envpool: by envpool (pip install 'millrace-rl[envpool]'). native and envpool use other random numbers than loop.
     """
     images_dtype: Free[ImagesDtype] = "float32"
     """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
@@ -127,26 +129,18 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     # --------------------------------------------------------------------------------------------- timeouts and failures
 
-    heartbeat_s: Free[Seconds] = 1.0
-    """Seconds between two heartbeats of a worker."""
     worker_timeout_s: Free[Seconds] = 5.0
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
     is not silent while its supervisor says that its environment is busy, however long that takes.
     """
     no_workers_timeout_s: Free[Seconds] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
-    construct_timeout_s: Free[SecondsOrNever] = 600.0
-    """A local worker process is restarted if making one env copy, or the policy with all that it imports, takes longer than
-    this many seconds. 0: never.
+    start_timeout_s: Free[SecondsOrNever] = 600.0
+    """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
+    imports, takes longer than this many seconds. 0: never.
     """
-    reset_timeout_s: Free[SecondsOrNever] = 600.0
-    """A local worker process is restarted if a reset of an env copy takes longer than this many seconds. 0: never."""
     step_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
-    stall_timeout_s: Free[Seconds] = 600.0
-    """Write a checkpoint and end the run if, for this many seconds, no env step, reset or construction has ended. This does
-    not apply while such a call is in progress and within its timeout.
-    """
     max_env_failures: Free[Natural] = 3
     """End the run when a lane fails more often than this in a row, without a rollout in between, and at the latest after 10
     failures in a row; or when, within an hour, more failures than this came after env steps, and as many again for each env
@@ -160,8 +154,12 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def call_timeouts(self) -> CallTimeouts:
         """How long a call of an env copy may take."""
-        return CallTimeouts(self.construct_timeout_s, self.reset_timeout_s, self.step_timeout_s)
+        return CallTimeouts(self.start_timeout_s, self.step_timeout_s)
 
-    def chosen_vector(self) -> Vector:
-        """How the env copies of a lane are stepped."""
-        return "loop" if self.vector == "auto" else self.vector
+    def stall_timeout_s(self) -> float:
+        """The run ends if no env step, reset or construction has ended for so long, which is longer than each may take."""
+        return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
+
+    def heartbeat_s(self) -> float:
+        """Seconds between two heartbeats of a worker: often enough that it is not silent if some of them come late."""
+        return min(HEARTBEAT_S, self.worker_timeout_s / 5)

@@ -139,7 +139,7 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if name != one_line(name, MAX_NAME)]:
         raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(repr(wrong[0]), MAX_NAME)}")
-    if config.wrapper and config.chosen_vector() != "loop":
+    if config.wrapper and config.vector != "loop":
         raise UsageError(
             f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
         )
@@ -188,8 +188,8 @@ def _check_learner_inference(config: Config, at: str) -> None:
         wrong = f"compress: expected none, got {config.compress}; rollouts are made beside the learner"
     elif config.max_lag:
         wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
-    elif config.vector not in {"auto", "loop"}:
-        wrong = f"vector: expected auto or loop, got {config.vector}; its workers step copies one by one"
+    elif config.vector != "loop":
+        wrong = f"vector: expected loop, got {config.vector}; its workers step copies one by one"
     else:
         return
     raise UsageError(f"{at}inference learner: {wrong}")

@@ -29,7 +29,7 @@ LOG_WAITING_EVERY_S = 10.0
 
 @dataclass(frozen=True)
 class DescribeSettings:
-    """The settings of a run that matter before it begins, named as in `Config`."""
+    """The settings of a run that matter before it begins, named as there."""
 
     worker_timeout_s: float
     no_workers_timeout_s: float

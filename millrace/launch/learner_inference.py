@@ -99,5 +99,5 @@ def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSett
 def _longest_order_s(config: Config) -> float:
     """How long an order may take: to make and to reset every copy. A worker whose environment hangs is ended before that."""
     timeouts = config.call_timeouts()
-    each = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
-    return sum(each) * config.envs if all(each) else NEVER_S
+    each_s = 2 * timeouts.start_s + timeouts.step_s
+    return each_s * config.envs if timeouts.start_s and timeouts.step_s else NEVER_S

@@ -63,7 +63,7 @@ def start(
 
     supervisor, processes = resources.enter_context(endpoint.workers(config.workers, flags, timeouts))
     with stopped_on_error(supervisor):
-        spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
+        spec = DescribeSpec(env, config.vector, heartbeat_s=config.heartbeat_s())
         described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
         spaces = EnvSpaces.of_description(described, config.action_masks)
         policy_spec = policy.spec(spaces.observation, spaces.action)

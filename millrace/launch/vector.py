@@ -289,4 +289,4 @@ def _call_timeouts(timeout_s: float) -> CallTimeouts:
     wait.
     """
     seconds = max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
-    return CallTimeouts(seconds, seconds, seconds)
+    return CallTimeouts(seconds, seconds)

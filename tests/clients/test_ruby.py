@@ -38,7 +38,7 @@ def _with_ruby() -> None:
 def learner(stage: Stage, address: str, *flags: str) -> Learner:
     """`millrace learner` at this address, which acts for its workers."""
     command = [sys.executable, "-m", "millrace", "learner", "GridWorld-v0", "--bind", address, "--run-dir", str(stage.runs)]
-    settings = ["--inference", "learner", "--lanes", "2", "--heartbeat-s", "0.2", "--worker-timeout-s", "2"]
+    settings = ["--inference", "learner", "--lanes", "2", "--worker-timeout-s", "2"]
     made = Learner([*command, *settings, *flags], stage.tmp_path / "learner.log", stage.runs)
     stage.started.append(made)
     return made

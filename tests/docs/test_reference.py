@@ -8,12 +8,14 @@ import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
 import millrace
 from learner.config.command_line import RunFlags
 from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.rollout_config import RolloutConfig
 from learner.metric_names import METRICS
 from learner.run_folder import run_folder
 from millrace.cli.commands import COMMANDS
@@ -58,7 +60,6 @@ def logged(which: str) -> tuple[set[str], set[str]]:
         "eval_episodes": 1,
         "eval_every": 16,
         "workers": 1,
-        "heartbeat_s": 0.05,
     }
     chosen: dict[str, Any] = {
         "env": "CartPole-v1",
@@ -68,7 +69,8 @@ def logged(which: str) -> tuple[set[str], set[str]]:
         **sizes,
         **RUNS[which],
     }
-    with tempfile.TemporaryDirectory() as folder:
+    often = mock.patch.object(RolloutConfig, "heartbeat_s", return_value=0.05)  # the figures of workers come with heartbeats
+    with tempfile.TemporaryDirectory() as folder, often:
         run = millrace.train(**chosen, run_dir=folder, progress=False, callbacks=[Log()])
         rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
         return {name for row in rows for name in row}, {path.name for path in run.path.iterdir()}

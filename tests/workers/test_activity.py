@@ -98,11 +98,9 @@ def test_only_a_worker_that_says_so_leaves_on_purpose() -> None:
 
 
 def test_each_call_has_its_own_timeout_and_zero_is_never() -> None:
-    timeouts = CallTimeouts(1.0, 2.0, 0.0)
-    assert [timeouts.limit_s(doing) for doing in ("making", "resetting", "stepping", "waiting")] == [
-        1,
-        2,
-        math.inf,
-        math.inf,
-    ]
-    assert "a reset of its environment took longer than 2 s (--reset-timeout-s)" in timeouts.reason("resetting")
+    timeouts = CallTimeouts(start_s=2.0, step_s=0.0)
+    limits = [timeouts.limit_s(doing) for doing in ("making", "resetting", "stepping", "waiting")]
+    assert limits == [2, 2, math.inf, math.inf]
+    assert "a reset of its environment took longer than 2 s (--start-timeout-s)" in timeouts.reason("resetting")
+    assert CallTimeouts(start_s=2.0, step_s=1.0).longest_s() == 2
+    assert timeouts.longest_s() == math.inf

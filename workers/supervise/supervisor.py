@@ -272,5 +272,4 @@ def core_flags(cores: Sequence[int], name: str) -> list[str]:
 
 def timeout_flags(timeouts: CallTimeouts) -> list[str]:
     """The flags that say these timeouts."""
-    named = (("construct", timeouts.construct_s), ("reset", timeouts.reset_s), ("step", timeouts.step_s))
-    return [word for call, seconds in named for word in (f"--{call}-timeout-s", str(seconds))]
+    return ["--start-timeout-s", str(timeouts.start_s), "--step-timeout-s", str(timeouts.step_s)]

@@ -154,7 +154,7 @@ def test_status_says_what_a_worker_does_until_its_supervisor_is_silent() -> None
 # ---------------------------------------------------------------- standing still
 
 STALL_S, STEP_S = 100.0, 30.0
-TIMEOUTS = CallTimeouts(STEP_S, STEP_S, STEP_S)
+TIMEOUTS = CallTimeouts(STEP_S, STEP_S)
 
 
 def watch(learner: Learner, timeouts: CallTimeouts = TIMEOUTS) -> StallWatch:
@@ -182,7 +182,7 @@ def test_a_run_in_which_nothing_happens_stands_still() -> None:
 def test_env_steps_calls_and_rollouts_are_progress() -> None:
     learner = Learner()
     learner.joins(A)
-    made, arrived = watch(learner, CallTimeouts(0.0, 0.0, 0.0)), 0
+    made, arrived = watch(learner, CallTimeouts(0.0, 0.0)), 0
     for number, kind in enumerate(["steps", "calls", "rollouts"] * 2, 1):
         learner.now += STALL_S - 1
         if kind == "steps":
@@ -218,7 +218,7 @@ def test_a_worker_that_hoards_its_tickets_is_refused_and_another_gets_them() -> 
     learner = Learner(lanes=2)
     learner.joins(A)
     learner.joins(B, host="other")
-    made = watch(learner, CallTimeouts(0.0, 0.0, 0.0))
+    made = watch(learner, CallTimeouts(0.0, 0.0))
     hoarded = len(learner.tickets(A))
     for _ in range(2):
         learner.now += STALL_S / 2 + 1
@@ -251,7 +251,7 @@ def test_a_worker_that_claims_progress_is_refused_when_its_budget_is_spent() -> 
 def test_without_timeouts_there_is_no_budget() -> None:
     learner = Learner()
     learner.joins(A)
-    made = watch(learner, CallTimeouts(0.0, 0.0, 0.0))
+    made = watch(learner, CallTimeouts(0.0, 0.0))
     assert made._longest_s(copies=1, steps=1) == math.inf
 
 

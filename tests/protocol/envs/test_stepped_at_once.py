@@ -168,13 +168,10 @@ def test_a_run_is_the_same_whatever_the_number_of_workers(tmp_path: Path, vector
     assert one == two
 
 
-def test_auto_is_the_loop() -> None:
+def test_the_loop_is_the_default() -> None:
     env = EnvSpec("CartPole-v1")
-    assert [run_spec(Config(env=env.id, vector=vector), env).vector for vector in ("auto", "loop", "native")] == [
-        "loop",
-        "loop",
-        "native",
-    ]
+    assert run_spec(Config(env=env.id), env).vector == "loop"
+    assert run_spec(Config(env=env.id, vector="native"), env).vector == "native"
 
 
 # ------------------------------------------------------------------------------------------------ refusals
@@ -246,7 +243,7 @@ def test_where_envpool_is_not_installed_a_line_says_how_to(monkeypatch: pytest.M
 
 def test_where_the_policy_acts_beside_the_learner_copies_are_stepped_one_by_one() -> None:
     for vector in ("native", "envpool"):
-        with pytest.raises(UsageError, match=f"inference learner: vector: expected auto or loop, got {vector}"):
+        with pytest.raises(UsageError, match=f"inference learner: vector: expected loop, got {vector}"):
             resolve("CartPole-v1", vector=vector, inference="learner")
-    with pytest.raises(UsageError, match="vector: expected one of auto, loop, native, envpool, got 'sync'"):
+    with pytest.raises(UsageError, match="vector: expected one of loop, native, envpool, got 'sync'"):
         resolve("CartPole-v1", vector="sync")

@@ -36,7 +36,7 @@ def with_spaces(observation: gymnasium.Space[Any], action: gymnasium.Space[Any])
 
 def run_spec(config: Config, env: EnvSpec) -> RunSpec:
     """The run of this configuration. Raises `UsageError`."""
-    return spec_of_run(config, env, EnvSpaces.of_description(described(env, config.chosen_vector())))
+    return spec_of_run(config, env, EnvSpaces.of_description(described(env, config.vector)))
 
 
 def step_spec(settings: VectorEnvSettings) -> StepSpec:

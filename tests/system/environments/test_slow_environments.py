@@ -29,7 +29,6 @@ SMALL: dict[str, object] = {
     "n-epochs": 1,
     "eval-episodes": 1,
     "worker-timeout-s": 1,
-    "heartbeat-s": 0.3,
     "steps": 1_000_000,
 }
 RUN_ENDS_S = 120.0
@@ -217,7 +216,7 @@ def test_status_names_the_lane_and_the_call_of_a_worker_that_hangs_and_for_how_l
 @pytest.mark.timeout(600)
 def test_the_whole_case_with_default_timeouts(stage: Stage) -> None:
     """A constructor of 40 s, resets of 15 s, steps of 8 s, one lane per worker: two updates."""
-    settings = {"env-kwargs": "make_s 40.0 reset_s 15.0 step_s 8.0", "worker-timeout-s": 5, "heartbeat-s": 1}
+    settings = {"env-kwargs": "make_s 40.0 reset_s 15.0 step_s 8.0", "worker-timeout-s": 5}
     learner = trained(stage, "Slow-v0", settings)
     began_s = time.monotonic()
     learner.trains(2, 300)

@@ -42,7 +42,6 @@ SMALL: dict[str, object] = {
     "eval-episodes": 1,
     "steps": 1_000_000_000,  # practically no limit: the test ends the run
     "worker-timeout-s": WORKER_TIMEOUT_S,
-    "heartbeat-s": 0.3,
     "no-workers-timeout-s": 60,
 }
 

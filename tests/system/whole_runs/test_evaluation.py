@@ -98,10 +98,12 @@ def test_the_evaluation_after_a_short_run_is_small_and_says_so(tmp_path: Path, c
     assert millrace.train("CartPole-v1", resume=run, workers=1, progress=False).summary == run.summary
 
 
-def test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers(tmp_path: Path) -> None:
+def test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RolloutConfig, "heartbeat_s", lambda self: 0.05)  # the figures of workers come with heartbeats
     settings: dict[str, Any] = {
         "steps": 3_000, "eval_every": 1_000, "eval_episodes": 10, "seed": 3, "n_epochs": 2,
-        "heartbeat_s": 0.05,  # the figures of workers come with heartbeats
     }  # fmt: skip
     found = []
     for workers, inference in ((1, "workers"), (3, "workers"), (2, "learner")):
@@ -141,7 +143,7 @@ def test_four_workers_take_at_most_two_fifths_of_the_time_of_one() -> None:
 
 def test_a_worker_in_a_long_step_is_not_silent() -> None:
     policy = untrained(f"{TOY}Slow-v0", {"seconds": 0.8, "k": 1})
-    which = PlayingWorkers(1, settings=RolloutConfig(worker_timeout_s=0.5, heartbeat_s=0.05))
+    which = PlayingWorkers(1, settings=RolloutConfig(worker_timeout_s=0.5))
     with policy_player(policy, which, silent) as player:
         played = player.play(EvaluationPlan.of(1, seed=5, copies=1, max_steps=100))
     assert [one.episode.length for one in played] == [1]
