@@ -1,7 +1,7 @@
 """Counts what one run has made, and decides by the counts when it ends, and when an evaluation or a checkpoint is due.
 
 Rule: no files and no sockets. A decision depends on counts alone, so that every run of these settings makes the same ones;
-only a checkpoint may also be due by time. The seconds of evaluations are a stage of their own and do not count as training.
+only a checkpoint is due by time. The seconds of evaluations are a stage of their own and do not count as training.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ class Tally:
         self._stages_s = {"update": 0.0, "other": 0.0}
         self.wall_before_s, self.steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
-        self._episodes_since_save = 0
 
     def count(self, batch: Batch) -> None:
         """An update was made of this batch."""
@@ -56,7 +55,6 @@ class Tally:
         self.state.env_steps += batch.env_steps
         self.window.extend(batch.episodes)
         self.new_episodes = batch.episodes
-        self._episodes_since_save += len(batch.episodes)
 
     def stop_reason(self) -> str | None:
         """Why the run should end now, or None."""
@@ -86,13 +84,12 @@ class Tally:
 
     def checkpoint_is_due(self) -> bool:
         """Whether a checkpoint is due now. Before the first update, the time alone asks for one."""
-        since_s, episodes = time.monotonic() - self._saved_s, self._episodes_since_save
-        updates = self.state.version
-        return checkpoint_is_due(self._config, since_last_s=since_s, episodes_since_last=episodes, updates=updates)
+        since_s = time.monotonic() - self._saved_s
+        return checkpoint_is_due(self._config, since_last_s=since_s, updates=self.state.version)
 
     def saved(self, began_s: float) -> None:
         """A checkpoint was begun at this time, and is written, or refused by the disk. -inf: all are gone, so one is due."""
-        self._saved_s, self._episodes_since_save = began_s, 0
+        self._saved_s = began_s
 
     # ---------------------------------------------------------------- seconds
 

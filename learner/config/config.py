@@ -14,9 +14,9 @@ import tomli_w
 from msgspec import Meta
 from tyro.conf import UseAppendAction, arg
 
-from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
+from learner.config.hyperparameters import AlgorithmConfig, NotNegative, PPOConfig
 from learner.config.resume_rules import Fixed, Free
-from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds, SecondsOrNever
+from learner.config.rollout_config import Count, Natural, RolloutConfig, SecondsOrNever
 from protocol.bounds import MAX_SEEDS
 
 TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
@@ -97,12 +97,10 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     # -------------------------------------------------------------------------------------------------------------- files
 
-    checkpoint_every_s: Free[Seconds] = 60.0
-    """Seconds between checkpoints. The first one is written after the first update."""
-    checkpoint_every_episodes: Free[Natural] = 0
-    """Number of training episodes between two additional checkpoints. 0: no additional checkpoints."""
-    checkpoint_every_updates: Free[Natural] = 0
-    """Number of updates between two additional checkpoints. 0: no additional checkpoints."""
+    checkpoint_every_s: Free[NotNegative] = 60.0
+    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation. 0: after
+    each update.
+    """
     keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""
     record: Free[str] = ""

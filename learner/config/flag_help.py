@@ -37,7 +37,7 @@ GROUPS = {
         "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
     ),
     "file and log": (
-        "checkpoint_every_s", "checkpoint_every_episodes", "checkpoint_every_updates", "keep_checkpoints", "record", "prior",
+        "checkpoint_every_s", "keep_checkpoints", "record", "prior",
         "callback", "metrics_bind", "log_json", "debug",
     ),
 }  # fmt: skip

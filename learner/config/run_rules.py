@@ -27,14 +27,12 @@ def reason_to_stop(
     return "all steps done" if env_steps_after_next_update > config.steps else None
 
 
-def checkpoint_is_due(config: Config, *, since_last_s: float, episodes_since_last: int, updates: int) -> bool:
-    """Whether to write a checkpoint. `since_last_s` and `episodes_since_last`: since the last one; `updates`: in all.
+def checkpoint_is_due(config: Config, *, since_last_s: float, updates: int) -> bool:
+    """Whether to write a checkpoint, `since_last_s` after the last one and after `updates` in all.
 
     The first update is saved at once: until then a killed run has nothing to resume.
     """
-    by_episodes = 0 < config.checkpoint_every_episodes <= episodes_since_last
-    by_updates = 0 < config.checkpoint_every_updates <= updates and updates % config.checkpoint_every_updates == 0
-    return updates == 1 or by_episodes or by_updates or since_last_s > config.checkpoint_every_s
+    return updates == 1 or since_last_s >= config.checkpoint_every_s
 
 
 class EvaluationSize(NamedTuple):

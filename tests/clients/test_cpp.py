@@ -307,7 +307,7 @@ def test_the_client_joins_a_learner_that_was_started_again(stage: Stage, cpp: Pa
     """A killed learner is started again with --resume: the client joins it, and the run goes on."""
     address = f"tcp://127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "millrace", "learner", "--bind", address]
-    flags = ["--checkpoint-every-updates", "1", "--worker-timeout-s", "2", "--inference", profile]
+    flags = ["--checkpoint-every-s", "0", "--worker-timeout-s", "2", "--inference", profile]
     runs = learner(stage, address, *flags, steps=10_000_000)
     client = stage.start([str(cpp / "cartpole"), address, "--name", "cpp0"], "cpp0")
     runs.hears(r"update [1-9]\d*", START_S)

@@ -92,7 +92,7 @@ def test_the_learner_takes_the_spaces_from_the_client_and_compares_other_workers
 def test_a_client_joins_a_learner_that_is_killed_and_resumed_twice(stage: Stage, clients: Clients) -> None:
     """One JavaScript client serves three learner processes of a run, and leaves with the last."""
     cartpole, address = clients["js cartpole"], loopback()
-    flags = ("--checkpoint-every-updates", 1, "--worker-timeout-s", 2, *IN_LEARNER)
+    flags = ("--checkpoint-every-s", 0, "--worker-timeout-s", 2, *IN_LEARNER)
     runs = learner(stage, address, *flags, steps=1_000_000)
     client = cartpole.start(address)
     for kill in (1, 2):

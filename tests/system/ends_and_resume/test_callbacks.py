@@ -157,7 +157,7 @@ STOPS = [moment for moment in MOMENTS if moment != "on_end"]
 def test_an_early_stop(tmp_path: Path, moment: str, max_lag: int) -> None:
     """The run ends with a checkpoint, the final evaluation and a summary. Resumed without the callback it goes on."""
     stops = Acts(moment, lambda progress: False, updates=5)
-    folder = run(tmp_path, stops, max_lag=max_lag, eval_every=130, checkpoint_every_updates=5)
+    folder = run(tmp_path, stops, max_lag=max_lag, eval_every=130, checkpoint_every_s=0.0)
     at = 0 if moment == "on_start" else 5
     told = summary(folder)
     assert (told["stop_reason"], told["updates"]) == (f"ended by Acts.{moment}", at)
@@ -181,7 +181,7 @@ def test_a_raise_in_each_method(tmp_path: Path, moment: str, error: BaseExceptio
 
     raises = Acts(moment, act, updates=5)
     with pytest.raises(type(error)) as caught:
-        run(tmp_path, raises, eval_every=130, checkpoint_every_updates=5)
+        run(tmp_path, raises, eval_every=130, checkpoint_every_s=0.0)
     assert caught.value is error
     notes = list(error.__notes__)
     del error.__notes__

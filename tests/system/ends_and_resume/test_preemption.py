@@ -142,7 +142,7 @@ def test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal(tmp_pa
 
 def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
     """A run goes on from an older checkpoint than the newest. The policy that was the best later is not its best."""
-    settings = {**VARIANTS["ppo"], "checkpoint_every_updates": 1, "keep_checkpoints": 100, "learning_rate": 0.05}
+    settings = {**VARIANTS["ppo"], "checkpoint_every_s": 0.0, "keep_checkpoints": 100, "learning_rate": 0.05}
     folder = run(tmp_path / "resumed", **settings)
     later = summary(folder)["best"]
     saved = {path: checkpoint.load(path) for path in (folder / "checkpoints").iterdir()}

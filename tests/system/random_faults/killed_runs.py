@@ -41,29 +41,29 @@ AT_ONCE = 3  # runs at a time
 ENDS_S = 120.0  # a run that is not killed any more
 GONE_S = 15.0  # the workers of a learner that was killed, on an idle machine
 LOOK_EVERY_S = 0.001
-LANES, ENVS, EVERY = 2, 4, 200  # EVERY: env steps between evaluations
+LANES, ENVS, ROWS, EVERY = 2, 4, 64, 200  # env steps of an update, and between two evaluations
 COMMON: dict[str, object] = {
-    "lanes": LANES, "envs": ENVS, "net": 8, "steps": 1000, "rollout-steps": 16, "checkpoint-every-s": 1000,
+    "lanes": LANES, "envs": ENVS, "net": 8, "steps": 1000, "rollout-steps": ROWS // ENVS, "checkpoint-every-s": 1000,
     "eval-every": EVERY, "eval-episodes": 4, "eval-copies": 2,
 }  # fmt: skip
 DQN: dict[str, object] = {"algo": "dqn", "learning-starts": 64, "gradient-steps": 4, "replay-size": 600, "batch-size": 16}
 PPO: dict[str, object] = {"n-epochs": 2, "batch-size": 32}
 TARGET = 9  # a return that an evaluation of a policy at random reaches in nearly every run
 VARIANTS: dict[str, dict[str, object]] = {
-    "ppo": {**PPO, "checkpoint-every-updates": 1, "workers": 2},
-    "dqn, prioritized": {**DQN, "priority-alpha": 0.6, "checkpoint-every-updates": 1, "workers": 1},
-    "a2c, lag 1": {"algo": "a2c", "max-lag": 1, "checkpoint-every-updates": 2, "workers": 2},
-    "impala, lag 2": {"algo": "impala", "max-lag": 2, "checkpoint-every-updates": 1, "workers": 1},
+    "ppo": {**PPO, "checkpoint-every-s": 0, "workers": 2},
+    "dqn, prioritized": {**DQN, "priority-alpha": 0.6, "checkpoint-every-s": 0, "workers": 1},
+    "a2c, lag 1": {"algo": "a2c", "max-lag": 1, "workers": 2},
+    "impala, lag 2": {"algo": "impala", "max-lag": 2, "checkpoint-every-s": 0, "workers": 1},
     "reinforce": {
-        "algo": "reinforce", "rollout-steps": 501, "steps": 12_000, "eval-every": 3_000, "checkpoint-every-updates": 1,
+        "algo": "reinforce", "rollout-steps": 501, "steps": 12_000, "eval-every": 3_000, "checkpoint-every-s": 0,
         "workers": 1,
     },
-    "ppo, lstm": {**PPO, "core": "lstm", "core-size": 8, "checkpoint-every-updates": 3, "workers": 1},
-    "ppo, learner inference": {**PPO, "inference": "learner", "checkpoint-every-updates": 1, "workers": 1},
+    "ppo, lstm": {**PPO, "core": "lstm", "core-size": 8, "workers": 1},
+    "ppo, learner inference": {**PPO, "inference": "learner", "checkpoint-every-s": 0, "workers": 1},
     "dqn, lag 1, tcp": {
-        **DQN, "max-lag": 1, "transport": "tcp", "checkpoint-every-updates": 3, "keep-checkpoints": 1, "workers": 2,
+        **DQN, "max-lag": 1, "transport": "tcp", "keep-checkpoints": 1, "workers": 2,
     },
-    "ppo to a return": {**PPO, "target-return": TARGET, "checkpoint-every-updates": 1, "workers": 1},
+    "ppo to a return": {**PPO, "target-return": TARGET, "checkpoint-every-s": 0, "workers": 1},
 }  # fmt: skip
 """Flags of `millrace train CartPole-v1`."""
 TIMES_S = {  # from the beginning of a phase until the kill, at most, on an idle machine
@@ -305,7 +305,8 @@ class OneRun:
             return
         found, warnings = checkpoint.newest(run)
         assert not warnings, warnings
-        saved, every = int(found.state["past"]["version"]), int(str(self.flags["checkpoint-every-updates"]))
+        saved = int(found.state["past"]["version"])
+        every = -(-EVERY // ROWS) if self.flags["checkpoint-every-s"] else 1  # a checkpoint comes before each evaluation
         assert saved >= marks.saved, f"an older checkpoint than the one that was written: {saved}, {marks}"
         table = run / "metrics.jsonl"
         seen = max((int(row["time/iterations"]) for row in read_rows(table)), default=0) if table.exists() else 0
