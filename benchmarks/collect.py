@@ -44,7 +44,8 @@ from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
-from protocol.specs import ImagesDtype, PolicySpec, RunSpec
+from protocol.specs import PolicySpec, RunSpec
+from protocol.wire.weight_dtypes import ActingDtype
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 
@@ -155,7 +156,7 @@ class ZeroPolicy:
         return np.zeros((*leaves[0].shape[:2], self._params), np.float32)
 
 
-def ours(kind: str, lanes: int, images: ImagesDtype, spec: EnvSpec, copies: int, number: int) -> Turn:
+def ours(kind: str, lanes: int, images: ActingDtype, spec: EnvSpec, copies: int, number: int) -> Turn:
     """The collector on `lanes` lanes that share the copies. `images`: precision in which the policy processes images."""
     made = spec.make()
     policy_spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))

@@ -31,7 +31,7 @@ from protocol.wire.codec import decode_to_learner, encode
 from protocol.wire.compression import Packing
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.socket_options import MAX_FRAME_BYTES
-from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
+from protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
@@ -174,7 +174,7 @@ def rounding(rounds: int) -> list[dict[str, object]]:
     """A row for each dtype in which the weights of an image network may travel: MB, and CPU ms at each end; medians."""
     parameters = np.random.default_rng(0).normal(0, 0.1, MNIH).astype(np.float32)
     found: list[dict[str, object]] = []
-    dtypes: list[WeightsDtype] = ["float32", "bfloat16", "float16"]
+    dtypes: list[ActingDtype] = ["float32", "bfloat16"]
     for dtype in dtypes:
         times = []
         for _ in range(rounds):

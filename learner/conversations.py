@@ -21,7 +21,7 @@ from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
 from protocol.specs import ExtraArray, PolicySpec, RunSpec
 from protocol.wire.codec import check_can_be_sent
-from protocol.wire.compression import why_no_zstd
+from protocol.wire.compression import has_zstd
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.socket_options import MAX_FRAME_BYTES
 
@@ -44,12 +44,6 @@ def rollout_spec(
         raise UsageError(
             "vector envpool: its environments report no action masks; use --vector loop, or --action-masks none"
         )
-    if config.compress == "zstd" and (why := why_no_zstd()):
-        raise UsageError(why)
-    if config.images_dtype != "float32" and not policy.convolves:
-        raise UsageError(
-            f"images_dtype {config.images_dtype}: expected float32, for this policy has no convolutions of ours"
-        )
     run = RunSpec(
         env=env,
         policy=policy,
@@ -58,8 +52,8 @@ def rollout_spec(
         lanes=config.lanes,
         seed=config.seed,
         vector=config.vector,
-        compress=config.compress,
-        images_dtype=config.images_dtype,
+        zstd=any(leaf.is_image for leaf in policy.observation) and has_zstd(),
+        images_dtype=config.acting_dtype if policy.convolves else "float32",
         masked=masked,
         extras=extras,
         facts=config.fact_names(),
@@ -72,7 +66,7 @@ def rollout_spec(
 
 def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: RolloutConfig) -> None:
     """Also a space of few arrays may make a policy too large to allocate: a `Discrete` of 2**53 values."""
-    size = acting_size(policy) * (4 if config.weights_dtype == "float32" else 2)
+    size = acting_size(policy) * (4 if config.acting_dtype == "float32" else 2)
     if size > MAX_FRAME_BYTES:
         raise UsageError(
             f"environment {env}: expected a policy whose weights take at most {MAX_FRAME_BYTES:,} bytes, got {size:,}; wrap "
@@ -111,7 +105,7 @@ def open_hub(
         config.no_workers_timeout_s,
         config.stall_timeout_s(),
         config.max_env_failures,
-        config.weights_dtype,
+        config.acting_dtype,
         config.call_timeouts(),
     )
     return Hub(link, coordinator, settings, processes, check_interrupt, observer)

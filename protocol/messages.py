@@ -84,7 +84,7 @@ class Weights(Message, frozen=True):
 
     version: Natural
     parameters: Array
-    """[P] the parameters needed to act: float32, or rounded to float16 or bfloat16 (which is sent as uint16)"""
+    """[P] the parameters needed to act: float32, or rounded to bfloat16 (which is sent as uint16)"""
     buffers: Array
     """[B] float32, observation mean and standard deviation if observations are normalized; then ε for action values, or the
     scale of the noise (deterministic actions); last, for actions in [-1, 1], 1 while they are drawn uniformly, else 0"""

@@ -8,7 +8,7 @@ import msgspec
 
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
 from protocol.space_spec import Shape
-from protocol.wire.compression import why_no_zstd
+from protocol.wire.weight_dtypes import ActingDtype
 
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
 
@@ -107,9 +107,6 @@ class OwnPolicySpec(msgspec.Struct, frozen=True):
     """the callable, pickled by cloudpickle"""
 
 
-ImagesDtype = Literal["float32", "bfloat16"]
-
-
 class PolicySpec(msgspec.Struct, frozen=True):
     """A policy as plain data: enough to act in numpy (workers) and to learn in torch (learner)."""
 
@@ -203,9 +200,9 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """how the copies of a lane are stepped: one after another (`loop`), or together, by the environment's own vectorized
     form (`native`) or by envpool's
     """
-    compress: Literal["none", "zstd"] = "none"
-    """whether workers also compress the larger arrays of their rollouts"""
-    images_dtype: ImagesDtype = "float32"
+    zstd: bool = False
+    """whether workers may also compress the larger arrays of their rollouts with Zstandard"""
+    images_dtype: ActingDtype = "float32"
     """precision in which workers process images with the built-in convolutions"""
     masked: bool = False
     """whether rollouts carry a mask of the allowed actions"""
@@ -219,8 +216,6 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
-        if self.compress == "zstd" and (why := why_no_zstd()):
-            return why
         for what, called in (("encoder", self.policy.encoder), ("policy", self.policy.own)):
             if called is not None and (why := code.refuses_to_call(f"{what} {called.factory}")):
                 return why

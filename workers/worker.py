@@ -343,7 +343,7 @@ class Worker:
                     activity().begin(MAKING)  # the policy may import torch and the user's modules, which takes long
                     self._collector, self._evaluator = self._options.make_actors(run)
                     activity().begin(WAITING)
-                    self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
+                    self._packing = replace(self._link.packing, zstd=run.zstd and self._link.packing.zstd)
                 case StepSpec():
                     self._stepper = Stepper(
                         run,

@@ -29,10 +29,10 @@ BASIC = (
 GROUPS = {
     "evaluation": ("eval_env_kwargs", "eval_copies", "eval_max_steps", "info_keys"),
     "worker": (
-        "lanes", "max_lag", "vector", "action_masks", "inference", "images_dtype", "torch_threads", "pin_workers",
-        "max_env_copies", "min_workers", "launched_workers",
+        "lanes", "max_lag", "vector", "action_masks", "inference", "acting_dtype", "torch_threads", "max_env_copies",
+        "min_workers", "launched_workers",
     ),
-    "network": ("transport", "bind", "advertise", "keys", "insecure", "compress", "weights_dtype"),
+    "network": ("transport", "bind", "advertise", "keys", "insecure"),
     "timeout and failure": (
         "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
     ),

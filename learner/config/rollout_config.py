@@ -13,8 +13,8 @@ from tyro.conf import Positional, UseAppendAction
 
 from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
-from protocol.specs import ImagesDtype, Vector
-from protocol.wire.weight_dtypes import WeightsDtype
+from protocol.specs import Vector
+from protocol.wire.weight_dtypes import ActingDtype
 
 Scalar = bool | int | float | str
 Count = Annotated[int, Meta(ge=1)]
@@ -64,9 +64,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
     envpool: by envpool (pip install 'millrace-rl[envpool]'). native and envpool use other random numbers than loop.
     """
-    images_dtype: Free[ImagesDtype] = "float32"
-    """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
-    elsewhere. The learner always computes in float32.
+    acting_dtype: Free[ActingDtype] = "float32"
+    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights that
+    are sent. With images it halves the work of acting on CPUs with AMX, and is slower elsewhere.
     """
     info_keys: Free[str] = ""
     """Names of numbers that the environment reports in info at the end of an episode, separated by commas,
@@ -76,10 +76,6 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Which actions are allowed, as the environment says it for a Discrete or MultiDiscrete action. auto: by the key
     action_mask of a Dict observation, if it has one with a bit for each choice. info: by info["action_mask"] of each reset
     and step; the key of a Dict observation comes first. none: all actions are allowed, and the key is an observation.
-    """
-    pin_workers: Free[bool | None] = None
-    """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
-    multiple of the number of cores.
     """
     max_env_copies: Free[Natural] = 0
     """Most env copies of the run on all machines, as for floating licences: those of its lanes, and those that play
@@ -114,14 +110,6 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     insecure: Free[bool] = False
     """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
-    compress: Free[Literal["none", "zstd"]] = "none"
-    """Compression of rollouts. zstd reduces the size of images, which helps on almost any network
-    (pip install 'millrace-rl[compress]' for the learner and every worker).
-    """
-    weights_dtype: Free[WeightsDtype] = "float32"
-    """Precision of the weights that are sent to workers. bfloat16 and float16 halve the bytes. Workers act with the rounded
-    weights; the learner keeps its own weights in float32.
-    """
     metrics_bind: Free[str] = ""
     """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network
     can read them. Default: no metrics are served.

@@ -184,9 +184,7 @@ def _check_env_arguments(config: Config, at: str) -> None:
 
 
 def _check_learner_inference(config: Config, at: str) -> None:
-    if config.compress != "none":
-        wrong = f"compress: expected none, got {config.compress}; rollouts are made beside the learner"
-    elif config.max_lag:
+    if config.max_lag:
         wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
     elif config.vector != "loop":
         wrong = f"vector: expected loop, got {config.vector}; its workers step copies one by one"

@@ -37,7 +37,7 @@ from protocol.errors import BadRollout, Stalled
 from protocol.messages import Evaluated, Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
 from protocol.wire.learner_link import LearnerLink
-from protocol.wire.weight_dtypes import WeightsDtype, to_wire_dtype
+from protocol.wire.weight_dtypes import ActingDtype, to_wire_dtype
 
 log = logging.getLogger("millrace.learner")
 
@@ -56,7 +56,7 @@ class HubSettings:
     stall_timeout_s: float
     max_env_failures: int
     """How many failures the run survives, as `FailureCount` counts them."""
-    weights_dtype: WeightsDtype = "float32"
+    acting_dtype: ActingDtype = "float32"
     """Dtype in which parameters are sent."""
     call_timeouts: CallTimeouts = NO_TIMEOUTS
     """How long a call of the environment may take; its supervisor ends a worker that exceeds it."""
@@ -149,9 +149,9 @@ class Hub:
         """Set the newest weights. The arrays must not change afterwards.
 
         `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first.
-        Raises `RunError` if a parameter is too large for `weights_dtype`.
+        Raises `RunError` if a parameter is too large for `acting_dtype`.
         """
-        sent = to_wire_dtype(parameters, self.settings.weights_dtype)
+        sent = to_wire_dtype(parameters, self.settings.acting_dtype)
         self._time.learned(self._clock())
         self.weight_age.published(version, self._clock())
         self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes)

@@ -383,14 +383,13 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
 
 
 def takes_rounded_weights(learner: Learner) -> Script[None]:
-    """Parameters rounded to bfloat16, which are sent as uint16, and to float16."""
+    """Parameters rounded to bfloat16, which are sent as uint16."""
     session = yield from collecting(learner)
-    for version, dtype in ((1, "bfloat16"), (2, "float16")):
-        rounded = to_wire_dtype(session.random_parameters(version), dtype)  # type: ignore[arg-type]
-        permit = session.permit()
-        session.order(permit, version=version)
-        session.give(Weights(version, rounded, np.zeros(buffer_size(session.run.policy), np.float32)))
-        yield from session.rollout(permit)
+    rounded = to_wire_dtype(session.random_parameters(1), "bfloat16")
+    permit = session.permit()
+    session.order(permit, version=1)
+    session.give(Weights(1, rounded, np.zeros(buffer_size(session.run.policy), np.float32)))
+    yield from session.rollout(permit)
 
 
 def sends_again(learner: Learner) -> Script[None]:

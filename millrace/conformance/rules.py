@@ -394,7 +394,7 @@ LOG_PROB = Rule(
 )
 ROUNDED = Rule(
     "Collector profile",
-    "float16 and bfloat16 (as uint16: the upper half of a float32) are converted to float32",
+    "bfloat16 (as uint16: the upper half of a float32) is converted to float32",
     "look at the dtype of `Weights.parameters`: a uint16 is shifted 16 bits up and read as float32",
 )
 NORMALIZED = Rule(

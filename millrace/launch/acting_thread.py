@@ -17,7 +17,8 @@ from millrace.launch.endpoint import Endpoint
 from protocol.alive import WorkerExit
 from protocol.arrays import Array
 from protocol.policy.policy import Policy, make_policy
-from protocol.specs import ImagesDtype, PolicySpec, RunSpec
+from protocol.specs import PolicySpec, RunSpec
+from protocol.wire.weight_dtypes import ActingDtype
 from workers.collect.collector import Collector
 from workers.copies.env_loop import Pulse
 from workers.copies.split_vector_env import SplitLane, SplitVectorEnv
@@ -76,7 +77,7 @@ def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> Step
     return env.step_wait()
 
 
-def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
+def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
     """The policy that acts. If numpy can compute it, it runs in numpy on the CPU and gives the same bits as on a worker.
 
     Otherwise it runs in torch on the device, for all lanes in one pass.

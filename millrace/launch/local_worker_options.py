@@ -85,16 +85,14 @@ def worker_flags(config: Config, run: Path) -> WorkerFlags:
 
 
 def worker_cores(config: RolloutConfig) -> list[int]:
-    """The cores that local workers are pinned to, in turn; empty if they are not pinned. Raises `UsageError`.
+    """The cores that local workers are pinned to, in turn; empty if they are not pinned.
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
     leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they are not
-    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run.
+    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run. Nor are
+    they with a lag, where it gains nothing.
     """
     if not hasattr(os, "sched_setaffinity"):
-        if config.pin_workers:
-            raise UsageError("pin_workers: this system does not let a process keep to one core")
         return []
     cores = sorted(os.sched_getaffinity(0))
-    take_turns = config.max_lag == 0 and config.workers % len(cores) == 0
-    return cores if config.pin_workers or (config.pin_workers is None and take_turns) else []
+    return cores if config.max_lag == 0 and config.workers % len(cores) == 0 else []

@@ -7,7 +7,8 @@ from typing import Protocol
 
 from protocol.arrays import Array, Floats
 from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.specs import ImagesDtype, PolicySpec
+from protocol.specs import PolicySpec
+from protocol.wire.weight_dtypes import ActingDtype
 
 
 class Policy(Protocol):
@@ -25,7 +26,7 @@ class Policy(Protocol):
         ...
 
 
-def make_policy(spec: PolicySpec, images: ImagesDtype = "float32") -> Policy:
+def make_policy(spec: PolicySpec, images: ActingDtype = "float32") -> Policy:
     """The policy of this spec: in numpy for an MLP, else (images, encoders) in torch, which is imported only then.
 
     `images` is the precision in which images are processed.

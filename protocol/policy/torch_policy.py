@@ -12,14 +12,15 @@ from protocol.policy.features import features, normalize
 from protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views
 from protocol.policy.networks import ActorCriticNetwork, network_of
 from protocol.policy.recurrent import zero_state
-from protocol.specs import ImagesDtype, PolicySpec
+from protocol.specs import PolicySpec
+from protocol.wire.weight_dtypes import ActingDtype
 
 
 class TorchPolicy:
     """Acts like `NumpyPolicy`, also on images. Lanes are computed one by one: their results do not depend on other lanes."""
 
     def __init__(
-        self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ImagesDtype = "float32"
+        self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ActingDtype = "float32"
     ) -> None:
         """`together`: compute all lanes at once; the caller always passes all. `images`: precision for images."""
         self.spec = spec

@@ -74,13 +74,13 @@ def unpack_array(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any],
             raise BadMessage(f"packings: expected stack, zstd or both in this order, got {str(packings)[:80]}")
 
 
-def why_no_zstd() -> str:
-    """Why zstd is not available on this machine; empty if it is."""
+def has_zstd() -> bool:
+    """Whether the package zstandard, which is an extra, is installed here."""
     try:
-        import zstandard  # noqa: F401  (an extra)
+        import zstandard  # noqa: F401
     except ImportError:
-        return "compress zstd needs the package zstandard, which is an extra; pip install 'millrace-rl[compress]'"
-    return ""
+        return False
+    return True
 
 
 def _compressed(frame: Frame) -> bytes | None:

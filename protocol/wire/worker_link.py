@@ -20,7 +20,7 @@ from protocol.keys.zap import connect_with
 from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from protocol.messages import ToObserver, ToWorker
 from protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
-from protocol.wire.compression import Packing
+from protocol.wire.compression import Packing, has_zstd
 from protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
 from protocol.wire.sockets import receive_frames, send_frames
 
@@ -47,8 +47,9 @@ class WorkerLink:
         """why there is no connection, if known"""
         self.connected = False
         """whether there seems to be a connection; known of tcp only"""
-        self.packing = Packing(stack=token is not None or not is_local(address))
-        """how rollouts are packed: frame stacks only if the connection is encrypted or leaves this machine"""
+        far = token is not None or not is_local(address)
+        self.packing = Packing(stack=far, zstd=far and has_zstd())
+        """how rollouts may be packed: only if the connection is encrypted or leaves this machine"""
         self._log_limiter = LogRateLimiter()
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)

@@ -248,9 +248,9 @@ MUTANTS = [
         "collector", "collects rollouts", rules.LOG_PROB, "-",
     ),
     Mutant(
-        "bfloat16 read as float16", "policy.hpp",
-        "if (array.dtype == \"<u2\")",
-        "if (false)",
+        "bfloat16 read as a number", "policy.hpp",
+        "std::uint32_t(half) << 16",
+        "std::uint32_t(half)",
         "collector", "weights rounded to 16 bits", rules.ROUNDED, "",
     ),
     Mutant(

@@ -30,6 +30,7 @@ from protocol.policy.layout import acting_size
 from protocol.specs import ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec, StepSpec
 from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack
+from protocol.wire.weight_dtypes import to_wire_dtype
 
 SESSION = 77
 CARTPOLE = EnvSpec("CartPole-v1")
@@ -57,7 +58,7 @@ def messages(lanes: int) -> list[ToWorker]:
         Collect(SESSION, 3, (Permit(10, 0, 0, 0), Permit(11, 1, 1, 0))[:lanes], FEW[:lanes]),
         Weights(3, weights, np.zeros(0, np.float32)),
         Evaluate(SESSION, 12, 4, (1, 2), True, 30, False, False),
-        Weights(4, weights.astype(np.float16), np.zeros(0, np.float32)),
+        Weights(4, to_wire_dtype(weights, "bfloat16"), np.zeros(0, np.float32)),
         HeartbeatReply(SESSION, 2, FEW[:1]),
         Drain("the run is over"),
         Refuse("no"),

@@ -19,7 +19,6 @@ from learner.torch_setup import one_thread, threads
 from millrace.launch.local_worker_options import worker_cores
 from protocol import cpu_cores as counting
 from protocol.cpu_cores import usable_cores
-from protocol.errors import UsageError
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CORES = {2, 3}
@@ -47,30 +46,23 @@ def test_a_program_has_its_threads_again_whichever_run_ends_first(monkeypatch: p
 
 
 @pytest.mark.parametrize(
-    ("workers", "max_lag", "pin", "kept"),
+    ("workers", "max_lag", "kept"),
     [
-        (2, 0, None, True),
-        (4, 0, None, True),
-        (1, 0, None, False),  # another run's only worker would keep to the same core
-        (3, 0, None, False),
-        (2, 1, None, False),  # the learner runs beside them
-        (2, 0, False, False),
-        (3, 0, True, True),
-        (2, 1, True, True),
+        (2, 0, True),
+        (4, 0, True),
+        (1, 0, False),  # another run's only worker would keep to the same core
+        (3, 0, False),
+        (2, 1, False),  # the learner runs beside them
     ],
 )
-def test_workers_keep_to_the_cores_that_this_process_may_use(
-    workers: int, max_lag: int, pin: bool | None, kept: bool
-) -> None:
-    config = resolve("CartPole-v1", workers=workers, max_lag=max_lag, pin_workers=pin)
+def test_workers_keep_to_the_cores_that_this_process_may_use(workers: int, max_lag: int, kept: bool) -> None:
+    config = resolve("CartPole-v1", workers=workers, max_lag=max_lag)
     assert worker_cores(config) == (sorted(CORES) if kept else [])
 
 
-def test_where_the_system_cannot_only_who_asked_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_system_cannot_they_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_setaffinity")
     assert worker_cores(resolve("CartPole-v1", workers=2)) == []
-    with pytest.raises(UsageError, match="pin_workers"):
-        worker_cores(resolve("CartPole-v1", workers=2, pin_workers=True))
 
 
 @pytest.mark.parametrize(

@@ -274,12 +274,6 @@ def test_a_replay_buffer_that_holds_no_rollout_is_refused() -> None:
     assert resolve("CartPole-v1", **fits, envs=14, replay_size=112).envs == 14
 
 
-def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
-    assert "compress: expected none, got zstd" in refusal(inference="learner", compress="zstd")
-    assert "compress: expected one of none, zstd, got 'gzip'" in refusal(compress="gzip")
-    assert resolve("CartPole-v1", compress="none").compress == "none"
-
-
 @pytest.mark.parametrize("table", ["env_kwargs", "eval_env_kwargs"])
 def test_arguments_of_the_environment_that_policy_json_cannot_hold_are_refused(table: str) -> None:
     settings: dict[str, Any] = {table: {"limit": float("inf")}}

@@ -59,9 +59,10 @@ def test_the_algorithms_are_named(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_setting_that_may_be_none_is_written_so_on_the_command_line_and_in_a_file() -> None:
-    flags = ["CartPole-v1", "--core", "none", "--clip-range-vf", "none", "--torch_threads", "none", "--compress", "none"]
+    flags = ["CartPole-v1", "--core", "none", "--clip-range-vf", "none", "--torch_threads", "none", "--action-masks", "none"]
     config, _ = read_config("train", flags)
-    assert config == read_config("train", ["CartPole-v1"])[0]
-    assert read_config("train", ["CartPole-v1", "--core", "None"])[0] == config
-    signs = ["CartPole-v1", "--core=none", "--clip-range-vf=none", "--torch_threads=none", "--compress=none"]
+    expected = msgspec.structs.replace(read_config("train", ["CartPole-v1"])[0], action_masks="none")
+    assert config == expected
+    assert read_config("train", ["CartPole-v1", "--core", "None", "--action-masks", "none"])[0] == config
+    signs = ["CartPole-v1", "--core=none", "--clip-range-vf=none", "--torch_threads=none", "--action-masks=none"]
     assert read_config("train", signs)[0] == config

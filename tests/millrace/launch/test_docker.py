@@ -30,7 +30,7 @@ from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parents[3]
 DOCKER = ROOT / "docker"
-# Imported where they are used: for policies that process images; for --compress; for --vector envpool.
+# Imported where they are used: for policies that process images; for compression; for --vector envpool.
 NOT_FOR_WORKERS = {"torch", "zstandard", "envpool"}
 
 

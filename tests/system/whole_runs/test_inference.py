@@ -134,17 +134,12 @@ def test_a_torch_policy_does_not_depend_on_the_number_of_workers(tmp_path: Path)
 
 
 @pytest.mark.parametrize("inference", [pytest.param("workers", marks=pytest.mark.soak), "learner"])
-def test_images_dtype_changes_how_images_are_processed(tmp_path: Path, inference: str) -> None:
+def test_acting_dtype_changes_how_images_are_processed(tmp_path: Path, inference: str) -> None:
     settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 300, **SMALL}
     settings |= {"inference": inference}
     dtypes = ("float32", "bfloat16")
-    policies = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", images_dtype=dtype, **settings)) for dtype in dtypes}
+    policies = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", acting_dtype=dtype, **settings)) for dtype in dtypes}
     assert len(policies) == 2
-
-
-def test_images_dtype_is_refused_for_a_policy_without_images(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="images_dtype bfloat16: expected float32"):
-        run(tmp_path, f"{TOY}Spaces-v0", images_dtype="bfloat16", steps=300, **SMALL)
 
 
 # ---------------------------------------------------------------- faults

@@ -267,7 +267,6 @@ class Decoder {
       else if (name == "copies" && !r.is_array()) run.copies = r.natural();
       else if (name == "rollout_steps") run.rollout_steps = r.natural();
       else if (name == "seed") run.seed = r.natural();
-      else if (name == "compress") { if (r.text(40) != "none") run.beyond = "compressed rollouts"; }
       else if (name == "masked") { if (r.boolean()) run.beyond = "action masks"; }
       else if (name == "facts") { run.facts = r.array(); for (std::size_t n = run.facts; n; --n) r.skip(); }
       else if (name == "extras") { if (std::size_t n = r.array()) for (run.beyond = "further arrays"; n; --n) r.skip(); }

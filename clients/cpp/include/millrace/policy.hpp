@@ -48,7 +48,7 @@ class Policy {
 
   Weights weights(const Message& m) const {  // throws BadMessage if they are not of this policy
     const Array &given = m.arrays[0], &buffers = m.arrays[1];
-    bool known = given.dtype == "<f4" || given.dtype == "<f2" || given.dtype == "<u2";
+    bool known = given.dtype == "<f4" || given.dtype == "<u2";
     if (!known || given.elements != size_ || buffers.elements != (normalize_ ? 2 * inputs_ : 0))
       throw BadMessage("Weights: expected " + std::to_string(size_) + " parameters, got " + std::to_string(given.elements));
     const float* numbers = static_cast<const float*>(buffers.data);
@@ -141,16 +141,13 @@ class Policy {
                                                     : (static_cast<float>(value) - buffers_[i]) / buffers_[inputs_ + i];
     return static_cast<float>(std::min(std::max(scaled, -10.0), 10.0));
   }
-  static float as_float(const Array& array, std::size_t i) {  // float32, float16, or bfloat16 sent as uint16
+  static float as_float(const Array& array, std::size_t i) {  // float32, or bfloat16 sent as uint16
     float value;
-    std::uint32_t bits;
     if (array.dtype == "<f4") return std::memcpy(&value, static_cast<const char*>(array.data) + 4 * i, 4), value;
     std::uint16_t half;
     std::memcpy(&half, static_cast<const char*>(array.data) + 2 * i, 2);
-    if (array.dtype == "<u2") return bits = std::uint32_t(half) << 16, std::memcpy(&value, &bits, 4), value;
-    int exponent = half >> 10 & 31, fraction = half & 1023;
-    value = exponent ? std::ldexp(1024.0f + static_cast<float>(fraction), exponent - 25) : std::ldexp(static_cast<float>(fraction), -24);
-    return half >> 15 ? -value : value;
+    std::uint32_t bits = std::uint32_t(half) << 16;
+    return std::memcpy(&value, &bits, 4), value;
   }
 
   Space observation_, action_;
