@@ -21,14 +21,13 @@ from millrace.arguments import checked
 from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.terminal import count_line
-from protocol.bounds import MAX_SEEDS
 from protocol.env_spec import EnvLike
 from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError, check_at_least, did_you_mean
+from protocol.errors import UsageError, did_you_mean
+from protocol.flags.fields import fields_of
+from protocol.flags.values import read_value
 
 NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
-LEAST = {"steps": 1, "episodes": 1, "seed": 0, "workers": 1, "copies": 1, "max_steps": 1, "max_env_failures": 0}
-"""The smallest value of each flag that is a number."""
 ShowPlayed = Callable[[str], None]
 """Gets how far it is, as text."""
 _Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
@@ -159,12 +158,11 @@ def record(
 
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     """The flags that these keyword arguments make. Raises `UsageError` that names one that is wrong."""
+    fields = fields_of(kind)
     for keyword in keywords:
-        if keyword not in kind.__struct_fields__ or keyword in NOT_KEYWORDS:
-            raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, kind.__struct_fields__)}")
-    if (npy := keywords.get("npy")) is not None:
-        keywords["npy"] = Path(npy)
-    return kind(**keywords)
+        if keyword not in fields or keyword in NOT_KEYWORDS:
+            raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, fields)}")
+    return kind(**{keyword: read_value(fields[keyword], value) for keyword, value in keywords.items()})
 
 
 def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) -> tuple[Evaluation, list[Path]]:
@@ -173,9 +171,6 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
     """
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
-    _check_least(flags)
-    if flags.copies > MAX_SEEDS:
-        raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
     if flags.video:
         if flags.inference == "learner":
             raise UsageError("video: expected inference workers, got learner; only a worker that acts renders its episodes")
@@ -195,17 +190,10 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
 
 def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
     """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
-    _check_least(flags)
     with policy_player(_saved(flags, given), _workers(flags, flags.workers, 1), watch) as player:
         return record_dataset(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
         )
-
-
-def _check_least(flags: EvaluateFlags | RecordFlags) -> None:
-    for name, least in LEAST.items():
-        if (value := getattr(flags, name, None)) is not None:
-            check_at_least(name, value, least)
 
 
 def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> PlayingWorkers:

@@ -74,9 +74,9 @@ def _block(line: str) -> str:
     text = help_of(line)
     if line.startswith("train --algo"):
         algo = line.split()[-1]
-        found = re.search(rf"^ {algo} options\n -+\n.*?(?=\n\n)", text, re.DOTALL | re.MULTILINE)
+        found = re.search(rf"^{algo}:\n.*?(?=\n\n)", text, re.DOTALL | re.MULTILINE)
         if found is None:
-            raise ValueError(f"commands page: millrace {line} --help: expected a section of {algo} options, got none")
+            raise ValueError(f"commands page: millrace {line} --help: expected a section of its flags, got none")
         text = f"…\n\n{found[0]}\n\n…"
     return f"```text\n$ millrace {line} --help\n{text}\n```\n\n".replace("  --help", " --help")
 

@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 
 from benchmarks.markdown_tables import table
-from learner.config.command_line import RunFlags
+from learner.config.command_line import BASIC, GROUPS, LAYERS, RunFlags
 from learner.config.config import Config
-from learner.config.flag_help import BASIC, GROUPS, field_texts
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.resume_rules import OnResume, declared
+from protocol.flags.field_texts import field_texts
 from website.tables import anchored
 
 HEAD = """# Settings
@@ -38,16 +38,6 @@ The column "on resume" says what happens if a [resumed run](../how-to/resume.md)
 
 """
 COLUMNS = ("setting", "values", "default", "on resume", "meaning")
-TITLES = {
-    "evaluation": "Evaluation",
-    "worker": "Workers",
-    "network": "Network",
-    "timeout and failure": "Timeouts and failures",
-    "file and log": "Files and logs",
-}
-"""Headings of the groups of `--help`"""
-LAYERS = ("config", "preset", "resume", "log_json", "debug")
-"""Flags that are no settings: they say where settings come from, or how errors and logs look."""
 KINDS = {bool: "true or false", int: "int", float: "float", str: "text", Path: "path"}
 
 
@@ -60,7 +50,7 @@ def page() -> str:
         + _table(RunFlags, LAYERS)
     )
     for title, names in GROUPS.items():
-        parts.append(f"\n## {TITLES[title]}\n\n" + _table(Config, [name for name in names if name not in LAYERS]))
+        parts.append(f"\n## {title.capitalize()}\n\n" + _table(Config, [name for name in names if name not in LAYERS]))
     for algo, record in HYPERPARAMETERS.items():
         about = " ".join((record.__doc__ or "").split())
         parts.append(

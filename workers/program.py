@@ -7,7 +7,6 @@ supervisor reads: an end without that is a failure.
 
 from __future__ import annotations
 
-import argparse
 import errno
 import math
 import os
@@ -19,7 +18,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from protocol.alive import CallTimeouts
 from protocol.env_spec import AllowedCode
 from protocol.errors import UserFacingError
 from protocol.keys.keys import Token
@@ -29,6 +27,7 @@ from workers.activity import Activity, activity, share_activity
 from workers.conversation.connection_rules import wait_limits_s
 from workers.conversation.session import NO_LEARNER, Session
 from workers.exit_codes import EXIT_NO_LEARNER
+from workers.flags import WorkerFlags
 from workers.security import allowed_code
 from workers.slots import share_slots
 from workers.supervise.process_group import kill, live_members
@@ -42,7 +41,7 @@ CLOSED_WITHIN_S = 1.0  # the sockets of a killed process
 AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
 
 
-def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts, signals: list[int]) -> int:
+def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
     """Run one worker in this process until it leaves. `signals` grows with each request to leave. Returns the exit code."""
     nonce = int(os.environ.pop(NONCE_VARIABLE, "0")) or None
     if flags.activity is not None:
@@ -50,18 +49,18 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
     if flags.slots is not None:
         share_slots(flags.slots)
     try:
-        link = WorkerLink(flags.address, flags.name, token=token)
+        link = WorkerLink(flags.address, flags.called, token=token)
     except UserFacingError as error:
         activity().leave(error.exit_code)
         raise
     if flags.core is not None:
         os.sched_setaffinity(0, {flags.core})
-    longest_s = timeouts.longest_s()
+    longest_s = flags.timeouts().longest_s()
     watchdog = Watchdog(longest_s + AFTER_SUPERVISOR_S) if math.isfinite(longest_s) else None
     threading.Thread(target=_end_after_supervisor, args=(flags.parent, flags.address), daemon=True).start()
     join_timeout_s, rejoin_timeout_s = wait_limits_s(flags.join_timeout_s, stay=flags.stay)
     session = Session(
-        identity(flags.name, nonce),
+        identity(flags.called, nonce),
         time.monotonic(),
         join_timeout_s=join_timeout_s,
         rejoin_timeout_s=rejoin_timeout_s,
@@ -77,7 +76,7 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
     if watchdog:
         watchdog.stop()
     if left.exit_code:
-        sys.stderr.write(f"worker {flags.name}: {_explained(left.reason, link)}\n")
+        sys.stderr.write(f"worker {flags.called}: {_explained(left.reason, link)}\n")
     if parent_is_gone(flags.parent):
         _remove_socket_of_killed_parent(flags.address)
         _kill_own_session()

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import tomli_w
 from msgspec import Meta
-from tyro.conf import UseAppendAction, arg
 
-from learner.config.hyperparameters import AlgorithmConfig, NotNegative, PPOConfig
+from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, NotNegative, PPOConfig
 from learner.config.resume_rules import Fixed, Free
 from learner.config.rollout_config import Count, Natural, RolloutConfig, SecondsOrNever
 from protocol.bounds import MAX_SEEDS
+from protocol.flags.fields import Flag
 
 TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
 PRESETS = Path(__file__).with_name("presets.toml")
@@ -28,7 +28,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     # ------------------------------------------------------------------------------------------------------------ basics
 
-    algo: Fixed[str] = "ppo"
+    algo: Annotated[Fixed[str], Flag(f"{{{','.join(HYPERPARAMETERS)}}}|MODULE:CLASS")] = "ppo"
     """Learning algorithm: a built-in one, or your own, such as my_module:MyClass. `--algo NAME --help` shows its
     settings.
     """
@@ -36,7 +36,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Settings of the algorithm."""
     steps: Free[Count] = 100_000
     """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
-    start_from: Annotated[Fixed[str], arg(aliases=["--from"])] = ""
+    start_from: Annotated[Fixed[str], Flag("PATH", alias="from")] = ""
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and rewards.
     A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the new run, and
     schedules start anew. A resumed run does not read the folder again: see docs/how-to/start_from.md.
@@ -90,7 +90,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     it is undone, and the state before it is saved. 0: wait until the update has ended.
     """
 
-    callback: Free[UseAppendAction[tuple[str, ...]]] = ()
+    callback: Annotated[Free[tuple[str, ...]], Flag("MODULE:FACTORY", repeated=True)] = ()
     """A callback of your own, such as my_module:factory. The learner calls it between updates. Repeat the flag to add more
     callbacks. docs/how-to/callbacks.md describes them.
     """

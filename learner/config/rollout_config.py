@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
-from tyro.conf import Positional, UseAppendAction
 
 from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
+from protocol.flags.fields import Flag
 from protocol.specs import Vector
 from protocol.wire.weight_dtypes import ActingDtype
 
@@ -31,7 +31,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     # ------------------------------------------------------------------------------------------------------------ basics
 
-    env: Fixed[Positional[str]] = ""
+    env: Annotated[Fixed[str], Flag(positional=True)] = ""
     """Environment id for gymnasium.make, such as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Texts may use number, slot, lane and copy of each env
@@ -39,7 +39,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     eval_env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
-    wrapper: Fixed[Annotated[tuple[str, ...], UseAppendAction]] = ()
+    wrapper: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:CLASS", repeated=True)] = ()
     """Wrapper of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
     literals: "my_module:Scale(by=0.5)". Repeat the flag to add more wrappers. The first one is the innermost.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
@@ -18,6 +18,7 @@ from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
+from protocol.flags.values import what_was_expected
 from protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
@@ -208,17 +209,8 @@ def _check_prior(config: Config, at: str) -> None:
 def _reworded(message: str, settings: dict[str, Any]) -> str:
     """Msgspec's message in our words: the setting, what was expected and what was given."""
     algorithm = settings.get("algorithm", {})
-    expected, _, path = message.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
-    name = re.split(r"[.\[`]", path)[0]
+    name = re.split(r"[.\[`]", message.partition(" - at `$.")[2])[0]
     record = settings_record(settings["algo"]) if name in algorithm else Config
     given = algorithm.get(name, settings.get(name))
     given = list(given) if isinstance(given, tuple) else given
-    if expected.startswith("Invalid enum value"):
-        return f"{name}: expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"
-    return f"{name}: {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {given!r}"
-
-
-def _choices(hint: Any) -> list[str]:
-    """The values that a type allows: a Literal, or a Literal or None."""
-    parts = [_choices(part) if get_args(part) else ["none" if part is type(None) else str(part)] for part in get_args(hint)]
-    return [choice for choices in parts for choice in choices]
+    return f"{name}: {what_was_expected(message, get_type_hints(record).get(name))}, got {given!r}"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from learner.config.flag_parser import parse_flags
 from learner.report import learning_curves
 from learner.report.page import write_page
 from millrace.cli.flags import PlotFlags, ReportFlags
 from protocol.errors import UsageError
+from protocol.flags.parse import parse_flags
 
 
 def plot(argv: list[str]) -> int:

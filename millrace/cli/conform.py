@@ -5,23 +5,52 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
-from millrace.cli.arguments import Arguments
-from millrace.conformance.conform import ADDRESS_VARIABLE, ClientCommand, conform
+import msgspec
+from msgspec import Meta
+
+from millrace.conformance.conform import ClientCommand, conform
 from millrace.conformance.examiner import Check, CheckResult
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import as_data, explanation, line_of, summary
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
-from protocol.keys.key_folder import TOKEN_VARIABLE
+from protocol.flags.fields import Flag
+from protocol.flags.parse import parse_flags
 
-ABOUT = (
-    "Check a client, which is a worker in any language. Plays the learner on a port of this machine, starts COMMAND, and "
-    "walks it through the messages, states and faults of the wire document. In COMMAND, {address} is where to connect and "
-    f"{{token}} a file with the join token; the environment has them as {ADDRESS_VARIABLE} and {TOKEN_VARIABLE}. Exit code "
-    "0: the client conforms; 1: it does not."
-)
+Seconds = Annotated[float, Meta(gt=0)]
+
+
+class ConformFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Check a client, which is a worker in any language, with `millrace conform [flags] -- COMMAND`.
+
+    Plays the learner on a port of this machine, starts COMMAND, and walks it through the messages, states and faults of the
+    wire document. In COMMAND, {address} is where to connect and {token} a file with the join token; the environment has
+    them as MILLRACE_ADDRESS and MILLRACE_TOKEN. Exit code 0: the client conforms; 1: it does not.
+    """
+
+    profile: Literal["collector", "environment"] = "environment"
+    """environment: the learner acts, the client resets and steps its copies; collector: the client acts, by the weights that
+    it is sent
+    """
+    env: Annotated[str, Flag("ID")] = "CartPole-v1"
+    """the environment that the client is asked for"""
+    copies: Annotated[int, Meta(ge=1)] = 2
+    """env copies in a lane"""
+    only: str = ""
+    """run only the checks whose name contains TEXT"""
+    json: Annotated[str, Flag("FILE")] = ""
+    """also write the report to FILE, as JSON"""
+    with_keys: bool = False
+    """encrypt the connection; {token} in COMMAND does so too"""
+    patience_s: Seconds = 5.0
+    """seconds that an answer of the client may take"""
+    start_s: Seconds = 20.0
+    """seconds that the client may take to start"""
+    limit_s: Seconds = 300.0
+    """seconds that the whole test may take"""
 
 
 def run(argv: list[str]) -> int:
@@ -31,44 +60,12 @@ def run(argv: list[str]) -> int:
 
 def check(argv: list[str], write: Callable[[str], None]) -> int:
     """Check the client. `write` takes the lines of the report. Returns the exit code."""
-    flags, command = _split(argv)
-    arguments = Arguments("conform", ABOUT)
-    arguments.usage = "millrace conform [flags] -- COMMAND …"
-    arguments.flag(
-        "--profile", choices=sorted(PROFILES), default="environment",
-        help="environment: the learner acts, the client resets and steps its copies; collector: the client acts, by the "
-        "weights that it is sent (default: environment)",
-    )  # fmt: skip
-    arguments.flag(
-        "--env",
-        default="CartPole-v1",
-        metavar="ID",
-        help="the environment that the client is asked for (default: CartPole-v1)",
-    )
-    arguments.flag("--copies", type=int, default=2, metavar="N", help="env copies in a lane (default: 2)")
-    arguments.flag("--only", default="", metavar="TEXT", help="run only the checks whose name contains TEXT")
-    arguments.flag("--json", default="", metavar="FILE", help="also write the report to FILE, as JSON")
-    arguments.flag("--with-keys", action="store_true", help="encrypt the connection; {token} in COMMAND does so too")
-    arguments.flag(
-        "--patience-s",
-        type=float,
-        default=5.0,
-        metavar="S",
-        help="seconds that an answer of the client may take (default: 5)",
-    )
-    arguments.flag(
-        "--start-s", type=float, default=20.0, metavar="S", help="seconds that the client may take to start (default: 20)"
-    )
-    arguments.flag(
-        "--limit-s", type=float, default=300.0, metavar="S", help="seconds that the whole test may take (default: 300)"
-    )
-    values = arguments.parse(flags)
+    words, command = _split(argv)
+    values = parse_flags(ConformFlags, words, "conform")
     if not command:
         raise UsageError(
             "conform: which client? expected its command after --, as in: millrace conform -- ./client {address}"
         )
-    if not (values.copies >= 1 and all(seconds > 0 for seconds in (values.patience_s, values.start_s, values.limit_s))):
-        raise UsageError("conform: expected --copies of 1 or more, and seconds above 0")
     checks = _chosen(PROFILES[values.profile], values.only)
     settings = Settings(EnvSpec(values.env), copies=values.copies, patience_s=values.patience_s, start_s=values.start_s)
     results: list[CheckResult] = []

@@ -1,4 +1,4 @@
-"""The flags of the commands that look at runs, and of the launchers. tyro makes command lines of these records."""
+"""The flags of the commands that look at runs, and of the launchers."""
 
 from __future__ import annotations
 
@@ -7,21 +7,27 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
-from tyro.conf import Positional, UseAppendAction, arg
+from msgspec import Meta
+
+from protocol.bounds import MAX_SEEDS
+from protocol.flags.fields import Flag
+
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
 
 
 class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Flags of the commands whose workers play episodes of a run's policy."""
 
-    run: Positional[Path]
+    run: Annotated[Path, Flag(positional=True)]
     """run folder"""
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     env: str = ""
     """the environment, if the run does not find it by itself, such as my_module:make_env or my_module:MyEnv-v0"""
-    wrapper: Annotated[tuple[str, ...], arg(metavar="MODULE:CLASS"), UseAppendAction] = ()
+    wrapper: Annotated[tuple[str, ...], Flag("MODULE:CLASS", repeated=True)] = ()
     """the wrappers, innermost first, if the run does not find them by itself"""
-    workers: int = 2
+    workers: Count = 2
     """number of worker processes that play the episodes; the result does not depend on it"""
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
@@ -29,36 +35,32 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
     inference: Literal["workers", "learner"] = "workers"
     """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
-    max_env_failures: int = 3
+    max_env_failures: Natural = 3
     """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
 
 
 class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     """Play greedy episodes of a run's newest policy; print mean and standard deviation of the return."""
 
-    episodes: int | None = None
+    episodes: Annotated[Count | None, Flag("INT")] = None
     """number of episodes; if not given: 100, or 3 with --video"""
-    seed: int = 1_000_000
+    seed: Natural = 1_000_000
     """seed of the episodes"""
-    copies: int = 4
+    copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
     """number of episodes that a worker plays at the same time"""
-    max_steps: int = 1_000_000
+    max_steps: Count = 1_000_000
     """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
     video: bool = False
     """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Draw learning curves as a PNG: a panel for each environment, a color for each algorithm, a band for several seeds."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Annotated[tuple[Path, ...], Flag("RUN ...", positional=True)]
     """run folders"""
-    out: Path | None = None
+    out: Annotated[Path | None, Flag("PATH")] = None
     """file to write; if not given, curves.png in the first run folder"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class RecordFlags(PlayFlags, frozen=True, kw_only=True):
@@ -66,40 +68,34 @@ class RecordFlags(PlayFlags, frozen=True, kw_only=True):
 
     out: str
     """id of the dataset, such as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
-    steps: int = 50_000
+    steps: Count = 50_000
     """number of env steps; the last episode is finished, unless that would take more than twice as many"""
-    npy: Path | None = None
+    npy: Annotated[Path | None, Flag("PATH")] = None
     """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
     stochastic: bool = False
     """sample actions from the policy, as in training, instead of taking the most probable ones"""
-    seed: int = 2_000_000
+    seed: Natural = 2_000_000
     """seed of the episodes and of the sampled actions"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Compare runs on one HTML page: results, learning curves, settings, tickets, where the time went, videos."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Annotated[tuple[Path, ...], Flag("RUN ...", positional=True)]
     """run folders"""
-    out: Path | None = None
+    out: Annotated[Path | None, Flag("PATH")] = None
     """file to write; if not given, report.html in the first run folder"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Flags of every launcher. Put flags of `millrace learner` after `--`: millrace launch … -- --steps 1000000."""
 
-    env: Positional[str]
+    env: Annotated[str, Flag(positional=True)]
     """environment id for gymnasium.make, such as CartPole-v1 or my_package.envs:MyEnv-v0"""
-    workers: int = 4
+    workers: Count = 4
     """number of worker processes; with Ray, of actors"""
     name: str = "millrace"
     """name of the run on the cluster: small letters, digits and dashes"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class KubernetesFlags(LaunchFlags, frozen=True, kw_only=True):

@@ -5,23 +5,62 @@ Rule: a secret is printed only if the user asked for it by name.
 
 from __future__ import annotations
 
-from argparse import Namespace
-from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import Annotated
 
-from millrace.cli.arguments import Arguments
+import msgspec
+
 from protocol.errors import UsageError, did_you_mean
-from protocol.keys.key_folder import DEFAULT_FOLDER, FOLDER_VARIABLE, KeyFolder, chosen_key_folder
+from protocol.flags.fields import Flag, fields_of
+from protocol.flags.parse import HELP_FLAGS, parse_flags
+from protocol.keys.key_folder import KeyFolder, chosen_key_folder
 from protocol.keys.keys import public_key
 
 
-class Subcommand(NamedTuple):
-    """A subcommand of `millrace keys`."""
+class KeysFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Flags of every subcommand."""
 
-    run: Callable[[list[str]], list[str]]
-    usage: str
-    about: str
+    keys: Annotated[str, Flag("FOLDER")] = ""
+    """key folder; if not given, the one that MILLRACE_KEYS names, or ~/.config/millrace/keys"""
+
+
+class NewFlags(KeysFlags, frozen=True, kw_only=True):
+    """Make a key for workers, allow it here, and write its join token to a file."""
+
+    name: Annotated[str, Flag(positional=True)]
+    """name of the client; `millrace keys revoke NAME` blocks its workers"""
+    server: Annotated[str, Flag("PUBLIC")] = ""
+    """public key of a learner elsewhere: the token is for that learner, which must allow the key that is printed"""
+    print_token: bool = False
+    """print the token and nothing else, as for a secret store; whoever sees it can join"""
+
+
+class ShowFlags(KeysFlags, frozen=True, kw_only=True):
+    """List the learner's public key and the clients: names, public keys, dates, states."""
+
+
+class AllowFlags(KeysFlags, frozen=True, kw_only=True):
+    """Allow a client whose key was made on another machine."""
+
+    public: Annotated[str, Flag(positional=True)]
+    """public key of the client: 64 hexadecimal digits"""
+    name: Annotated[str, Flag(positional=True)]
+    """name that you give to the client, for use in `millrace keys revoke NAME`"""
+
+
+class RevokeFlags(KeysFlags, frozen=True, kw_only=True):
+    """Block a client; running learners disconnect its workers within seconds."""
+
+    name: Annotated[str, Flag(positional=True)]
+    """name of the client"""
+
+
+SUBCOMMANDS: dict[str, type[KeysFlags]] = {
+    "new": NewFlags,
+    "show": ShowFlags,
+    "allow": AllowFlags,
+    "revoke": RevokeFlags,
+}
 
 
 def run(argv: list[str]) -> int:
@@ -33,53 +72,57 @@ def run(argv: list[str]) -> int:
 def keys(argv: list[str]) -> list[str]:
     """Run a subcommand. Returns the lines to print. Raises `UsageError`."""
     name, *rest = argv or [""]
-    if name in ("-h", "--help"):
+    if name in HELP_FLAGS:
         return _help()
     if name not in SUBCOMMANDS:
         problem = f"keys {name}: no such command{did_you_mean(name, SUBCOMMANDS)};" if name else "keys: which command?"
         raise UsageError(f"{problem} expected one of {', '.join(SUBCOMMANDS)}")
-    return SUBCOMMANDS[name].run(rest)
+    flags = parse_flags(SUBCOMMANDS[name], rest, f"keys {name}")
+    folder = KeyFolder(chosen_key_folder(flags.keys))
+    now = datetime.now(UTC).replace(microsecond=0)
+    match flags:
+        case NewFlags():
+            return _new(folder, flags, now)
+        case AllowFlags():
+            folder.allow(flags.name, public_key(flags.public, "keys allow"), now)
+            return [f"{flags.name} may connect"]
+        case RevokeFlags():
+            folder.revoke(flags.name, now)
+            return [f"{flags.name} is shut out; running learners cut it off within a second or two"]
+    return _show(folder)
 
 
 def _help() -> list[str]:
+    commands = [(" ".join([name, *_arguments(record)]), record.__doc__) for name, record in SUBCOMMANDS.items()]
     return [
         f"usage: millrace keys {'|'.join(SUBCOMMANDS)} …",
         "",
         "Choose which workers of other machines may join the learners of this machine.",
         "",
-        *(f"  millrace keys {each.usage:18} {each.about}" for each in SUBCOMMANDS.values()),
+        *(f"  millrace keys {usage:18} {about}" for usage, about in commands),
         "",
         "millrace keys COMMAND --help lists the flags of each.",
     ]
 
 
-def _new(argv: list[str]) -> list[str]:
-    arguments = _arguments("new")
-    arguments.flag("name", metavar="NAME", help="name of the client; `millrace keys revoke NAME` blocks its workers")
-    arguments.flag(
-        "--server", default="", metavar="PUBLIC",
-        help="public key of a learner elsewhere: the token is for that learner, which must allow the key that is printed",
-    )  # fmt: skip
-    arguments.flag(
-        "--print-token", action="store_true",
-        help="print the token and nothing else, as for a secret store; whoever sees it can join",
-    )  # fmt: skip
-    values = arguments.parse(argv)
-    folder = _folder(values)
-    if values.server:
-        token, public = folder.new_for_other_learner(values.name, public_key(values.server, "--server"))
-        lines = [f"token: {token}", f"on the learner's machine: millrace keys allow {public.hex()} {values.name}"]
+def _arguments(record: type[KeysFlags]) -> list[str]:
+    return [field.metavar for field in fields_of(record).values() if field.flag.positional]
+
+
+def _new(folder: KeyFolder, flags: NewFlags, now: datetime) -> list[str]:
+    if flags.server:
+        token, public = folder.new_for_other_learner(flags.name, public_key(flags.server, "--server"))
+        lines = [f"token: {token}", f"on the learner's machine: millrace keys allow {public.hex()} {flags.name}"]
     else:
-        token = folder.new(values.name, _now())
+        token = folder.new(flags.name, now)
         lines = [
             f"token: {token}",
             "a worker on another machine joins with its own copy: millrace worker ADDRESS --token FILE",
         ]
-    return [token.read_text().strip()] if values.print_token else lines
+    return [token.read_text().strip()] if flags.print_token else lines
 
 
-def _show(argv: list[str]) -> list[str]:
-    folder = _folder(_arguments("show").parse(argv))
+def _show(folder: KeyFolder) -> list[str]:
     allowed = folder.allowed()
     lines = [f"key folder: {folder.path}", f"learner: {folder.server().public.hex()}"]
     width = max((len(client.name) for client in allowed.clients), default=0)
@@ -87,45 +130,3 @@ def _show(argv: list[str]) -> list[str]:
         state = f"revoked {client.revoked:%Y-%m-%d %H:%M}" if client.revoked else "may connect"
         lines.append(f"{client.name:{width}}  {client.public}  made {client.made:%Y-%m-%d %H:%M}  {state}")
     return lines if allowed.clients else [*lines, "no clients yet: `millrace keys new NAME` makes one"]
-
-
-def _allow(argv: list[str]) -> list[str]:
-    arguments = _arguments("allow")
-    arguments.flag("public", metavar="PUBLIC", help="public key of the client: 64 hexadecimal digits")
-    arguments.flag("name", metavar="NAME", help="name that you give to the client, for use in `millrace keys revoke NAME`")
-    values = arguments.parse(argv)
-    _folder(values).allow(values.name, public_key(values.public, "keys allow"), _now())
-    return [f"{values.name} may connect"]
-
-
-def _revoke(argv: list[str]) -> list[str]:
-    arguments = _arguments("revoke")
-    arguments.flag("name", metavar="NAME", help="name of the client")
-    values = arguments.parse(argv)
-    _folder(values).revoke(values.name, _now())
-    return [f"{values.name} is shut out; running learners cut it off within a second or two"]
-
-
-def _arguments(name: str) -> Arguments:
-    arguments = Arguments(f"keys {name}", SUBCOMMANDS[name].about.capitalize() + ".")
-    arguments.flag(
-        "--keys", default="", metavar="FOLDER",
-        help=f"key folder; if not given, the one that {FOLDER_VARIABLE} names, or {DEFAULT_FOLDER}",
-    )  # fmt: skip
-    return arguments
-
-
-def _folder(values: Namespace) -> KeyFolder:
-    return KeyFolder(chosen_key_folder(values.keys))
-
-
-def _now() -> datetime:
-    return datetime.now(UTC).replace(microsecond=0)
-
-
-SUBCOMMANDS = {
-    "new": Subcommand(_new, "new NAME", "make a key for workers, allow it here, and write its join token to a file"),
-    "show": Subcommand(_show, "show", "list the learner's public key and the clients: names, public keys, dates, states"),
-    "allow": Subcommand(_allow, "allow PUBLIC NAME", "allow a client whose key was made on another machine"),
-    "revoke": Subcommand(_revoke, "revoke NAME", "block a client; running learners disconnect its workers within seconds"),
-}

@@ -32,7 +32,6 @@ NOT_IN_WORKERS = {
     "threadpoolctl",
     "tomli_w",
     "torch",
-    "tyro",
 }
 """Packages that the learner needs and a worker does not. An installation only for workers lacks them."""
 

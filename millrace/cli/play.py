@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from learner.config.flag_parser import parse_flags
 from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.terminal import count_line
+from protocol.flags.parse import parse_flags
 
 
 def evaluate(argv: list[str]) -> int:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from learner.config.presets import algorithms_and_environments, named_presets
-from millrace.cli.commands import HELP_FLAGS, usage
-from protocol.errors import UsageError
+from protocol.flags.parse import parse_flags
+
+
+class PresetsFlags(msgspec.Struct, frozen=True):
+    """List settings that are known to work."""
 
 
 def run(argv: list[str]) -> int:
     """List them. Returns the exit code."""
-    argv = [flag for flag in argv if flag != "--debug"]
-    if argv and argv[0] in HELP_FLAGS:
-        print(usage("presets"))
-        return 0
-    if argv:
-        raise UsageError(f"presets: unexpected argument {argv[0]}")
+    parse_flags(PresetsFlags, argv, "presets")
     print("Used unless --preset says otherwise, by environment and algorithm:\n")
     for algo, env in algorithms_and_environments():
         print(f"  millrace train {env} --algo {algo}")

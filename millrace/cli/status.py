@@ -13,14 +13,16 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TextIO
+from typing import Annotated, TextIO
 
 import msgspec
+from msgspec import Meta
 
 from learner.members.held_up import in_words
 from learner.run_folder.run_lock import learner_of_run
-from millrace.cli.arguments import Arguments
 from protocol.errors import Refused, RunError, UsageError
+from protocol.flags.fields import Flag
+from protocol.flags.parse import parse_flags
 from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
 from protocol.keys.keys import Token
 from protocol.messages import Inquire, Status, WorkerStatus
@@ -40,6 +42,23 @@ DROPS = {
 LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are right-aligned
 
 
+class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Show the workers of a run (speed, memory, seconds since the last message), and what was dropped."""
+
+    address: Annotated[str, Flag("ADDRESS|RUN", positional=True)]
+    """where the learner listens, as in tcp://HOST:5555, or the folder of a run that is training"""
+    watch: bool = False
+    """ask again every second, until Ctrl-C or the end of the learner"""
+    json: bool = False
+    """print one line of JSON instead of a table"""
+    timeout_s: Annotated[float, Meta(gt=0)] = 5.0
+    """seconds to wait for the learner's answer"""
+    token: Annotated[str, Flag("FILE")] = ""
+    """file of a join token, if workers need one; if not given, MILLRACE_TOKEN, or the key folder of RUN"""
+    insecure: bool = False
+    """ask on another machine without a token, and trust the answer"""
+
+
 def run(argv: list[str]) -> int:
     """Print it. Returns the exit code."""
     status(argv, sys.stdout)
@@ -48,26 +67,7 @@ def run(argv: list[str]) -> int:
 
 def status(argv: list[str], out: TextIO) -> None:
     """Run the command. Raises `UsageError`, or `RunError` when the learner does not answer."""
-    arguments = Arguments(
-        "status", "Show the workers of a run (speed, memory, seconds since the last message), and what was dropped."
-    )
-    arguments.flag(
-        "address", metavar="ADDRESS|RUN",
-        help="where the learner listens, as in tcp://HOST:5555, or the folder of a run that is training",
-    )  # fmt: skip
-    arguments.flag("--watch", action="store_true", help="ask again every second, until Ctrl-C or the end of the learner")
-    arguments.flag("--json", action="store_true", help="print one line of JSON instead of a table")
-    arguments.flag(
-        "--timeout-s", type=float, default=5.0, metavar="FLOAT", help="seconds to wait for the learner's answer (default: 5)"
-    )
-    arguments.flag(
-        "--token", default="", metavar="FILE",
-        help=f"file of a join token, if workers need one; if not given, {TOKEN_VARIABLE}, or the key folder of RUN",
-    )  # fmt: skip
-    arguments.flag("--insecure", action="store_true", help="ask on another machine without a token, and trust the answer")
-    values = arguments.parse(argv)
-    if not values.timeout_s > 0:  # also true for NaN
-        raise UsageError(f"status: --timeout-s: expected a number of seconds above 0, got {values.timeout_s:g}")
+    values = parse_flags(StatusFlags, argv, "status")
     address, token = whom_to_ask(values.address, read_token(values.token), insecure=values.insecure)
     link = WorkerLink(address, observer_name(), token=token)
     try:

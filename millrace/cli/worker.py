@@ -7,4 +7,4 @@ from workers.__main__ import main
 
 def run(argv: list[str]) -> int:
     """Work until the learner or the user ends it. Returns the exit code."""
-    return main([flag for flag in argv if flag != "--debug"], "millrace worker")
+    return main(argv)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from learner.config.command_line import read_config
-from learner.config.flag_parser import parse_flags
 from millrace.cli.flags import LaunchFlags
 from protocol.errors import UsageError
+from protocol.flags.parse import parse_flags
 
 Flags = TypeVar("Flags", bound=LaunchFlags)
 
@@ -29,8 +29,6 @@ def read_flags(
     words = list(argv)
     separator = words.index("--") if "--" in words else len(words)
     flags, rest = parse_flags(kind, words[:separator], f"launch {launcher}"), words[separator + 1 :]
-    if flags.workers < 1:
-        raise UsageError(f"workers: expected int >= 1, got {flags.workers}")
     if not DNS_LABEL.fullmatch(flags.name):
         raise UsageError(f"name {flags.name!r}: expected small letters, digits and dashes, at most 40, as in my-run")
     for flag in rest:

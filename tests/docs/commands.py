@@ -5,24 +5,22 @@ Rule: each command is parsed by the parser that the program itself uses. Nothing
 
 from __future__ import annotations
 
-import argparse
 import re
 import shlex
 from collections.abc import Iterator
 from typing import Any, NamedTuple
-from unittest import mock
 
 from benchmarks.program import BENCHMARKS
-from learner.config.command_line import RunFlags, _none_for_tyro
-from learner.config.flag_parser import parse_flags
-from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
-from millrace.cli import conform, flags, keys, status
-from millrace.cli.arguments import Arguments
+from learner.config.command_line import RunFlags
+from learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.cli import conform, flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
 from protocol.errors import UsageError
+from protocol.flags.fields import fields_of
+from protocol.flags.parse import given_values, parse_flags, words_of
 from tests.docs.pages import Block
 from website.commands_page import help_of, lines_of
-from workers.__main__ import _parser as worker_parser
+from workers.flags import WorkerFlags
 
 SHELL = {"", "bash", "sh", "console", "shell"}
 OPERATORS = re.compile(r"^[();<>|&]+$")
@@ -42,6 +40,10 @@ RECORDS: dict[str, type[Any]] = {
     "record": flags.RecordFlags,
     "plot": flags.PlotFlags,
     "report": flags.ReportFlags,
+    "status": status.StatusFlags,
+    "conform": conform.ConformFlags,
+    "presets": presets.PresetsFlags,
+    "worker": WorkerFlags,
 }
 
 
@@ -51,10 +53,6 @@ class Shown(NamedTuple):
     line: int
     words: tuple[str, ...]
     """after `millrace`"""
-
-
-class Parsed(Exception):
-    """The arguments are right; the command would begin now."""
 
 
 def shown_in(block: Block) -> Iterator[Shown]:
@@ -108,12 +106,8 @@ def mistake(words: tuple[str, ...]) -> str:
         return "" if not rest or rest[0] == "--algo" else mistake((name, *rest)) if name not in ("keys", "launch") else ""
     try:
         _parse(name, [word for word in rest if not NO_ARGUMENT.match(word)])
-    except (UsageError, argparse.ArgumentError) as error:
+    except UsageError as error:
         return str(error)
-    except SystemExit as stop:
-        return f"{name}: its parser ended with {stop.code}"
-    except Parsed:
-        return ""
     return ""
 
 
@@ -121,62 +115,35 @@ def _parse(name: str, argv: list[str]) -> None:
     match name:
         case "train" | "learner":
             _parse_run(name, argv)
-        case "worker":
-            parser = worker_parser("millrace worker")
-            parser.exit_on_error = False
-            with mock.patch.object(parser, "error", side_effect=lambda message: _refuse(f"worker: {message}")):
-                parser.parse_args([word for word in argv if word != "--debug"])
-        case "keys" | "status":
-            with mock.patch.object(Arguments, "parse", _parse_only):
-                (keys.keys if name == "keys" else _status)(argv)
-        case "conform":
-            with mock.patch.object(Arguments, "parse", _parse_only):
-                conform.check(argv, lambda line: None)
+        case "keys":
+            subcommand, *rest = argv or [""]
+            if subcommand not in keys.SUBCOMMANDS:
+                raise UsageError(f"keys {subcommand}: no such command")
+            parse_flags(keys.SUBCOMMANDS[subcommand], rest, f"keys {subcommand}")
         case "launch":
             launcher, *rest = argv or [""]
             if launcher not in LAUNCHERS:
                 raise UsageError(f"launch {launcher}: no such launcher")
-            separator = rest.index("--") if "--" in rest else len(rest)
-            chosen: Any = parse_flags(LAUNCHERS[launcher], rest[:separator], f"launch {launcher}")
-            _parse_run("learner", [chosen.env, *rest[separator + 1 :]])
-        case "presets":
-            if argv:
-                raise UsageError(f"presets: unexpected argument {argv[0]}")
+            chosen: Any = parse_flags(LAUNCHERS[launcher], _before_dashes(rest), f"launch {launcher}")
+            _parse_run("learner", [chosen.env, *rest[len(_before_dashes(rest)) + 1 :]])
         case "bench":
             if argv and argv[0] not in BENCHMARKS:
                 raise UsageError(f"bench {argv[0]}: no such benchmark")
         case _:
-            parse_flags(RECORDS[name], argv, name)
+            parse_flags(RECORDS[name], _before_dashes(argv), name)
+
+
+def _before_dashes(argv: list[str]) -> list[str]:
+    return argv[: argv.index("--")] if "--" in argv else argv
 
 
 def _parse_run(command: str, argv: list[str]) -> None:
     """Flags of a run. An algorithm of the user's own has flags that nobody knows here."""
-    words = [word for flag in argv for word in flag.split("=", 1)] if any("=" in flag for flag in argv) else argv
-    algo = words[words.index("--algo") + 1] if "--algo" in words[:-1] else ""
-    algorithm: AlgorithmConfig = HYPERPARAMETERS.get(algo or "ppo", AlgorithmConfig)()
-    if algo and algo not in HYPERPARAMETERS and ":" not in algo and not PLACEHOLDER.match(algo):
+    algo = words_of(argv, "algo").get("algo", "ppo")
+    if algo in HYPERPARAMETERS:
+        given_values(fields_of(RunFlags) | fields_of(HYPERPARAMETERS[algo]), argv, command)
+    elif ":" not in algo and not PLACEHOLDER.match(algo):
         raise UsageError(f"{command}: no such algorithm: {algo}")
-    default = RunFlags(algo=algo or "ppo", algorithm=algorithm)
-    own = ":" in algo or bool(PLACEHOLDER.match(algo or "x"))
-    parse_flags(RunFlags, _none_for_tyro(argv, algorithm), command, default, ignore_unknown=own)
-
-
-def _parse_only(self: Arguments, argv: list[str]) -> argparse.Namespace:
-    """In place of `Arguments.parse`: the same checks, and then nothing."""
-    values, unknown = self.parse_known_args(argv)
-    if unknown:
-        _refuse(f"{self.prog}: unexpected {unknown[0]}")
-    raise Parsed(values)
-
-
-def _status(argv: list[str]) -> None:
-    import sys
-
-    status.status(argv, sys.stdout)
-
-
-def _refuse(message: str) -> None:
-    raise UsageError(message)
 
 
 def all_flags() -> set[str]:

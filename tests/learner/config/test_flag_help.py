@@ -5,9 +5,9 @@ import re
 import msgspec
 import pytest
 
-from learner.config.command_line import RunFlags, read_config
-from learner.config.flag_help import BASIC, GROUPS, field_texts
+from learner.config.command_line import BASIC, GROUPS, RunFlags, read_config
 from learner.config.hyperparameters import HYPERPARAMETERS
+from protocol.flags.field_texts import field_texts
 
 
 def help_text(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
@@ -18,7 +18,7 @@ def help_text(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 
 
 def flags_in(text: str) -> list[str]:
-    return re.findall(r"^  (?:--[\w-]+ PATH, )?(?:--|\[)([\w-]+)", text, re.M)
+    return re.findall(r"^  (?:--from, )?(?:--|\[)([\w-]+)", text, re.M)
 
 
 def test_every_setting_is_in_one_group() -> None:
@@ -46,12 +46,12 @@ def test_groups_stand_below_each_other_the_basic_one_first(
 ) -> None:
     monkeypatch.setenv("COLUMNS", columns)
     text = help_text(capsys, "--algo", algo)
-    titles = re.findall(r"^ ([\w ]+?) *\n -+ *$", text, re.M)
-    assert titles == ["positional arguments", "options", *(f"{title} options" for title in (algo, *GROUPS))]
+    titles = re.findall(r"^(\w[\w ]*):$", text, re.M)
+    assert titles == ["arguments", "basics", algo, *GROUPS]
     settings = [name.replace("-", "_") for name in flags_in(text)]
     algorithm = list(field_texts(HYPERPARAMETERS[algo]))
     assert settings == ["ENV", *BASIC[1:], *algorithm, *(name for names in GROUPS.values() for name in names)]
-    assert max(map(len, text.splitlines())) <= 120
+    assert max(map(len, text.splitlines())) <= min(max(int(columns), 80), 120)
 
 
 def test_the_algorithms_are_named(capsys: pytest.CaptureFixture[str]) -> None:

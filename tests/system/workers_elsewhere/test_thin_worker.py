@@ -41,7 +41,7 @@ def thin(tmp_path: Path) -> dict[str, str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [line for lines in project["optional-dependencies"].values() for line in lines]
     missing = names(project["dependencies"] + extras) - names((ROOT / "docker" / "worker.txt").read_text().splitlines())
-    learner_only = {"prometheus_client", "rich", "safetensors", "tensorboard", "threadpoolctl", "tomli_w", "torch", "tyro"}
+    learner_only = {"prometheus_client", "rich", "safetensors", "tensorboard", "threadpoolctl", "tomli_w", "torch"}
     assert learner_only | {"matplotlib"} <= missing
     folder = tmp_path / "thin"
     folder.mkdir()

@@ -1,0 +1,106 @@
+"""The fields of a record, as flags.
+
+Rule: a field is a flag of the same name, with dashes. Its type says which values are allowed. `Annotated[..., Flag(...)]`
+says what neither name nor type can. A field that is a record of its own is no flag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+
+
+@dataclass(frozen=True)
+class Flag:
+    """What a field says about its flag."""
+
+    metavar: str = ""
+    """how the help shows its values; if empty, by the type"""
+    alias: str = ""
+    """another name"""
+    positional: bool = False
+    """an argument without a flag"""
+    repeated: bool = False
+    """for a tuple: one value each time that the flag is given"""
+    hidden: bool = False
+    """a process of millrace gives it to another one; the help does not show it"""
+
+
+class Field(NamedTuple):
+    """A field of a record."""
+
+    name: str
+    hint: Any
+    """its type, with bounds"""
+    kind: Any
+    """its type without bounds and without None"""
+    optional: bool
+    """whether it may be None, which is written as `none`"""
+    flag: Flag
+
+    @property
+    def written(self) -> str:
+        """As the command line names it."""
+        return self.metavar if self.flag.positional else f"--{self.name.replace('_', '-')}"
+
+    @property
+    def many(self) -> bool:
+        """Whether several words follow the flag."""
+        return get_origin(self.kind) in (tuple, list, dict) and not self.flag.repeated
+
+    @property
+    def metavar(self) -> str:
+        """How the help shows the values; empty for a flag without."""
+        if self.flag.metavar:
+            return self.flag.metavar
+        if self.flag.positional:
+            return self.name.upper()
+        shown = _metavar(self.kind)
+        return f"{shown}|none" if self.optional else shown
+
+
+def fields_of(record: type[msgspec.Struct]) -> dict[str, Field]:
+    """The fields of a record by name, those of its bases first."""
+    found = {}
+    for name, hint in get_type_hints(record, include_extras=True).items():
+        kind, optional = _plain(hint)
+        if name in record.__struct_fields__ and not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
+            marks = getattr(hint, "__metadata__", ())
+            flag = next((mark for mark in marks if isinstance(mark, Flag)), Flag())
+            found[name] = Field(name, hint, kind, optional, flag)
+    return found
+
+
+def choices(hint: Any) -> list[str]:
+    """The values that a type allows: a Literal, or a Literal or None."""
+    kind, optional = _plain(hint)
+    return [*map(str, get_args(kind)), *(["none"] if optional else [])]
+
+
+def _plain(hint: Any) -> tuple[Any, bool]:
+    """A type without bounds and None, and whether None is allowed."""
+    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    if get_origin(kind) not in (Union, UnionType):
+        return kind, False
+    options = get_args(kind)
+    others = [option for option in options if option is not NoneType]
+    plain = _plain(others[0])[0] if len(others) == 1 else kind
+    return plain, NoneType in options
+
+
+def _metavar(kind: Any) -> str:
+    names = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+    if kind in names:
+        return names[kind]
+    match get_origin(kind):
+        case origin if origin is Literal:
+            return f"{{{','.join(map(str, get_args(kind)))}}}"
+        case origin if origin in (tuple, list):
+            return f"{_metavar(_plain(get_args(kind)[0])[0])} ..."
+        case origin if origin is dict:
+            return "NAME VALUE ..."
+    return "VALUE"

@@ -1,0 +1,93 @@
+"""The help of a command: its usage, what it does, and its flags in groups. Pure but for the width of the terminal."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+
+from protocol.flags.field_texts import field_texts
+from protocol.flags.fields import Field, fields_of
+
+WIDEST_COLUMNS = 120
+TEXT_COLUMN = 26  # where the texts begin
+NO_BREAK = "\0"  # a space where no line ends
+
+Group = tuple[type[msgspec.Struct] | msgspec.Struct, Sequence[str]]
+"""A record, or one with the values to show as defaults, and the names of the fields to show"""
+
+
+class Entry(NamedTuple):
+    """A field in the help."""
+
+    field: Field
+    text: str
+    default: Any
+    """`msgspec.NODEFAULT` if there is none"""
+    layered: bool
+    """whether the default may come from a preset or a file, so that a flag can also turn off what is on"""
+
+
+def help_text(command: str, about: str, groups: Mapping[str, Group]) -> str:
+    """The help. Arguments without a flag come first, whichever group they are in."""
+    width = min(shutil.get_terminal_size().columns, WIDEST_COLUMNS)
+    entries = {title: list(_entries(*group)) for title, group in groups.items()}
+    arguments = [entry for each in entries.values() for entry in each if entry.field.flag.positional]
+    required = [entry for each in entries.values() for entry in each if entry.default is msgspec.NODEFAULT]
+    usage = [_heading(entry) for entry in [*arguments, *(entry for entry in required if entry not in arguments)]]
+    shown = {title: [one for one in each if not one.field.flag.positional] for title, each in entries.items()}
+    usage += ["[flags]"] if any(shown.values()) else []
+    lines = [" ".join(["usage: millrace", command, *usage]), "", *textwrap.wrap(about, width)]
+    if arguments:
+        lines += ["", "arguments:", *(line for entry in arguments for line in _lines(entry, width))]
+    for title, flags in shown.items():
+        lines += ["", f"{title}:", *(line for entry in flags for line in _lines(entry, width))] if flags else []
+    return "\n".join([*lines, "", "--help shows this; --debug shows the traceback of an error.", ""])
+
+
+def _entries(record: type[msgspec.Struct] | msgspec.Struct, names: Sequence[str]) -> Iterator[Entry]:
+    kind = record if isinstance(record, type) else type(record)
+    fields, texts = fields_of(kind), field_texts(kind)
+    defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
+    for name in names:
+        if not fields[name].flag.hidden:
+            value = defaults[name] if record is kind else getattr(record, name)
+            yield Entry(fields[name], texts[name], value, layered=record is not kind)
+
+
+def _heading(entry: Entry) -> str:
+    """How a field is written: `--steps INT`."""
+    field = entry.field
+    if field.flag.positional:
+        return field.metavar if entry.default is msgspec.NODEFAULT else f"[{field.metavar}]"
+    if field.kind is bool and not field.optional:
+        return f"{field.written}, --no-{field.written[2:]}" if entry.layered else field.written
+    alias = f"--{field.flag.alias.replace('_', '-')}, " if field.flag.alias else ""
+    return f"{alias}{field.written} {field.metavar}"
+
+
+def _lines(entry: Entry, width: int) -> list[str]:
+    """The heading and, beside or below it, the text and the default."""
+    heading, text = f"  {_heading(entry)}", f"{entry.text}{_default(entry)}"
+    lines = textwrap.wrap(text, width - TEXT_COLUMN, break_long_words=False, break_on_hyphens=False)
+    wrapped = [line.replace(NO_BREAK, " ") for line in lines]
+    indented = [" " * TEXT_COLUMN + line for line in wrapped]
+    if len(heading) > TEXT_COLUMN - 2:
+        return [heading, *indented]
+    return [heading.ljust(TEXT_COLUMN) + "".join(wrapped[:1]), *indented[1:]]
+
+
+def _default(entry: Entry) -> str:
+    match entry.default:
+        case None:
+            return f" (default:{NO_BREAK}none)" if entry.field.metavar.endswith("none") else ""
+        case msgspec.NODEFAULT | "" | () | {}:
+            return ""
+        case False if not entry.layered:
+            return ""
+        case tuple() | list():
+            return f" (default:{NO_BREAK}{' '.join(map(str, entry.default))})"
+    return f" (default:{NO_BREAK}{entry.default})"

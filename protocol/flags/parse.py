@@ -1,0 +1,151 @@
+"""A command line -> the values that it gives.
+
+Rules: a word that begins with a dash and is no number is a flag; other words are values of the flag before them, as many as
+it takes, or arguments. A value that begins with a dash is written behind a sign: `--name=-x`. Of a flag that is given twice
+the last one counts. What the user does wrong is one line.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NoReturn, TypeVar
+
+import msgspec
+
+from protocol.errors import UsageError, did_you_mean, unexpected_arguments
+from protocol.flags.fields import Field, fields_of
+from protocol.flags.help import Group, help_text
+from protocol.flags.values import read_words
+
+HELP_FLAGS = ("-h", "--help")
+EVERYWHERE = (*HELP_FLAGS, "--debug")  # flags that every command takes
+
+Record = TypeVar("Record", bound=msgspec.Struct)
+
+
+def parse_flags(record: type[Record], argv: Sequence[str], command: str) -> Record:
+    """The record that these words describe. Raises `UsageError`, or SystemExit(0) after `--help`."""
+    fields = fields_of(record)
+    if asks_for_help(argv):
+        show_help(command, " ".join((record.__doc__ or "").split()), {"flags": (record, list(fields))})
+    given = given_values(fields, argv, command)
+    required = {field.name for field in msgspec.structs.fields(record) if field.required}
+    if missing := [fields[name].written for name in fields if name in required - given.keys()]:
+        raise UsageError(f"{command}: missing: {', '.join(missing)}{_more(command)}")
+    return record(**given)
+
+
+def show_help(command: str, about: str, groups: Mapping[str, Group]) -> NoReturn:
+    """Print the help and raise SystemExit(0)."""
+    sys.stdout.write(help_text(command, about, groups))
+    raise SystemExit(0)
+
+
+def asks_for_help(argv: Sequence[str]) -> bool:
+    """Whether the user asks how a command is used."""
+    return any(flag in argv for flag in HELP_FLAGS)
+
+
+def words_of(argv: Sequence[str], *names: str) -> dict[str, str]:
+    """The words behind these flags, whatever the other flags may be."""
+    found = {}
+    for word, following in pairwise([*argv, "--"]):
+        name, sign, value = _parts(word)
+        if is_flag(word) and name in names and (sign or not is_flag(following)):
+            found[name] = value if sign else following
+    return found
+
+
+def given_values(
+    fields: Mapping[str, Field],
+    argv: Sequence[str],
+    command: str,
+    hint: Callable[[str], str] = lambda setting: "",
+) -> dict[str, Any]:
+    """The values of the fields that are given. `hint` gets the name of an unknown one and returns a text for the error."""
+    given: dict[str, Any] = {}
+    arguments: list[str] = []
+    words = deque(word for word in argv if word not in EVERYWHERE)
+    while words:
+        word = words.popleft()
+        if not is_flag(word):
+            arguments.append(word)
+            continue
+        name, sign, value = _parts(word)
+        field = _field(fields, name)
+        if field is None or field.flag.positional:
+            raise UsageError(f"{command}: {_unknown(fields, word.partition('=')[0], command, hint(name))}")
+        if field.kind is bool and not field.optional:
+            if sign:
+                raise UsageError(f"{command}: {word}: expected {field.written} or --no-{field.written[2:]}")
+            given[field.name] = name == field.name
+            continue
+        values = [value] if sign else _taken(words, len(words) if field.many else 1)
+        if not values and not field.many:
+            raise UsageError(f"{command}: expected {field.written} {field.metavar}, got no value{_more(command)}")
+        value = read_words(field, values)
+        given[field.name] = (*given.get(field.name, ()), *value) if field.flag.repeated else value
+    return given | _arguments([field for field in fields.values() if field.flag.positional], arguments, command)
+
+
+def is_flag(word: str) -> bool:
+    """Whether a word is a flag, and no value."""
+    try:
+        float(word)
+    except ValueError:
+        return len(word) > 1 and word[0] == "-"
+    return False
+
+
+def _parts(word: str) -> tuple[str, str, str]:
+    """The name of a flag as a field has it, and the value behind a sign, if there is one."""
+    name, sign, value = word.partition("=")
+    return name.lstrip("-").replace("-", "_"), sign, value
+
+
+def _field(fields: Mapping[str, Field], name: str) -> Field | None:
+    """The field of this flag. A field that is true or false also has a flag that begins with `no`."""
+    for field in fields.values():
+        if name in (field.name, field.flag.alias) or (field.kind is bool and name == f"no_{field.name}"):
+            return field
+    return None
+
+
+def _taken(words: deque[str], most: int) -> list[str]:
+    """The values that come next, which are taken away."""
+    taken: list[str] = []
+    while words and len(taken) < most and not is_flag(words[0]):
+        taken.append(words.popleft())
+    return taken
+
+
+def _arguments(fields: Sequence[Field], words: list[str], command: str) -> dict[str, Any]:
+    given = {}
+    for field in fields:
+        if field.many:
+            given[field.name], words = read_words(field, words), []
+        elif words:
+            given[field.name] = read_words(field, words[:1])
+            words = words[1:]
+    if words:
+        one_run = any("RUN" in field.metavar for field in fields)
+        raise UsageError(f"{command}: {unexpected_arguments(words, one_run=one_run)}")
+    return given
+
+
+def _unknown(fields: Mapping[str, Field], flag: str, command: str, hint: str) -> str:
+    name = flag.lstrip("-").replace("-", "_")
+    if name in fields:
+        argument = fields[name].metavar
+        return f"{argument} has no flag; expected it as in: millrace {command} {argument}"
+    known = [field for field in fields.values() if not field.flag.positional]
+    names = [field.written[2:] for field in known]
+    names += [f"no-{field.written[2:]}" for field in known if field.kind is bool]
+    return f"unknown flag {flag}{hint or did_you_mean(flag.lstrip('-'), names, '--')}"
+
+
+def _more(command: str) -> str:
+    return f"; millrace {command} --help tells more"

@@ -1,0 +1,61 @@
+"""Words of a command line, or a keyword argument, as the value of a field; and why a value is refused: expected, got."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from typing import Any, get_origin
+
+import msgspec
+
+from protocol.errors import UsageError
+from protocol.flags.fields import Field, choices
+
+
+def read_words(field: Field, words: Sequence[str]) -> Any:
+    """The value that these words say. Raises `UsageError`."""
+    if field.optional and list(words) in (["none"], ["None"]):
+        return None
+    match get_origin(field.kind):
+        case origin if origin is dict:
+            if len(words) % 2:
+                raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}")
+            return {name: _scalar(word) for name, word in zip(words[::2], words[1::2], strict=True)}
+        case origin if origin in (tuple, list):
+            value: object = list(words)
+        case _:
+            (value,) = words
+    return _converted(field, value, shlex.join(words), strict=False)
+
+
+def read_value(field: Field, value: Any) -> Any:
+    """The same value of Python's, as the field has it. Raises `UsageError`."""
+    return _converted(field, value, f"{value!r:.60}", strict=True)
+
+
+def _converted(field: Field, value: Any, given: str, *, strict: bool) -> Any:
+    try:
+        return msgspec.convert(value, field.hint, strict=strict, dec_hook=lambda kind, plain: kind(plain))
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{field.name}: {what_was_expected(str(error), field.hint)}, got {given}") from None
+
+
+def what_was_expected(message: str, hint: Any) -> str:
+    """What a value should have been, from msgspec's message and the type of the field."""
+    if message.startswith("Invalid enum value"):
+        return f"expected one of {', '.join(choices(hint))}"
+    text = message.partition(" - at ")[0].replace(" | null", ' or "none"').replace("`object`", "table")
+    return re.sub(", got .*", "", text).replace("`", "").replace("Expected", "expected", 1)
+
+
+def _scalar(word: str) -> bool | int | float | str:
+    """A keyword argument: True, False, a number, or text."""
+    if word in ("True", "False"):
+        return word == "True"
+    for number in (int, float):
+        try:
+            return number(word)
+        except ValueError:
+            pass
+    return word

@@ -1,0 +1,69 @@
+"""The flags of a worker program, and of the worker processes that it starts."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from protocol.alive import CallTimeouts
+from protocol.flags.fields import Flag
+
+Seconds = Annotated[float, Flag("S"), Meta(ge=0)]
+HIDDEN = Flag(hidden=True)
+
+
+class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Start a worker: it steps environments for the learner at ADDRESS until the learner is done."""
+
+    address: Annotated[str, Flag(positional=True)]
+    """address of the learner: ipc://PATH or tcp://HOST:PORT"""
+    processes: Annotated[int, Flag("N"), Meta(ge=1)] = 1
+    """start N workers, one process each; one that fails is restarted"""
+    name: str = ""
+    """name of this worker, unique in the run; if not given, host name and process id"""
+    stay: bool = False
+    """after a run, wait for the next learner at ADDRESS, until SIGTERM or Ctrl-C; every run gets new processes"""
+    token: Annotated[str, Flag("FILE")] = ""
+    """file with the join token; or set MILLRACE_TOKEN to a file or a token"""
+    insecure: bool = False
+    """connect to a learner on another machine without a token; the learner is not authenticated, so this worker runs only
+    environments that are registered here (as with --no-code)
+    """
+    no_code: bool = False
+    """accept only environments that are registered here: no pickled callables, and no modules to import"""
+    pin: bool = False
+    """with --processes: pin each worker to one CPU core"""
+    join_timeout_s: Seconds = 60.0
+    """leave when no learner has answered for S seconds (with --stay: never); a worker that had joined waits for its learner
+    to come back, 600 s or S if that is longer
+    """
+    start_timeout_s: Seconds = 600.0
+    """end and restart a worker if making or resetting one env copy, or making the policy, takes longer than S seconds; 0: no
+    limit
+    """
+    step_timeout_s: Seconds = 600.0
+    """end and restart a worker if a step takes longer than S seconds; 0: no limit"""
+
+    parent: Annotated[int, HIDDEN] = 0
+    """be a worker; leave when it is not the parent"""
+    core: Annotated[int | None, HIDDEN] = None
+    """run only on this CPU core"""
+    activity: Annotated[int | None, HIDDEN] = None
+    """descriptor of the page that the parent reads"""
+    slots: Annotated[int | None, HIDDEN] = None
+    """descriptor whose locks the parent holds too"""
+    handed: Annotated[str, HIDDEN] = ""
+    """descriptors of shared memory"""
+
+    @property
+    def called(self) -> str:
+        """The name of this worker."""
+        return self.name or f"{socket.gethostname()}-{os.getpid()}"
+
+    def timeouts(self) -> CallTimeouts:
+        """How long a call of an env copy may take."""
+        return CallTimeouts(self.start_timeout_s, self.step_timeout_s)
