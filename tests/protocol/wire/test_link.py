@@ -30,7 +30,7 @@ from protocol.messages import (
     Weights,
 )
 from protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
-from protocol.wire.compression import Packing
+from protocol.wire.compression import Packing, has_zstd
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.sockets import COPY_BELOW_BYTES
 from protocol.wire.worker_link import WorkerLink
@@ -154,7 +154,7 @@ def test_a_packed_rollout_arrives_whole_where_there_is_room_for_it(ends: Ends) -
 
 def test_what_leaves_the_machine_or_is_encrypted_is_packed(ends: Ends) -> None:
     assert ends.worker(ends.learner()).packing == Packing(stack=False)
-    assert ends.worker("tcp://192.0.2.1:5555", "w1").packing == Packing(stack=True)
+    assert ends.worker("tcp://192.0.2.1:5555", "w1").packing == Packing(stack=True, zstd=has_zstd())
     assert ends.worker("tcp://localhost:9", "w2").packing == Packing(stack=False)
 
 
