@@ -97,12 +97,11 @@ def test_a_step_that_hangs_ends_by_the_step_timeout_and_is_named(stage: Stage, k
     learner.trains(2)
 
 
-@pytest.mark.parametrize("call", ["construct", "reset"])
-def test_a_construction_and_a_reset_have_timeouts_of_their_own(stage: Stage, call: str) -> None:
-    slow = "make_s 60.0" if call == "construct" else "reset_s 60.0"
-    learner = trained(stage, "Slow-v0", {"env-kwargs": slow, f"{call}-timeout-s": 2, "max-env-failures": 0})
+@pytest.mark.parametrize("call", ["make_s", "reset_s"])
+def test_a_construction_and_a_reset_have_a_timeout_of_their_own(stage: Stage, call: str) -> None:
+    learner = trained(stage, "Slow-v0", {"env-kwargs": f"{call} 60.0", "start-timeout-s": 2, "max-env-failures": 0})
     assert learner.ends(RUN_ENDS_S) == 1
-    assert re.search(rf"took longer than 2 s \(--{call}-timeout-s\), at .*slow_envs.py:\d+", learner.said()), learner.said()
+    assert re.search(r"took longer than 2 s \(--start-timeout-s\), at .*slow_envs.py:\d+", learner.said()), learner.said()
 
 
 @pytest.mark.parametrize(
