@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -151,10 +152,16 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     if isinstance(value, str) and value == "none" and default is None:
         return None
     if isinstance(value, float) and value.is_integer():
-        hint = get_type_hints(type(record))[name]
+        hint = _types(type(record))[name]
         options = get_args(hint) or (hint,)
         return int(value) if int in options and float not in options else value
     return value
+
+
+@cache
+def _types(record: type[msgspec.Struct]) -> dict[str, Any]:
+    """Of each field. Kept, because each look-up evaluates the annotations of the whole record, which takes milliseconds."""
+    return get_type_hints(record)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
