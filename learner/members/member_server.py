@@ -276,8 +276,8 @@ class MemberServer:
             match event:
                 case WorkerRefused(_, why):
                     self._last_turned_away = f"was refused: {one_line(why)}"
-                case WorkerLeft(_, why, _, on_purpose) if on_purpose:
-                    expected = self._membership.draining is not None
+                case WorkerLeft(_, why, _, on_purpose):
+                    expected = on_purpose and self._membership.draining is not None
                     self._last_turned_away = self._last_turned_away if expected else why
                 case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
                     line, expected = line.partition("\n")[0], True

@@ -334,6 +334,14 @@ def test_copies_are_made_again_when_a_worker_is_lost_over_it() -> None:
         assert not env.step(np.zeros((3, 1), np.float32))[3].any(), "no episode had begun"
 
 
+def test_where_no_worker_is_left_the_error_says_what_became_of_the_last_one() -> None:
+    with made(copies=1, lanes=1, workers=1) as (env, link):
+        link.frozen = {"w0"}
+        env.reset_async(seed=1)
+        with pytest.raises(NoWorkers, match=r"0 joined \(the last one did not answer within 5 s\)"):
+            env.reset_wait(5.0)
+
+
 def test_after_three_lost_resets_the_loss_is_raised() -> None:
     with made(copies=1, lanes=1, workers=4) as (env, link):
         link.frozen = {f"w{n}" for n in range(4)}
