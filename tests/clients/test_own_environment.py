@@ -18,6 +18,14 @@ NOT_REGISTERED = "environment Corridor-v0 is not registered"
 HOW = "one of a client in another language needs the client (--bind)"
 
 
+def greedy_return(policy: millrace_package.LoadedPolicy) -> float:
+    """Of an episode in the corridor: five steps to the right end it, or 50 in all."""
+    at, steps = 0, 0
+    while at != 5 and steps < 50:
+        at, steps = at + (1 if policy([at]) == 1 else -1), steps + 1
+    return 1 - 0.01 * (steps - 1) if at == 5 else -0.01 * steps
+
+
 @pytest.mark.parametrize(("language", "inference"), [("js", IN_LEARNER), ("cpp", IN_LEARNER), ("cpp", ())])
 def test_it_is_trained_evaluated_and_resumed(
     stage: Stage, clients: Clients, language: str, inference: tuple[str, ...]
@@ -42,8 +50,7 @@ def test_it_is_trained_evaluated_and_resumed(
     assert last_line(player, 0) == f"return {reached:.1f} ± 0.0 over 5 episodes"
     ends_well(client)
 
-    policy = millrace_package.load(folder)
-    assert [int(policy([at])) for at in range(5)] == [1] * 5
+    assert greedy_return(millrace_package.load(folder)) == pytest.approx(reached)
     assert "no process trains it now" in last_line(millrace(stage, "status", "status", folder), 2)
     for command in ("report", "plot"):
         ends_well(millrace(stage, command, command, folder))
