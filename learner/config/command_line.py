@@ -65,7 +65,7 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
     Raises `UsageError`, with a one-line message, if a setting or a file is not valid.
     """
     words = words_of(argv, "algo", "config", "preset", "resume")
-    resume = Path(words["resume"]) if "resume" in words else None
+    resume = _path(words, "resume")
     if resume != AUTO:
         return _read_layers(command, argv, words, resume), resume
     config = _read_layers(command, argv, words, None)
@@ -73,7 +73,7 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
     if found is None:
         return config, None
     # A run that `--resume auto` found already contains the settings of its --config and --preset.
-    return _read_layers(command, argv, {**words, "config": "", "preset": "none"}, found), found
+    return _read_layers(command, argv, {**words, "config": "none", "preset": "none"}, found), found
 
 
 def _read_layers(command: str, argv: list[str], words: dict[str, str], resume: Path | None) -> Config:
@@ -81,7 +81,7 @@ def _read_layers(command: str, argv: list[str], words: dict[str, str], resume: P
 
     `words`: the flags that say what lies below the others, and which algorithm has which flags.
     """
-    file, preset = Path(words["config"]) if words.get("config") else None, words.get("preset", "auto")
+    file, preset = _path(words, "config"), words.get("preset", "auto")
     below = partial(lower_layers, algo=words.get("algo"), file=file, resume=resume, preset=preset)
     algorithm = type(below("").algorithm)
     own = fields_of(algorithm)
@@ -94,3 +94,7 @@ def _read_layers(command: str, argv: list[str], words: dict[str, str], resume: P
         show_help(command, DESCRIPTIONS[command], {"basics": (shown, BASIC), **of_algorithm, **groups})
     settings = {name: value for name, value in given.items() if name not in LAYERS}
     return validate(override(base, settings, "flags"))
+
+
+def _path(words: dict[str, str], flag: str) -> Path | None:
+    return None if words.get(flag, "none") in ("none", "None") else Path(words[flag])
