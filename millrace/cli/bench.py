@@ -8,17 +8,17 @@ import sys
 from pathlib import Path
 
 from millrace import import_conflict
-from millrace.cli.commands import HELP_FLAGS, usage
+from millrace.cli.commands import COMMANDS
 from protocol.errors import UsageError
+from protocol.flags.parse import asks_for_help, show_help
 
 
 def run(argv: list[str]) -> int:
     """Run them. Returns the exit code."""
     folders = import_conflict.INSTALLED_IN, Path.cwd()
     clone = next((folder for folder in folders if (folder / "benchmarks" / "program.py").is_file()), None)
-    if clone is None and argv and argv[0] in HELP_FLAGS:
-        print(usage("bench"))
-        return 0
+    if clone is None and asks_for_help(argv):
+        show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
     if clone is None:
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
     path = os.pathsep.join(filter(None, [str(clone), os.environ.get("PYTHONPATH")]))

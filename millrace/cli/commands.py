@@ -9,8 +9,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import NamedTuple
 
-HELP_FLAGS = ("-h", "--help")
-
 
 class Command(NamedTuple):
     """A command of `millrace`."""
@@ -56,10 +54,3 @@ def run_command(name: str, argv: list[str]) -> int:
     module, function = COMMANDS[name].runs.split(":")
     code: int = getattr(import_module(f"millrace.cli.{module}"), function)(argv)
     return code
-
-
-def usage(name: str, *more: str) -> str:
-    """How to use a command that has no flags of its own, and `more` lines."""
-    command = COMMANDS[name]
-    about = f"{command.about[0].upper()}{command.about[1:]}."
-    return "\n".join([f"usage: millrace {name} {command.arguments}".rstrip(), "", about, *more])

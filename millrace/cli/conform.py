@@ -18,7 +18,7 @@ from millrace.conformance.report import as_data, explanation, line_of, summary
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.flags.fields import Flag
-from protocol.flags.parse import parse_flags
+from protocol.flags.parse import cut_at_dashes, parse_flags
 
 Seconds = Annotated[float, Meta(gt=0)]
 
@@ -60,7 +60,7 @@ def run(argv: list[str]) -> int:
 
 def check(argv: list[str], write: Callable[[str], None]) -> int:
     """Check the client. `write` takes the lines of the report. Returns the exit code."""
-    words, command = _split(argv)
+    words, command = cut_at_dashes(argv)
     values = parse_flags(ConformFlags, words, "conform")
     if not command:
         raise UsageError(
@@ -85,14 +85,6 @@ def check(argv: list[str], write: Callable[[str], None]) -> int:
         except OSError as error:
             raise UsageError(f"conform: report {values.json} not written: {error.strerror}") from error
     return int(any(result.outcome == "failed" for result in results))
-
-
-def _split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The flags, and the client's command behind `--`."""
-    if "--" not in argv:
-        return list(argv), []
-    at = list(argv).index("--")
-    return list(argv[:at]), list(argv[at + 1 :])
 
 
 def _chosen(checks: Sequence[Check], only: str) -> list[Check]:

@@ -126,9 +126,9 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
     """folder that all nodes share, for runs, keys and logs; if not given, the current folder"""
     time: str = "24:00:00"
     """time limit of the job"""
-    save_s: int = 120
+    save_s: Count = 120
     """this many seconds before the time limit, the run is saved and the job is queued again to continue"""
-    cpus: int = 1
+    cpus: Count = 1
     """CPU cores of each worker, and of the learner"""
     partition: str = ""
     """partition of the cluster; if not given, the cluster's default"""

@@ -10,9 +10,9 @@ from typing import Annotated
 
 import msgspec
 
-from protocol.errors import UsageError, did_you_mean
-from protocol.flags.fields import Flag, fields_of
-from protocol.flags.parse import HELP_FLAGS, parse_flags
+from millrace.cli.subcommands import chosen_subcommand
+from protocol.flags.fields import Flag
+from protocol.flags.parse import parse_flags
 from protocol.keys.key_folder import KeyFolder, chosen_key_folder
 from protocol.keys.keys import public_key
 
@@ -71,12 +71,8 @@ def run(argv: list[str]) -> int:
 
 def keys(argv: list[str]) -> list[str]:
     """Run a subcommand. Returns the lines to print. Raises `UsageError`."""
-    name, *rest = argv or [""]
-    if name in HELP_FLAGS:
-        return _help()
-    if name not in SUBCOMMANDS:
-        problem = f"keys {name}: no such command{did_you_mean(name, SUBCOMMANDS)};" if name else "keys: which command?"
-        raise UsageError(f"{problem} expected one of {', '.join(SUBCOMMANDS)}")
+    about = "Choose which workers of other machines may join the learners of this machine."
+    name, rest = chosen_subcommand("keys", about, SUBCOMMANDS, argv)
     flags = parse_flags(SUBCOMMANDS[name], rest, f"keys {name}")
     folder = KeyFolder(chosen_key_folder(flags.keys))
     now = datetime.now(UTC).replace(microsecond=0)
@@ -90,23 +86,6 @@ def keys(argv: list[str]) -> list[str]:
             folder.revoke(flags.name, now)
             return [f"{flags.name} is shut out; running learners cut it off within a second or two"]
     return _show(folder)
-
-
-def _help() -> list[str]:
-    commands = [(" ".join([name, *_arguments(record)]), record.__doc__) for name, record in SUBCOMMANDS.items()]
-    return [
-        f"usage: millrace keys {'|'.join(SUBCOMMANDS)} …",
-        "",
-        "Choose which workers of other machines may join the learners of this machine.",
-        "",
-        *(f"  millrace keys {usage:18} {about}" for usage, about in commands),
-        "",
-        "millrace keys COMMAND --help lists the flags of each.",
-    ]
-
-
-def _arguments(record: type[KeysFlags]) -> list[str]:
-    return [field.metavar for field in fields_of(record).values() if field.flag.positional]
 
 
 def _new(folder: KeyFolder, flags: NewFlags, now: datetime) -> list[str]:

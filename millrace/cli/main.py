@@ -18,7 +18,7 @@ import millrace
 from learner.run_folder.last_line import last_line
 from learner.run_folder.run_format import is_run_folder
 from learner.standard_streams import prepare_streams, unfailing
-from millrace.cli.commands import COMMANDS, GROUPS, HELP_FLAGS, run_command
+from millrace.cli.commands import COMMANDS, GROUPS, run_command
 from protocol.bounds import escaped, indented
 from protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
 
@@ -88,7 +88,7 @@ def _exit_code(argv: list[str]) -> int:
 
 
 def _dispatch(argv: list[str]) -> int:
-    if not argv or argv[0] in HELP_FLAGS:
+    if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return 0
     if argv[0] == "--version":

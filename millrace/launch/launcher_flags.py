@@ -12,7 +12,7 @@ from typing import TypeVar
 from learner.config.command_line import read_config
 from millrace.cli.flags import LaunchFlags
 from protocol.errors import UsageError
-from protocol.flags.parse import parse_flags
+from protocol.flags.parse import cut_at_dashes, parse_flags
 
 Flags = TypeVar("Flags", bound=LaunchFlags)
 
@@ -26,9 +26,8 @@ def read_flags(
     kind: type[Flags], argv: Sequence[str], launcher: str, set_by_launcher: Sequence[str] = SET_BY_LAUNCHER
 ) -> tuple[Flags, list[str]]:
     """The launcher's flags, and the user's flags for the learner. Raises `UsageError` if a flag is not valid."""
-    words = list(argv)
-    separator = words.index("--") if "--" in words else len(words)
-    flags, rest = parse_flags(kind, words[:separator], f"launch {launcher}"), words[separator + 1 :]
+    own, rest = cut_at_dashes(argv)
+    flags = parse_flags(kind, own, f"launch {launcher}")
     if not DNS_LABEL.fullmatch(flags.name):
         raise UsageError(f"name {flags.name!r}: expected small letters, digits and dashes, at most 40, as in my-run")
     for flag in rest:

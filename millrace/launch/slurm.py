@@ -21,9 +21,6 @@ def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
     for text in (str(folder), flags.time, flags.partition):
         if any(character.isspace() or character in "%\"'\\" for character in text):
             raise UsageError(f"{text!r}: sbatch takes no spaces, quotes or % in its options; choose another name")
-    for name in ("cpus", "save_s"):
-        if getattr(flags, name) < 1:
-            raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
     options = {
         "job-name": flags.name,
         "ntasks": str(1 + flags.workers),

@@ -49,6 +49,12 @@ def asks_for_help(argv: Sequence[str]) -> bool:
     return any(flag in argv for flag in HELP_FLAGS)
 
 
+def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The words before `--`, and those behind it."""
+    at = argv.index("--") if "--" in argv else len(argv)
+    return list(argv[:at]), list(argv[at + 1 :])
+
+
 def words_of(argv: Sequence[str], *names: str) -> dict[str, str]:
     """The words behind these flags, whatever the other flags may be."""
     found = {}

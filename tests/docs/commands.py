@@ -15,9 +15,10 @@ from learner.config.command_line import RunFlags
 from learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.cli import conform, flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
+from millrace.cli.launch import LAUNCHERS
 from protocol.errors import UsageError
 from protocol.flags.fields import fields_of
-from protocol.flags.parse import given_values, parse_flags, words_of
+from protocol.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
 from tests.docs.pages import Block
 from website.commands_page import help_of, lines_of
 from workers.flags import WorkerFlags
@@ -30,11 +31,6 @@ LISTED = re.compile(r"^\s*millrace/? {2,}")
 """The folder `millrace` in a list of folders"""
 BEFORE = {"nohup", "exec", "time", "nice", "env", "srun"}
 """Words that may stand before a command"""
-LAUNCHERS: dict[str, type[flags.LaunchFlags]] = {
-    "kubernetes": flags.KubernetesFlags,
-    "slurm": flags.SlurmFlags,
-    "ray": flags.RayFlags,
-}
 RECORDS: dict[str, type[Any]] = {
     "evaluate": flags.EvaluateFlags,
     "record": flags.RecordFlags,
@@ -124,17 +120,14 @@ def _parse(name: str, argv: list[str]) -> None:
             launcher, *rest = argv or [""]
             if launcher not in LAUNCHERS:
                 raise UsageError(f"launch {launcher}: no such launcher")
-            chosen: Any = parse_flags(LAUNCHERS[launcher], _before_dashes(rest), f"launch {launcher}")
-            _parse_run("learner", [chosen.env, *rest[len(_before_dashes(rest)) + 1 :]])
+            own, learner = cut_at_dashes(rest)
+            chosen: Any = parse_flags(LAUNCHERS[launcher], own, f"launch {launcher}")
+            _parse_run("learner", [chosen.env, *learner])
         case "bench":
             if argv and argv[0] not in BENCHMARKS:
                 raise UsageError(f"bench {argv[0]}: no such benchmark")
         case _:
-            parse_flags(RECORDS[name], _before_dashes(argv), name)
-
-
-def _before_dashes(argv: list[str]) -> list[str]:
-    return argv[: argv.index("--")] if "--" in argv else argv
+            parse_flags(RECORDS[name], cut_at_dashes(argv)[0], name)
 
 
 def _parse_run(command: str, argv: list[str]) -> None:

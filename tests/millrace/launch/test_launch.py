@@ -33,7 +33,7 @@ def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 @pytest.mark.parametrize(
     ("argv", "says"),
     [
-        ([""], "expected kubernetes, slurm or ray"),
+        ([""], "launch: which command? expected one of kubernetes, slurm, ray"),
         (["kubernetes"], "missing"),
         (["kubernetes", "CartPole-v1", "--workers", "0"], "workers: expected int >= 1, got 0"),
         (["kubernetes", "CartPole-v1", "--name", "My_Run"], "expected small letters, digits and dashes"),
