@@ -316,6 +316,12 @@ def test_only_the_command_line_prints() -> None:
             assert not [where for where in calls(source, "print") if " of " not in where]
 
 
+def test_command_lines_are_made_in_one_way() -> None:
+    """By `protocol.flags`, of a record."""
+    for source in sources(*PACKAGES):
+        assert not imported(source) & {"argparse", "click", "getopt", "optparse", "tyro"}, source
+
+
 def test_tests_do_not_sleep() -> None:
     for source in sources("tests"):
         if not source.startswith("tests/system/"):
