@@ -6,6 +6,7 @@ docs/explanation/architecture.md describes them. Every import counts, also one i
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections import defaultdict
@@ -96,6 +97,9 @@ IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `lea
     "millrace.playing": "160 ms, after the flags are known to be right",
     "workers.program": "98 ms, after the flags are known to be right",
 }
+NAME_OF_A_TYPE = r"_?[A-Z][A-Za-z]*[a-z][A-Za-z]*"
+SAME_IN_EVERY_PACKAGE = {"Pulse"}  # a function that is called again and again in a long computation
+NAME_OF_AN_ENVIRONMENT = "Identity"
 MOST_FILES = 16  # in a folder
 MOST_PARAMETERS = 8  # of a function; self and cls do not count
 MAY_TAKE_MORE = {"millrace/launch/vector.py:make_vec"}  # gymnasium's users expect keyword arguments
@@ -326,6 +330,18 @@ def test_tests_do_not_sleep() -> None:
     for source in sources("tests"):
         if not source.startswith("tests/system/"):
             assert not calls(source, "sleep")
+
+
+def test_a_name_of_a_class_or_a_type_stands_for_one_thing() -> None:
+    places: defaultdict[str, list[str]] = defaultdict(list)
+    for source in sources(*PACKAGES):
+        for node in tree(source).body:
+            match node:
+                case ast.Assign(value=ast.Call(func=ast.Name(id="TypeVar"))):
+                    pass  # it stands for something else in each function
+                case ast.ClassDef(name=name) | ast.Assign(targets=[ast.Name(id=name)]) if re.fullmatch(NAME_OF_A_TYPE, name):
+                    places[name.lstrip("_")].append(source)
+    assert {name for name, where in places.items() if len(where) > 1} == SAME_IN_EVERY_PACKAGE | {NAME_OF_AN_ENVIRONMENT}
 
 
 def test_no_folder_is_a_drawer_for_everything() -> None:

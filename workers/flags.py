@@ -10,9 +10,10 @@ import msgspec
 from msgspec import Meta
 
 from protocol.alive import CallTimeouts
+from protocol.bounds import Seconds
 from protocol.flags.fields import Flag
 
-Seconds = Annotated[float, Flag("S"), Meta(ge=0)]
+SecondsFlag = Annotated[Seconds, Flag("S")]
 HIDDEN = Flag(hidden=True)
 
 
@@ -37,15 +38,15 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     """accept only environments that are registered here: no pickled callables, and no modules to import"""
     pin: bool = False
     """with --processes: pin each worker to one CPU core"""
-    join_timeout_s: Seconds = 60.0
+    join_timeout_s: SecondsFlag = 60.0
     """leave when no learner has answered for S seconds (with --stay: never); a worker that had joined waits for its learner
     to come back, 600 s or S if that is longer
     """
-    start_timeout_s: Seconds = 600.0
+    start_timeout_s: SecondsFlag = 600.0
     """end and restart a worker if making or resetting one env copy, or making the policy, takes longer than S seconds; 0: no
     limit
     """
-    step_timeout_s: Seconds = 600.0
+    step_timeout_s: SecondsFlag = 600.0
     """end and restart a worker if a step takes longer than S seconds; 0: no limit"""
 
     parent: Annotated[int, HIDDEN] = 0

@@ -15,8 +15,8 @@ from msgspec import Meta
 
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, NotNegative, PPOConfig
 from learner.config.resume_rules import Fixed, Free
-from learner.config.rollout_config import Count, Natural, RolloutConfig, SecondsOrNever
-from protocol.bounds import MAX_SEEDS
+from learner.config.rollout_config import RolloutConfig
+from protocol.bounds import MAX_SEEDS, Count, Natural, Seconds
 from protocol.flags.fields import Flag
 
 TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
@@ -85,7 +85,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     changes the last bits of results.
     """
 
-    grace_s: Free[SecondsOrNever] = 30.0
+    grace_s: Free[Seconds] = 30.0
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
     it is undone, and the state before it is saved. 0: wait until the update has ended.
     """

@@ -11,11 +11,11 @@ from typing import Annotated, Literal
 import msgspec
 
 from learner.config.resume_rules import Fixed, Free
+from protocol.bounds import Count
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
 Schedule = Literal["constant", "linear"]
 Optimizer = Literal["rmsprop", "adam"]
 

@@ -12,15 +12,11 @@ from msgspec import Meta
 
 from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
+from protocol.bounds import Count, Natural, PositiveSeconds, Seconds
+from protocol.env_spec import Scalar
 from protocol.flags.fields import Flag
 from protocol.specs import Vector
 from protocol.wire.weight_dtypes import ActingDtype
-
-Scalar = bool | int | float | str
-Count = Annotated[int, Meta(ge=1)]
-Natural = Annotated[int, Meta(ge=0)]
-Seconds = Annotated[float, Meta(gt=0)]
-SecondsOrNever = Annotated[float, Meta(ge=0)]
 
 HEARTBEAT_S = 1.0
 STALL_TIMEOUT_S = 600.0
@@ -43,7 +39,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Wrapper of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
     literals: "my_module:Scale(by=0.5)". Repeat the flag to add more wrappers. The first one is the innermost.
     """
-    seed: Fixed[Natural] = 1
+    seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""
     workers: Free[Count] = 2
     """Number of worker processes on this machine (train only)."""
@@ -117,17 +113,17 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     # --------------------------------------------------------------------------------------------- timeouts and failures
 
-    worker_timeout_s: Free[Seconds] = 5.0
+    worker_timeout_s: Free[PositiveSeconds] = 5.0
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
     is not silent while its supervisor says that its environment is busy, however long that takes.
     """
-    no_workers_timeout_s: Free[Seconds] = 600.0
+    no_workers_timeout_s: Free[PositiveSeconds] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
-    start_timeout_s: Free[SecondsOrNever] = 600.0
+    start_timeout_s: Free[Seconds] = 600.0
     """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
     imports, takes longer than this many seconds. 0: never.
     """
-    step_timeout_s: Free[SecondsOrNever] = 600.0
+    step_timeout_s: Free[Seconds] = 600.0
     """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
     max_env_failures: Free[Natural] = 3
     """End the run when a lane fails more often than this in a row, without a rollout in between, and at the latest after 10

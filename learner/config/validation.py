@@ -23,7 +23,7 @@ from protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
 LARGEST_SEED = 2**64 - 1  # that PyTorch takes
-Record = TypeVar("Record", bound=msgspec.Struct)
+RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
 def convert(settings: dict[str, Any], where: str) -> Config:
@@ -36,7 +36,7 @@ def convert(settings: dict[str, Any], where: str) -> Config:
     return msgspec.structs.replace(_converted({**settings, "algorithm": {}}, Config, settings, where), algorithm=algorithm)
 
 
-def _converted(values: Any, kind: type[Record], settings: dict[str, Any], where: str = "") -> Record:
+def _converted(values: Any, kind: type[RecordT], settings: dict[str, Any], where: str = "") -> RecordT:
     """These values, which are among the settings, as a record. Raises `UsageError`."""
     for table in TABLES:
         if not isinstance(settings.get(table, {}), Mapping):

@@ -33,7 +33,7 @@ from protocol.envs.spaces import make_flatten
 
 log = logging.getLogger("millrace.learner")
 
-StepResult = tuple[Any, Array, Array, Array, Infos]
+GymnasiumStep = tuple[Any, Array, Array, Array, Infos]
 
 
 class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
@@ -124,7 +124,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         observation, _, _, _, infos = self._wait(AsyncState.WAITING_RESET, timeout)
         return observation, infos
 
-    def step(self, actions: Any) -> StepResult:
+    def step(self, actions: Any) -> GymnasiumStep:
         """Step every copy. Returns observations, rewards, terminated, truncated and infos.
 
         `actions` and observations have a row for each copy, as `action_space` and `observation_space`. Rewards are
@@ -143,7 +143,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._send_recv.step(self._layout.lanes if lanes is None else lanes, arrays, self._layout.rows, together=True)
         self._state = AsyncState.WAITING_STEP
 
-    def step_wait(self, timeout: float | None = None) -> StepResult:
+    def step_wait(self, timeout: float | None = None) -> GymnasiumStep:
         """Wait for the pending step. Returns and raises what `step` does, and `NoAsyncCallError` if there is none.
 
         A worker that does not answer within `timeout` seconds (`timeout_s` by default) is given up.
@@ -174,7 +174,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._send_recv.step(list(at), arrays, at, together=False)
         self._state = AsyncState.DEFAULT
 
-    def recv(self, min_envs: int = 1, timeout: float | None = None) -> StepResult:
+    def recv(self, min_envs: int = 1, timeout: float | None = None) -> GymnasiumStep:
         """The results of all copies that are ready; waits until at least `min_envs` are. 0 does not wait.
 
         Observations, rewards, terminated and truncated have a row for each of these copies, in ascending order of the
@@ -257,7 +257,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         if not of_sent and (copies := self._send_recv.copies()):
             raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
 
-    def _wait(self, awaited: AsyncState, timeout_s: float | None) -> StepResult:
+    def _wait(self, awaited: AsyncState, timeout_s: float | None) -> GymnasiumStep:
         """Wait for what is pending, which must be this."""
         if self.closed:
             raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
@@ -266,7 +266,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.DEFAULT
         return self._rows(self._send_recv.recv_all(timeout_s))
 
-    def _rows(self, ready: Ready, copies: list[int] | None = None) -> StepResult:
+    def _rows(self, ready: Ready, copies: list[int] | None = None) -> GymnasiumStep:
         """The rows of these copies, which came back, or of all."""
         batch, rows = self._batch, slice(None) if copies is None else copies
         truncated = batch.truncated.copy()

@@ -9,11 +9,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from protocol.bounds import MAX_SEEDS
+from protocol.bounds import MAX_SEEDS, Count, Natural
 from protocol.flags.fields import Flag
-
-Count = Annotated[int, Meta(ge=1)]
-Natural = Annotated[int, Meta(ge=0)]
 
 
 class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from time import monotonic
 
 from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.vector_env.env import StepResult, ZmqVectorEnv
+from learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
 from millrace.launch.endpoint import Endpoint
 from protocol.alive import WorkerExit
 from protocol.arrays import Array
@@ -71,7 +71,7 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
     return processes
 
 
-def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> StepResult:
+def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> GymnasiumStep:
     """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
     env.step_async(actions, lanes)
     return env.step_wait()

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from learner.members.bind_settings import BindSettings
 from learner.members.bound import Bound, bind, listen
 from learner.members.process_callbacks import ProcessCallbacks
-from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
+from millrace.launch.local_worker_options import FlagsOfWorker, private_address, temporary_keys
 from protocol.alive import CallTimeouts
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
@@ -43,7 +43,7 @@ class Endpoint(Bound):
     def workers(
         self,
         count: int,
-        flags: WorkerFlags,
+        flags: FlagsOfWorker,
         timeouts: CallTimeouts,
         stop_within_s: float = STOP_WITHIN_S,
         handed: Callable[[str], InheritedDescriptors | None] = lambda name: None,

@@ -26,7 +26,7 @@ from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
 LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing
 
-WorkerFlags = Callable[[str], tuple[list[str], Path | None]]
+FlagsOfWorker = Callable[[str], tuple[list[str], Path | None]]
 """Takes a worker's name. Returns the flags of its process, and the file for its stderr (None: this process's stderr)."""
 
 
@@ -64,11 +64,11 @@ def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyrin
 
 
 def no_flags(name: str) -> tuple[list[str], Path | None]:
-    """Those of a worker without options of its own, which writes to this process's stderr: a `WorkerFlags`."""
+    """Those of a worker without options of its own, which writes to this process's stderr: a `FlagsOfWorker`."""
     return [], None
 
 
-def worker_flags(config: Config, run: Path) -> WorkerFlags:
+def worker_flags(config: Config, run: Path) -> FlagsOfWorker:
     """The flags of a run's workers. Their logs are in the run folder. Raises `UsageError` if they cannot be there."""
     try:
         logs = subfolder(run, "workers")

@@ -21,7 +21,7 @@ from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import WorkerFlags
+from millrace.launch.local_worker_options import FlagsOfWorker
 from millrace.launch.vector import listen
 
 
@@ -115,7 +115,7 @@ def _acting_player(
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, settings, described)
 
 
-def _own_logs(which: PlayingWorkers, stack: ExitStack) -> WorkerFlags:
+def _own_logs(which: PlayingWorkers, stack: ExitStack) -> FlagsOfWorker:
     """No flags, and for each worker that is started here a log in a folder that is removed at the end."""
     if which.bind:
         return lambda name: ([], None)

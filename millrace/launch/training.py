@@ -25,7 +25,7 @@ from learner.run_setup import (
 )
 from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import WorkerFlags, no_flags, stopped_on_error, worker_flags
+from millrace.launch.local_worker_options import FlagsOfWorker, no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
 from workers.slots import LIMIT_VARIABLE, copies_per_machine
 from workers.supervise.supervisor import STOP_WITHIN_S
@@ -61,7 +61,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         code = "" if elsewhere else env.called_code or ("an encoder" if config.algorithm.encoder else "")
         endpoint = open_endpoint(where, config.transport, stack, code)
         observer = stack.enter_context(prometheus_observer(config))
-        flags: WorkerFlags = no_flags
+        flags: FlagsOfWorker = no_flags
         if not elsewhere:
             folder = folder or stack.enter_context(run_folder(config, None))
             if config.transport != "inproc":

@@ -28,7 +28,7 @@ from learner.vector_env.spec import RequestedCopies, observation_spaces, request
 from learner.vector_env.step_hub import StepHub
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
-from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
+from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
 from protocol.cpu_cores import usable_cores
@@ -200,7 +200,7 @@ class ListeningVectorEnv:
     """For local workers only."""
     resources: ExitStack
 
-    def start(self, flags: WorkerFlags, timeouts: CallTimeouts) -> StartedVectorEnv:
+    def start(self, flags: FlagsOfWorker, timeouts: CallTimeouts) -> StartedVectorEnv:
         """Start the local workers with these flags. `timeouts`: of a call of the environment. Call it once."""
         # They are stopped at once if there will be no hub to close.
         started = self.endpoint.workers(self.settings.local_workers, flags, timeouts, LEAVE_AT_ONCE_S, self._handed)

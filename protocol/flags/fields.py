@@ -30,7 +30,7 @@ class Flag:
     """a process of millrace gives it to another one; the help does not show it"""
 
 
-class Field(NamedTuple):
+class FlagField(NamedTuple):
     """A field of a record."""
 
     name: str
@@ -63,7 +63,7 @@ class Field(NamedTuple):
         return f"{shown}|none" if self.optional else shown
 
 
-def fields_of(record: type[msgspec.Struct]) -> dict[str, Field]:
+def fields_of(record: type[msgspec.Struct]) -> dict[str, FlagField]:
     """The fields of a record by name, those of its bases first."""
     found = {}
     for name, hint in get_type_hints(record, include_extras=True).items():
@@ -71,7 +71,7 @@ def fields_of(record: type[msgspec.Struct]) -> dict[str, Field]:
         if name in record.__struct_fields__ and not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
             marks = getattr(hint, "__metadata__", ())
             flag = next((mark for mark in marks if isinstance(mark, Flag)), Flag())
-            found[name] = Field(name, hint, kind, optional, flag)
+            found[name] = FlagField(name, hint, kind, optional, flag)
     return found
 
 

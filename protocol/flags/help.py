@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from protocol.flags.field_texts import field_texts
-from protocol.flags.fields import Field, fields_of
+from protocol.flags.fields import FlagField, fields_of
 
 WIDEST_COLUMNS = 120
 TEXT_COLUMN = 26  # where the texts begin
@@ -23,7 +23,7 @@ Group = tuple[type[msgspec.Struct] | msgspec.Struct, Sequence[str]]
 class Entry(NamedTuple):
     """A field in the help."""
 
-    field: Field
+    field: FlagField
     text: str
     default: Any
     """`msgspec.NODEFAULT` if there is none"""

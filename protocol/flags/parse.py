@@ -16,17 +16,17 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 
 from protocol.errors import UsageError, did_you_mean, unexpected_arguments
-from protocol.flags.fields import Field, fields_of
+from protocol.flags.fields import FlagField, fields_of
 from protocol.flags.help import Group, help_text
 from protocol.flags.values import read_words
 
 HELP_FLAGS = ("-h", "--help")
 EVERYWHERE = (*HELP_FLAGS, "--debug")  # flags that every command takes
 
-Record = TypeVar("Record", bound=msgspec.Struct)
+FlagsT = TypeVar("FlagsT", bound=msgspec.Struct)
 
 
-def parse_flags(record: type[Record], argv: Sequence[str], command: str) -> Record:
+def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
     """The record that these words describe. Raises `UsageError`, or SystemExit(0) after `--help`."""
     fields = fields_of(record)
     if asks_for_help(argv):
@@ -66,7 +66,7 @@ def words_of(argv: Sequence[str], *names: str) -> dict[str, str]:
 
 
 def given_values(
-    fields: Mapping[str, Field],
+    fields: Mapping[str, FlagField],
     argv: Sequence[str],
     command: str,
     hint: Callable[[str], str] = lambda setting: "",
@@ -112,7 +112,7 @@ def _parts(word: str) -> tuple[str, str, str]:
     return name.lstrip("-").replace("-", "_"), sign, value
 
 
-def _field(fields: Mapping[str, Field], name: str) -> Field | None:
+def _field(fields: Mapping[str, FlagField], name: str) -> FlagField | None:
     """The field of this flag. A field that is true or false also has a flag that begins with `no`."""
     for field in fields.values():
         if name in (field.name, field.flag.alias) or (field.kind is bool and name == f"no_{field.name}"):
@@ -128,7 +128,7 @@ def _taken(words: deque[str], most: int) -> list[str]:
     return taken
 
 
-def _arguments(fields: Sequence[Field], words: list[str], command: str) -> dict[str, Any]:
+def _arguments(fields: Sequence[FlagField], words: list[str], command: str) -> dict[str, Any]:
     given = {}
     for field in fields:
         if field.many:
@@ -142,7 +142,7 @@ def _arguments(fields: Sequence[Field], words: list[str], command: str) -> dict[
     return given
 
 
-def _unknown(fields: Mapping[str, Field], flag: str, command: str, hint: str) -> str:
+def _unknown(fields: Mapping[str, FlagField], flag: str, command: str, hint: str) -> str:
     name = flag.lstrip("-").replace("-", "_")
     if name in fields:
         argument = fields[name].metavar

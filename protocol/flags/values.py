@@ -10,10 +10,10 @@ from typing import Any, get_origin
 import msgspec
 
 from protocol.errors import UsageError
-from protocol.flags.fields import Field, choices
+from protocol.flags.fields import FlagField, choices
 
 
-def read_words(field: Field, words: Sequence[str]) -> Any:
+def read_words(field: FlagField, words: Sequence[str]) -> Any:
     """The value that these words say. Raises `UsageError`."""
     if field.optional and list(words) in (["none"], ["None"]):
         return None
@@ -29,12 +29,12 @@ def read_words(field: Field, words: Sequence[str]) -> Any:
     return _converted(field, value, shlex.join(words), strict=False)
 
 
-def read_value(field: Field, value: Any) -> Any:
+def read_value(field: FlagField, value: Any) -> Any:
     """The same value of Python's, as the field has it. Raises `UsageError`."""
     return _converted(field, value, f"{value!r:.60}", strict=True)
 
 
-def _converted(field: Field, value: Any, given: str, *, strict: bool) -> Any:
+def _converted(field: FlagField, value: Any, given: str, *, strict: bool) -> Any:
     try:
         return msgspec.convert(value, field.hint, strict=strict, dec_hook=lambda kind, plain: kind(plain))
     except msgspec.ValidationError as error:
