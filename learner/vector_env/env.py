@@ -270,7 +270,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The rows of these copies, which came back, or of all."""
         batch, rows = self._batch, slice(None) if copies is None else copies
         truncated = batch.truncated.copy()
-        truncated[list(ready.losses)] = True
+        if ready.losses:
+            truncated[list(ready.losses)] = True
         self.infos_by_copy = self._info_reader.by_copy(ready)
         infos = merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
         observation = batch.observation(copy=self.copy) if copies is None else batch.observation_of_some(copies)

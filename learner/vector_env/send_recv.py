@@ -171,7 +171,7 @@ class SendRecv:
         try:
             if self._parts.lost_lanes.unreported:
                 self.look(timeout_s)
-            while sent.under_way:
+            while not sent.all_ready:
                 hub.wait(timeout_s, together=True)
                 self.look(timeout_s)
             hub.listen_if_due()
@@ -186,7 +186,7 @@ class SendRecv:
         """Note what has come of the lanes that are under way. Never waits. Raises `EnvironmentFailed` and `NoWorkers`."""
         self._take_results()
         self._parts.hub.coordinator.raise_failures()
-        if self._sent.under_way:
+        if not self._sent.all_ready:
             self._give_up_late(timeout_s)
             self._handle_losses()
 

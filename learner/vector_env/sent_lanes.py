@@ -7,9 +7,9 @@ no other order, so that nothing overwrites its results.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import reset_order
@@ -44,8 +44,7 @@ class Asked(Enum):
     CALL = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(NamedTuple):
     """What was asked of a lane, or of several alike."""
 
     asked: AskedReset | Asked
@@ -56,8 +55,7 @@ class Sent:
     """Of copies that were lost and whose episodes end with these observations, while their new copies are reset."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ready:
+class Ready(NamedTuple):
     """The lanes that come back together. Their observations, rewards and episode ends are in the batch."""
 
     results: Mapping[int, bytes | Returned]
@@ -101,6 +99,11 @@ class SentLanes:
         self._losses: dict[int, Infos] = {}  # by copy, of those that are ready
 
     @property
+    def all_ready(self) -> bool:
+        """Whether no lane is under way."""
+        return len(self._results) == len(self.sent)
+
+    @property
     def under_way(self) -> list[int]:
         """Lanes that are not ready."""
         return [lane for lane in self.sent if lane not in self._results]
@@ -133,7 +136,7 @@ class SentLanes:
 
     def start_again(self, now: float) -> None:
         """From now on, every lane that is under way has its whole time again."""
-        self.sent = {lane: replace(sent, since_s=now) for lane, sent in self.sent.items()}
+        self.sent = {lane: sent._replace(since_s=now) for lane, sent in self.sent.items()}
 
     def ready(self, results: Mapping[int, bytes | Returned]) -> None:
         """These lanes have their results."""
