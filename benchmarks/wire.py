@@ -29,7 +29,8 @@ from rich.table import Table
 from benchmarks.packing import ATARI, STACKS, atari, encrypted, packing, rounding
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import write
-from protocol.rollout import Rollout, rollout_bytes, validate
+from protocol.rollout import Rollout, rollout_bytes
+from protocol.rows.rollout_checks import validate
 from protocol.specs import RunSpec
 from protocol.wire.codec import Buffer, encode
 from protocol.wire.compression import Packing

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import msgspec
 
+from learner.between_updates.stop_rules import reason_to_stop
 from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
 from learner.config.layers import config_of_run
 from learner.config.resume_rules import Change, OnResume, changes, refusal
-from learner.config.run_rules import reason_to_stop
 from learner.env_spaces import EnvSpaces
 from learner.run_folder.run_folder import PolicyDescription, RunFolder
 from protocol.arrays import Floats

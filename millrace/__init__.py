@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
-    from protocol.envs.env_copy import EnvCopy
+    from protocol.envs.which_copy import EnvCopy
+    from workers.copy_slots import env_copy
     from workers.envs.reset_ahead import ResetAhead
-    from workers.made_copies import env_copy
 
 __all__ = [
     "CNN",
@@ -93,7 +93,7 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "learner.callbacks.callback",
-    "EnvCopy": "protocol.envs.env_copy",
+    "EnvCopy": "protocol.envs.which_copy",
     "Evaluation": "learner.run_folder.results",
     "LoadedPolicy": "millrace.loaded_policy",
     "MLP": "millrace.policies",
@@ -110,7 +110,7 @@ _IMPORTED_WHEN_USED = {
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
     "Summary": "learner.run_folder.results",
-    "env_copy": "workers.made_copies",
+    "env_copy": "workers.copy_slots",
     "evaluate": "millrace.playing",
     "load": "millrace.loaded_policy",
     "make_vec": "millrace.launch.vector",

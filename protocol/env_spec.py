@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
@@ -25,18 +24,17 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
 from protocol.bounds import one_line
-from protocol.envs.env_copy import FIRST_COPY, EnvCopy, being_made, filled, takes_copy
-from protocol.envs.found_names import MAIN, attribute, found_by_others, in_main, last_part, name_of
+from protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of
+from protocol.envs.make_env import made_by_callable, made_by_id, made_without_checker, names_a_function, why_not_made
 from protocol.envs.unknown_ids import (
     ids_of_gymnasium,
     is_registered,
     load_plugins,
-    most_similar,
     plugin_modules,
     registered_by_plugins,
     registers,
-    what_to_write,
 )
+from protocol.envs.which_copy import filled
 from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
 from protocol.errors import UsageError, first_line
 
@@ -205,7 +203,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def called_code(self) -> str:
         """What a worker calls that the learner names or sends, in words: a factory, or a wrapper. Empty for an id alone."""
-        if self.factory is not None or _names_a_function(self.id):
+        if self.factory is not None or names_a_function(self.id):
             return "an environment factory"
         return "a wrapper" if self.wrappers else ""
 
@@ -220,8 +218,8 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         kwargs = self.kwargs_of_copy() | ({} if render_mode is None else {"render_mode": render_mode})
         if self.factory is not None:
-            return _called(self.id, self.factory.load(), kwargs)
-        env = self._made(lambda env_id: _make(env_id, kwargs))
+            return made_by_callable(self.id, self.factory.load(), kwargs)
+        env = self._made(lambda env_id: made_by_id(env_id, kwargs))
         for wrapper in self.wrappers:
             env = wrap(env, wrapper)
         return env
@@ -252,68 +250,10 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         except UsageError:
             raise
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
-            raise UsageError(_make_error(self.id, error, plugins_failed)) from error
+            raise UsageError(why_not_made(self.id, error, plugins_failed)) from error
         except Exception as error:  # its constructor raised any exception
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
-
-
-def _names_a_function(env_id: str) -> bool:
-    """Whether a worker looks for a function or a class of this name: `module:name`, where the name has no version."""
-    _, colon, name = env_id.partition(":")
-    return bool(colon) and all(word.isidentifier() for word in name.split("."))
-
-
-def _make(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """Make the environment of an id, or call the function or class that a name names."""
-    module_name, _, name = env_id.partition(":")
-    if _names_a_function(env_id):
-        function = attribute(importlib.import_module(module_name), name)
-        if callable(function) and name not in gymnasium.registry:
-            return _called(env_id, function, kwargs)
-    return _unchecked(env_id, kwargs)
-
-
-def _unchecked(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """Made without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks rows.
-
-    Its spec says what was registered, so that a dataset's environment equals the one that gymnasium makes.
-    """
-    made = gymnasium.make(env, disable_env_checker=True, **kwargs)
-    if (spec := made.spec) is not None:
-        registered = gymnasium.registry.get(spec.id, spec) if isinstance(env, str) else env
-        spec.disable_env_checker = registered.disable_env_checker
-    return made
-
-
-def _called(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """What a user's callable returns. Raises `UsageError` if that is no environment, or it asks for an unknown id."""
-    parameter = takes_copy(factory, kwargs)
-    copy = [being_made.get() or FIRST_COPY] if parameter else []
-    try:
-        made = factory(*copy, **kwargs)
-    except TypeError as error:
-        if not parameter or EnvCopy.__name__ not in str(error):
-            raise
-        raise UsageError(
-            f"environment {name}: {first_line(error)}: its argument {parameter}, which has no default, got the EnvCopy; "
-            f"if it is something else, give it: --env-kwargs {parameter} VALUE"
-        ) from error
-    except gymnasium.error.UnregisteredEnv as error:
-        raise UsageError(
-            f"environment {name}: it asks gymnasium for an id that is not registered in the worker ({first_line(error)}); "
-            "pass the id itself or gymnasium.spec(id) instead of a callable, or let it make module:id, where the module "
-            "registers it"
-        ) from error
-    if isinstance(made, gymnasium.Env):
-        return made
-    if hasattr(made, "possible_agents"):
-        advice = "; it has several agents: return a gymnasium.Env with one action and one reward for all of them"
-    elif hasattr(made, "num_envs"):
-        advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
-    else:
-        advice = ""
-    raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}{advice}")
 
 
 # -------------------------------------------------------------------------------------------- what only this process has
@@ -341,7 +281,9 @@ class _Factory:
         if self._env is None:
             env = EnvSpec(self._name, kwargs).make(render_mode)
         else:
-            env = _called(self._name, self._env, kwargs | ({} if render_mode is None else {"render_mode": render_mode}))
+            env = made_by_callable(
+                self._name, self._env, kwargs | ({} if render_mode is None else {"render_mode": render_mode})
+            )
         for wrapper in self._wrappers:
             env = wrap(env, wrapper)
         return env
@@ -380,7 +322,7 @@ class _SpecFactory:
         self._spec = _sent(spec)
 
     def __call__(self, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-        return _unchecked(self._spec, kwargs)
+        return made_without_checker(self._spec, kwargs)
 
 
 def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
@@ -472,44 +414,3 @@ def _registering_module(spec: GymnasiumSpec) -> str:
     parts = _module_of(spec).split(".")
     modules = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
     return next((module for module in modules if module != MAIN and registers(module, spec.id)), "")
-
-
-# --------------------------------------------------------------------------------------------------------------- errors
-
-
-def _make_error(env_id: str, error: Exception, plugins_failed: Sequence[str] = ()) -> str:
-    """One line for an environment that is not known, or whose package is missing.
-
-    `plugins_failed`: lines about installed packages that could not register their environments.
-    """
-    module, colon, _ = env_id.partition(":")
-    while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
-        error = error.__cause__  # gymnasium raises one of its own, which names the module of the id whatever is missing
-    says = first_line(error)
-    match error:
-        case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
-            return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
-        case gymnasium.error.DependencyNotInstalled():
-            return f"environment {env_id}: {says}"
-        case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):
-            return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
-        case ImportError():
-            return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
-        case gymnasium.error.Error() if "vector entry point" in says:
-            return (
-                f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
-            )
-        case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
-            return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that is not
-        case gymnasium.error.UnregisteredEnv() if not colon:
-            broken = f" ({'; '.join(plugins_failed)})" if plugins_failed else ""
-            return f"environment {env_id} is not registered: {what_to_write(env_id)}{broken}"
-        case gymnasium.error.UnregisteredEnv():
-            name = env_id.partition(":")[2]
-            similar = most_similar(name, vars(sys.modules.get(module, object)))
-            hint = f"; did you mean {module}:{similar}?" if similar else ""
-            return (
-                f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named{hint}"
-            )
-        case _:
-            return f"environment {env_id} cannot be made: {says}"

@@ -22,12 +22,7 @@ from msgspec import Meta
 
 from protocol.arrays import Array, Bools, Floats
 from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
-from protocol.errors import BadRollout
-from protocol.policy.masks import no_choice, not_allowed
-from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
-from protocol.specs import ActionSpec, RunSpec
-
-LARGEST_REWARD = float(np.finfo(np.float32).max)
+from protocol.specs import RunSpec
 
 
 class Episode(msgspec.Struct, frozen=True, array_like=True):
@@ -89,70 +84,6 @@ def rollout_bytes(run: RunSpec) -> int:
     steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
     flags = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
     return flags + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
-
-
-def validate(rollout: Rollout, run: RunSpec) -> None:
-    """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
-    T, N = run.rollout_steps, run.copies
-    action = run.policy.action
-    expected = [
-        Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),
-        Expected("log_prob", rollout.log_prob, (T, N), "float32"),
-        Expected("reward", rollout.reward, (T, N), "float32"),
-        Expected("terminated", rollout.terminated, (T, N), "bool"),
-        Expected("truncated", rollout.truncated, (T, N), "bool"),
-        Expected("valid", rollout.valid, (T, N), "bool"),
-        Expected("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # its row is step 0
-    ]
-    if (rollout.mask is not None) != run.masked:
-        raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")
-    if rollout.mask is not None:
-        expected.append(Expected("mask", rollout.mask, (T + 1, N, sum(action.sizes)), "bool"))
-    if len(rollout.extras) != len(run.extras):
-        raise BadRollout(f"extras: expected {len(run.extras)} arrays, got {len(rollout.extras)}")
-    for extra, array in zip(run.extras, rollout.extras, strict=True):
-        expected.append(Expected(f"extra {extra.name}", array, (T, N, *extra.shape), extra.dtype))
-    if why := wrong_observation(rollout.obs, run.policy.observation, (T + 1, N)) or wrong_arrays(expected):
-        raise BadRollout(why)
-    if not 0 <= rollout.lane < run.lanes:
-        raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
-    if rollout.mask is not None:
-        _check_mask(rollout.mask, rollout, action)
-    ended = rollout.terminated | rollout.truncated
-    if np.count_nonzero(rollout.valid[1:] == ended[:-1]):
-        t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
-        raise BadRollout(f"valid: expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
-    if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
-        raise BadRollout(f"episodes: expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
-    steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
-    for episode in rollout.episodes:
-        whole = 0 < episode.length <= steps_so_far and 0 <= episode.seconds < math.inf
-        if not (whole and abs(episode.reward) <= episode.length * LARGEST_REWARD):  # false for NaN too
-            raise BadRollout(
-                f"episode: expected a finite return of 1 to {steps_so_far} float32 rewards and a duration, got {episode}"
-            )
-        if why := wrong_facts(episode, len(run.facts)):
-            raise BadRollout(f"episode: {why}")
-
-
-def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec) -> None:
-    """Raise `BadRollout` if a mask allows no choice, or forbids what was done."""
-    if (empty := no_choice(mask, action)).any():
-        t, n = np.argwhere(empty)[0]
-        raise BadRollout(f"mask: expected an allowed choice at step {t}, copy {n}, got none")
-    if (wrong := rollout.valid & not_allowed(rollout.action, mask[:-1], action)).any():
-        t, n = np.argwhere(wrong)[0]
-        got = rollout.action[t, n].tolist()
-        raise BadRollout(f"action: expected one that the mask allows at step {t}, copy {n}, got {got}")
-
-
-def wrong_facts(episode: Episode, count: int) -> str:
-    """What is wrong with the facts of an episode; empty if they are `count` numbers, each finite or NaN (missing)."""
-    if len(episode.facts) != count:
-        return f"expected {count} facts, got {len(episode.facts)}"
-    if any(map(math.isinf, episode.facts)):
-        return f"expected finite facts, got {episode.facts}"
-    return ""
 
 
 class Batch(msgspec.Struct, frozen=True):

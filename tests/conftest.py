@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-from workers import made_copies
-
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
 
@@ -29,7 +27,7 @@ import psutil
 import pytest
 
 from tests.system.stage import preloaded
-from workers import slots
+from workers import copy_slots, slots
 from workers.slots import FILE_VARIABLE
 from workers.supervise import worker_process
 
@@ -99,8 +97,8 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
     own_slots: dict[int, slots.Slots] = {}
     monkeypatch.setattr(slots, "_of_processes", own_slots)  # copies that a test does not close hold no slots of another test
-    monkeypatch.setattr(made_copies, "_slots", {})
-    made_copies._of_process.cache_clear()
+    monkeypatch.setattr(copy_slots, "_slots", {})
+    copy_slots._of_process.cache_clear()
     threads = set(threading.enumerate())
     yield
     for own in own_slots.values():

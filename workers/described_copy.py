@@ -14,15 +14,15 @@ import gymnasium
 
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import describe_env
-from protocol.envs.env_copy import FIRST_COPY
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.envs.vectorized import make_native, vector_alternative
+from protocol.envs.which_copy import FIRST_COPY
 from protocol.errors import EnvironmentFailed, UsageError, first_line
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec
 from workers.activity import DESCRIBING, activity
-from workers.made_copies import close_copy, make_copy
+from workers.copy_slots import close_copy, make_copy
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 
 from learner.between_updates.run_parts import RunParts
-from learner.config.run_rules import EvaluationSize, evaluation_size, final_evaluation_size
+from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
 from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Best, Evaluation
 from protocol.errors import UsageError

@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from learner.between_updates.stop_rules import reason_to_stop
 from learner.config.config import Config
-from learner.config.run_rules import checkpoint_is_due, reason_to_stop
 from learner.rollouts.hub import HubSnapshot
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_state import RunState
@@ -114,3 +114,11 @@ class Tally:
     def wall_s(self, snapshot: HubSnapshot) -> float:
         """Seconds of training."""
         return self.wall_before_s + time.monotonic() - self._started_s - snapshot.evaluate_s
+
+
+def checkpoint_is_due(config: Config, *, since_last_s: float, updates: int) -> bool:
+    """Whether to write a checkpoint, `since_last_s` after the last one and after `updates` in all.
+
+    The first update is saved at once: until then a killed run has nothing to resume.
+    """
+    return updates == 1 or since_last_s >= config.checkpoint_every_s

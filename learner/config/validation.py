@@ -11,9 +11,9 @@ import msgspec
 
 from learner.config.algorithm_names import settings_record
 from learner.config.config import TABLES, Config
+from learner.config.evaluation_size import evaluation_size
 from learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
 from learner.config.rollout_config import RolloutConfig
-from learner.config.run_rules import evaluation_size
 from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name

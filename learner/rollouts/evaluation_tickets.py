@@ -22,8 +22,9 @@ from learner.run_folder.results import Evaluation, fact_means
 from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.random_streams import Purpose, env_seed
-from protocol.rollout import LARGEST_REWARD, Episode, wrong_facts
+from protocol.rollout import Episode
 from protocol.rows.played import reason_to_reject
+from protocol.rows.rollout_checks import LARGEST_REWARD, wrong_facts
 from protocol.specs import PolicySpec
 
 FIRST_TICKET = 1 << 52

@@ -35,7 +35,8 @@ from protocol.arrays import Array
 from protocol.bounds import Stages, one_line
 from protocol.errors import BadRollout, Stalled
 from protocol.messages import Evaluated, Rollout, Status, ToLearner
-from protocol.rollout import rollout_bytes, validate
+from protocol.rollout import rollout_bytes
+from protocol.rows.rollout_checks import validate
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.weight_dtypes import ActingDtype, to_wire_dtype
 

@@ -43,7 +43,7 @@ STRIKES = 3  # rollouts or messages that could not be used, after which a worker
 class TicketCoordinator(Coordinator[CollectingMember]):
     """Members, their lanes, and what they are asked for.
 
-    A rollout that `receive` is given must have passed `protocol.rollout.validate`; else call `reject_rollout`.
+    A rollout that `receive` is given must have passed `protocol.rows.rollout_checks.validate`; else call `reject_rollout`.
     """
 
     def __init__(

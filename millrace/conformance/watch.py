@@ -45,7 +45,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.rollout import validate
+from protocol.rows.rollout_checks import validate
 from protocol.rows.stepped import wrong_rows
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 

@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from protocol.arrays import Array, Floats
 from protocol.bounds import Stages
-from protocol.envs.env_copy import EnvCopy
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_converter_of
 from protocol.envs.vectorized import make_native
+from protocol.envs.which_copy import EnvCopy
 from protocol.errors import EnvironmentFailed, PolicyFailed
 from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.masks import stored_leaves
@@ -37,7 +37,7 @@ from workers.copies.envpool_copies import EnvpoolCopies
 from workers.copies.open_lanes import OpenLanes
 from workers.copies.row_writers import write_numbers
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
-from workers.made_copies import make_copy
+from workers.copy_slots import make_copy
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""

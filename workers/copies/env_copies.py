@@ -19,9 +19,9 @@ from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array
 from protocol.envs.action_masks import without_mask
-from protocol.envs.env_copy import FIRST_COPY, EnvCopy
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from protocol.envs.vectorized import check_resets_next_step
+from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
 from protocol.specs import RunSpec
@@ -32,8 +32,8 @@ from workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.copies.mask_reader import MaskReader
 from workers.copies.row_writers import missing_leaf, read_leaves
+from workers.copy_slots import close_copy
 from workers.envs.reset_ahead import ResetAhead
-from workers.made_copies import close_copy
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]

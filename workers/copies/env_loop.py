@@ -17,7 +17,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
-from protocol.envs.env_copy import FIRST_COPY, EnvCopy
+from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
 from workers.activity import (
     DOING,
@@ -30,7 +30,7 @@ from workers.activity import (
     activity,
 )
 from workers.copies.env_errors import CopyFailed
-from workers.made_copies import close_copy, make_copy
+from workers.copy_slots import close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 CopyInfos = list[tuple[int, dict[str, Any]]]

@@ -21,7 +21,7 @@ from workers.copies.env_copies import Leaves, StepResult
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Pulse
 from workers.copies.facts import facts_of_copies, of_ended
-from workers.made_copies import close_copy, give_back
+from workers.copy_slots import close_copy, give_back
 
 
 class EnvpoolCopies:

@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from protocol.arrays import Array
-from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import action_converter_of
+from protocol.envs.which_copy import EnvCopy
 from protocol.errors import UsageError
 from protocol.messages import Evaluate, Evaluated
 from protocol.policy.called_policy import CalledPolicy

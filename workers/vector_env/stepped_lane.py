@@ -16,8 +16,8 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.envs.description import describe_env
-from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
+from protocol.envs.which_copy import EnvCopy
 from protocol.errors import UsageError
 from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec

@@ -32,7 +32,8 @@ from protocol.messages import (
     ToLearner,
     Welcome,
 )
-from protocol.rollout import Episode, validate
+from protocol.rollout import Episode
+from protocol.rows.rollout_checks import validate
 from protocol.token_bucket import TokenBucket
 from protocol.wire.codec import decode_to_learner, decode_to_observer, decode_to_worker, encode
 from protocol.wire.learner_link import LearnerLink

@@ -10,7 +10,7 @@ import gymnasium
 import pytest
 
 from protocol.env_spec import AllowedCode, EnvSpec
-from protocol.envs.env_copy import EnvCopy, being_made, filled, takes_copy
+from protocol.envs.which_copy import EnvCopy, being_made, filled, takes_copy
 from protocol.errors import UsageError
 from workers.envs.toy import Countdown
 

@@ -15,7 +15,8 @@ from gymnasium.vector.utils import batch_space
 from protocol.arrays import Array
 from protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
 from protocol.errors import BadRollout, UsageError
-from protocol.rollout import Episode, Rollout, validate, wrong_facts
+from protocol.rollout import Episode, Rollout
+from protocol.rows.rollout_checks import validate, wrong_facts
 from protocol.specs import RunSpec
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS

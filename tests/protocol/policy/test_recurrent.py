@@ -27,7 +27,8 @@ from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import advance, zero_state
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
-from protocol.rollout import Rollout, stack_rollouts, validate
+from protocol.rollout import Rollout, stack_rollouts
+from protocol.rows.rollout_checks import validate
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.in_process.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared

@@ -20,7 +20,8 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.messages import Evaluate
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
-from protocol.rollout import Episode, Rollout, validate
+from protocol.rollout import Episode, Rollout
+from protocol.rows.rollout_checks import validate
 from protocol.specs import PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
 from workers.conversation.held import Assignment

@@ -18,7 +18,8 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import BadRollout, EnvironmentFailed
 from protocol.messages import Evaluate
 from protocol.policy.masks import choices
-from protocol.rollout import Rollout, stack_rollouts, validate
+from protocol.rollout import Rollout, stack_rollouts
+from protocol.rows.rollout_checks import validate
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
 from tests.support.users_code.mask_envs import SIZES, InInfo, InObservation, Parts

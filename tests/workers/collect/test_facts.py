@@ -14,7 +14,8 @@ from gymnasium.vector import SyncVectorEnv
 
 from protocol.errors import EnvironmentFailed
 from protocol.messages import Evaluate
-from protocol.rollout import Rollout, validate
+from protocol.rollout import Rollout
+from protocol.rows.rollout_checks import validate
 from protocol.specs import RunSpec
 from tests.support.in_process.collectors import (
     collect,

@@ -22,7 +22,7 @@ from protocol.specs import DescribeSpec, RunSpec, Vector
 from protocol.wire.plain_values import pack
 from tests.support.in_process.collectors import no_pulse, run_of
 from tests.support.in_process.described import step_spec
-from workers import made_copies
+from workers import copy_slots
 from workers.collect.collector import open_env_copies
 from workers.described_copy import describing
 from workers.envs.reset_ahead import ResetAhead
@@ -80,15 +80,15 @@ gymnasium.register("Asks-v0", entry_point=f"{MODULE}:Asks", vector_entry_point=f
 def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[int]]:
     """The slots that are taken."""
     machine = Slots()
-    monkeypatch.setattr(made_copies, "slots", lambda: machine)
+    monkeypatch.setattr(copy_slots, "slots", lambda: machine)
     monkeypatch.setattr(Asks, "made", [])
     monkeypatch.setattr(Asks, "taken", machine.taken)
     monkeypatch.setattr(Asks, "closed_late", [])
-    monkeypatch.setattr(made_copies, "_slots", {})
-    made_copies._of_process.cache_clear()
+    monkeypatch.setattr(copy_slots, "_slots", {})
+    copy_slots._of_process.cache_clear()
     yield machine.taken
     assert not Asks.closed_late, "slots that were given back before their copy was closed"
-    made_copies._of_process.cache_clear()
+    copy_slots._of_process.cache_clear()
 
 
 def run_with(vector: Vector = "loop") -> RunSpec:
@@ -222,7 +222,7 @@ def test_each_thread_makes_its_own_copy() -> None:
         return Countdown(3)
 
     found: list[EnvCopy] = []
-    threads = [threading.Thread(target=made_copies.make_copy, args=(EnvCopy(number), make)) for number in (5, 9)]
+    threads = [threading.Thread(target=copy_slots.make_copy, args=(EnvCopy(number), make)) for number in (5, 9)]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -4,8 +4,10 @@ from typing import Any
 
 import pytest
 
+from learner.between_updates.stop_rules import reason_to_stop
+from learner.between_updates.tally import checkpoint_is_due
 from learner.config.config import Config
-from learner.config.run_rules import checkpoint_is_due, evaluation_size, final_evaluation_size, reason_to_stop
+from learner.config.evaluation_size import evaluation_size, final_evaluation_size
 
 
 def reason(config: Config, **numbers: Any) -> str | None:

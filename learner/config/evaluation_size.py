@@ -1,4 +1,4 @@
-"""Decisions by settings and numbers: when a run stops, when a checkpoint is due, how large an evaluation is. Pure."""
+"""How large an evaluation is, by settings and numbers. Pure."""
 
 from __future__ import annotations
 
@@ -8,31 +8,6 @@ from learner.config.config import Config
 
 MOST_EPISODES, FEWEST_EPISODES = 100, 10  # of an evaluation whose number of episodes is not set
 LONGEST_EPISODE = 10  # its episodes are cut after so many times the mean length of training, if there is no time limit
-
-
-def reason_to_stop(
-    config: Config, *, env_steps_after_next_update: int, evaluation_return: float | None, training_return: float | None
-) -> str | None:
-    """Why the run should end now, or None.
-
-    `evaluation_return`: mean return of the newest greedy evaluation, if there was one. `training_return`: mean return of
-    the last episodes of training, if there were enough of them.
-    """
-    target = config.target_return
-    if target is not None and evaluation_return is not None and evaluation_return >= target:
-        return f"target return {target:g} reached"
-    target = config.target_mean_return
-    if target is not None and training_return is not None and training_return >= target:
-        return f"mean return {target:g} of the last episodes reached"
-    return "all steps done" if env_steps_after_next_update > config.steps else None
-
-
-def checkpoint_is_due(config: Config, *, since_last_s: float, updates: int) -> bool:
-    """Whether to write a checkpoint, `since_last_s` after the last one and after `updates` in all.
-
-    The first update is saved at once: until then a killed run has nothing to resume.
-    """
-    return updates == 1 or since_last_s >= config.checkpoint_every_s
 
 
 class EvaluationSize(NamedTuple):

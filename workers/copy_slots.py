@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, TypeVar
 
-from protocol.envs.env_copy import EnvCopy, being_made
+from protocol.envs.which_copy import EnvCopy, being_made
 from protocol.errors import UsageError
 from workers.activity import CLOSING, activity
 from workers.slots import slots

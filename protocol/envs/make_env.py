@@ -1,0 +1,115 @@
+"""Makes an environment: by `gymnasium.make`, or by what a user's callable returns; and says in one line why it cannot."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
+
+from protocol.envs.found_names import attribute
+from protocol.envs.unknown_ids import (
+    most_similar,
+    what_to_write,
+)
+from protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
+from protocol.errors import UsageError, first_line
+
+
+def names_a_function(env_id: str) -> bool:
+    """Whether a worker looks for a function or a class of this name: `module:name`, where the name has no version."""
+    _, colon, name = env_id.partition(":")
+    return bool(colon) and all(word.isidentifier() for word in name.split("."))
+
+
+def made_by_id(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Make the environment of an id, or call the function or class that a name names."""
+    module_name, _, name = env_id.partition(":")
+    if names_a_function(env_id):
+        function = attribute(importlib.import_module(module_name), name)
+        if callable(function) and name not in gymnasium.registry:
+            return made_by_callable(env_id, function, kwargs)
+    return made_without_checker(env_id, kwargs)
+
+
+def made_without_checker(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Made without gymnasium's checker: it costs a tenth of a CartPole step, and `rollout_checks.validate` checks rows.
+
+    Its spec says what was registered, so that a dataset's environment equals the one that gymnasium makes.
+    """
+    made = gymnasium.make(env, disable_env_checker=True, **kwargs)
+    if (spec := made.spec) is not None:
+        registered = gymnasium.registry.get(spec.id, spec) if isinstance(env, str) else env
+        spec.disable_env_checker = registered.disable_env_checker
+    return made
+
+
+def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """What a user's callable returns. Raises `UsageError` if that is no environment, or it asks for an unknown id."""
+    parameter = takes_copy(factory, kwargs)
+    copy = [being_made.get() or FIRST_COPY] if parameter else []
+    try:
+        made = factory(*copy, **kwargs)
+    except TypeError as error:
+        if not parameter or EnvCopy.__name__ not in str(error):
+            raise
+        raise UsageError(
+            f"environment {name}: {first_line(error)}: its argument {parameter}, which has no default, got the EnvCopy; "
+            f"if it is something else, give it: --env-kwargs {parameter} VALUE"
+        ) from error
+    except gymnasium.error.UnregisteredEnv as error:
+        raise UsageError(
+            f"environment {name}: it asks gymnasium for an id that is not registered in the worker ({first_line(error)}); "
+            "pass the id itself or gymnasium.spec(id) instead of a callable, or let it make module:id, where the module "
+            "registers it"
+        ) from error
+    if isinstance(made, gymnasium.Env):
+        return made
+    if hasattr(made, "possible_agents"):
+        advice = "; it has several agents: return a gymnasium.Env with one action and one reward for all of them"
+    elif hasattr(made, "num_envs"):
+        advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
+    else:
+        advice = ""
+    raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}{advice}")
+
+
+def why_not_made(env_id: str, error: Exception, plugins_failed: Sequence[str] = ()) -> str:
+    """One line for an environment that is not known, or whose package is missing.
+
+    `plugins_failed`: lines about installed packages that could not register their environments.
+    """
+    module, colon, _ = env_id.partition(":")
+    while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
+        error = error.__cause__  # gymnasium raises one of its own, which names the module of the id whatever is missing
+    says = first_line(error)
+    match error:
+        case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
+            return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
+        case gymnasium.error.DependencyNotInstalled():
+            return f"environment {env_id}: {says}"
+        case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):
+            return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
+        case ImportError():
+            return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
+        case gymnasium.error.Error() if "vector entry point" in says:
+            return (
+                f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
+            )
+        case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
+            return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that is not
+        case gymnasium.error.UnregisteredEnv() if not colon:
+            broken = f" ({'; '.join(plugins_failed)})" if plugins_failed else ""
+            return f"environment {env_id} is not registered: {what_to_write(env_id)}{broken}"
+        case gymnasium.error.UnregisteredEnv():
+            name = env_id.partition(":")[2]
+            similar = most_similar(name, vars(sys.modules.get(module, object)))
+            hint = f"; did you mean {module}:{similar}?" if similar else ""
+            return (
+                f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named{hint}"
+            )
+        case _:
+            return f"environment {env_id} cannot be made: {says}"
