@@ -16,8 +16,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-import msgspec
-
 from learner.members.events import (
     Event,
     Failed,
@@ -30,7 +28,7 @@ from learner.members.events import (
 from learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import key_of_peer, name_for_people, worker_name
 from protocol.alive import NO_ENVIRONMENT_CODE
-from protocol.bounds import Stage, Stages, escaped, one_line
+from protocol.bounds import Stage, Stages, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
@@ -111,7 +109,7 @@ class Member:
     ) -> Failed:
         """The event that says that the worker failed, in this lane if it is known."""
         lanes = (lane,) if lane in self.lanes else tuple(sorted(self.lanes))
-        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, self.stepped, spare)
+        return kind(self.hello.worker, self.hello.host, error, traceback, lanes, self.stepped, spare)
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
         """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
@@ -127,14 +125,14 @@ class Member:
         """
         if self.heartbeat is None and not self.hello.is_first_attempt:
             self.stages_before = heartbeat.stages
-        self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
+        self.heartbeat = heartbeat
         self.stepped |= heartbeat.steps > 0
         steps, since_s = self.measured
-        if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
-            self.steps_per_s = max(0, heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
+        if self.heard_s - since_s >= MEASURE_S:  # several may be read at once
+            self.steps_per_s = (heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
             self.measured = heartbeat.steps, self.heard_s
-        held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
-        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and seen > sent_at]
+        held = set(heartbeat.tickets)
+        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
         """The late actions since the last heartbeat. Those before this session belong to an earlier one.
@@ -356,8 +354,7 @@ class Membership(Generic[M]):
         member.state = TABLE[member.state][event]
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
-        if self._of_process.get(process := (member.hello.worker, member.hello.process_nonce)) is member:
-            del self._of_process[process]
+        self._of_process.pop((member.hello.worker, member.hello.process_nonce), None)
         worker, tickets = member.hello.worker, len(member.tickets)
         left = WorkerLeft(worker, why, tickets, event is Goodbye)
         self.events.append(left if refusal is None else WorkerRefused(worker, refusal, tickets))

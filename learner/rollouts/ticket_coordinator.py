@@ -145,8 +145,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        mine = [number for number in heartbeat.tickets if number in member.tickets]
-        out = self.weights.again(member, heartbeat, self.rollouts.versions(mine) | self.evaluation.versions(mine))
+        named = self.rollouts.versions(heartbeat.tickets) | self.evaluation.versions(heartbeat.tickets)
+        out = self.weights.again(member, heartbeat, named)
         orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
         return out + self.weights.after(orders, self.members)
 

@@ -30,7 +30,9 @@ MUTATIONS = {
         "return self.weights.after(out + orders, self.members)",
         "return out + orders if self.evaluation.pending else self.weights.after(out + orders, self.members)",
     ),
-    "the lost weights of an evaluation are not sent again": Mutation(COORDINATOR, " | self.evaluation.versions(mine)", ""),
+    "the lost weights of an evaluation are not sent again": Mutation(
+        COORDINATOR, " | self.evaluation.versions(heartbeat.tickets)", ""
+    ),
     "a lost order to evaluate is not sent again": Mutation(COORDINATOR, " + self.evaluation.send(member, lost)", ""),
     "the evaluation's tickets of a lost worker are kept": Mutation(
         COORDINATOR, "dealer.lose(member, number)", "dealer is self.rollouts and dealer.lose(member, number)"
