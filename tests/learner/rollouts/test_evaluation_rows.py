@@ -80,12 +80,57 @@ def test_rows_before_an_answer_that_they_do_not_fit_are_played_again() -> None:
     played.learner.says(A, played.answer(2))
     assert played.learner.coordinator.evaluation.done
     assert played.taken == [(0, 0), (0, 1)]
+    assert played.strikes() == 0, "the network may lose a message"
+
+
+def test_what_another_worker_says_of_a_ticket_changes_nothing() -> None:
+    played = Played()
+    session = played.learner.session(B)
+    for step in range(5):
+        played.learner.says(B, msgspec.structs.replace(played.rows(step), session=session))
+    played.learner.says(B, msgspec.structs.replace(played.answer(5), session=session))
+    assert not played.learner.coordinator.evaluation.done
+    played.learner.says(A, played.rows(0))
+    played.learner.says(A, played.answer(1))
+    assert played.learner.coordinator.evaluation.done
+    assert (played.taken, played.strikes(B)) == ([(0, 0)], 0)
+
+
+def test_rows_that_were_not_asked_for_are_not_kept() -> None:
+    """A worker could send as many as an episode may have, of each ticket."""
+    played = Played()
+    evaluation = played.learner.coordinator.evaluation
+    evaluation.end()
+    plan = EvaluationPlan((7,), 1, MOST_STEPS)
+    played.order = played.order_in(played.learner.coordinator.begin_evaluation(plan), A)
+    played.learner.says(A, played.rows(0))
+    assert evaluation._rows == {}
+    played.learner.says(A, played.answer(1))
+    assert evaluation.done
 
 
 def test_an_answer_holds_nothing_but_what_was_asked_for() -> None:
     played = Played()
     episode = Episode(0.0, 1, 0.0, (1.0,) * 60_000)
-    played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(episode,)))
+    outs = played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(episode,)))
+    assert played.strikes() == 1
+    assert [order.ticket for order in of(outs, Evaluate)] == [played.order.ticket], "it is not played again"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"episodes": ()},
+        {"cut": ()},
+        {"episodes": (Episode(0.0, MOST_STEPS + 1, 0.0),)},
+        {"episodes": (Episode(math.nan, 1, 0.0),)},
+        {"episodes": (Episode(1e39, 1, 0.0),)},
+    ],
+    ids=["no episode", "no mark", "too long", "no return", "a return of no reward"],
+)
+def test_an_answer_that_no_player_gives_is_a_strike(changes: dict[str, object]) -> None:
+    played = Played()
+    played.learner.says(A, msgspec.structs.replace(played.answer(1), **changes))
     assert played.strikes() == 1
 
 
@@ -134,12 +179,13 @@ def test_frames_have_one_size_and_end_at_a_limit() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
+        {"episode": 1},
         {"obs": (np.full((2, 1), np.nan, np.float32),)},
         {"action": np.array([2])},
         {"action": np.array([-1])},
         {"terminated": np.array([255], np.uint8).view(bool)},
     ],
-    ids=["observation", "choice", "negative choice", "flag"],
+    ids=["episode", "observation", "choice", "negative choice", "flag"],
 )
 def test_rows_hold_only_values_that_a_dataset_may_hold(changes: dict[str, object]) -> None:
     played = Played()

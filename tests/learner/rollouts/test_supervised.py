@@ -147,6 +147,11 @@ def test_status_says_what_a_worker_does_until_its_supervisor_is_silent() -> None
     speaks(learner, activity("resetting", 40.0))
     (row,) = learner.coordinator.membership.status(learner.now + 1.5)
     assert (row.doing, row.doing_s) == ("resetting", 41.5)
+    assert row.silent_s == 1.5
+    learner.now += 2.0
+    speaks(learner, activity("resetting", 42.0))
+    (row,) = learner.coordinator.membership.status(learner.now)
+    assert row.silent_s == 2.0, "the worker itself says nothing"
     (row,) = learner.coordinator.membership.status(learner.now + 60.0)
     assert (row.doing, row.doing_s) == ("", 0.0)
 
@@ -179,11 +184,20 @@ def test_a_run_in_which_nothing_happens_stands_still() -> None:
     assert verdict.refuse == ()
 
 
+def test_time_in_which_the_learner_did_not_wait_is_no_standstill() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made = watch(learner, CallTimeouts(0.0, 0.0))
+    learner.now += 10 * STALL_S
+    made.begin(learner.now)
+    assert made.check(learner.now + STALL_S, 0) is None
+
+
 def test_env_steps_calls_and_rollouts_are_progress() -> None:
     learner = Learner()
     learner.joins(A)
     made, arrived = watch(learner, CallTimeouts(0.0, 0.0)), 0
-    for number, kind in enumerate(["steps", "calls", "rollouts"] * 2, 1):
+    for number, kind in enumerate(["steps", "steps", "calls", "calls", "rollouts", "rollouts"], 1):
         learner.now += STALL_S - 1
         if kind == "steps":
             beats(learner, A, number)
@@ -210,8 +224,18 @@ def test_a_call_within_its_timeout_is_no_standstill_and_one_beyond_it_is() -> No
     learner.now += STALL_S + 1
     speaks(learner, activity("stepping", STEP_S + ENDED_WITHIN_S - 1))
     assert made.check(learner.now, 0) is None
+    assert made.check(learner.now + 2, 0) is not None, "the call has lasted since its supervisor spoke"
+    learner.now += STALL_S + 3
     speaks(learner, activity("stepping", STEP_S + ENDED_WITHIN_S + 1))
     assert made.check(learner.now, 0) is not None
+
+
+def test_a_call_of_which_its_supervisor_speaks_no_more_is_a_standstill() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made = watch(learner, CallTimeouts(10 * STALL_S, 10 * STALL_S))
+    speaks(learner, activity())
+    assert made.check(learner.now + STALL_S + 1, 0) is not None
 
 
 def test_a_worker_that_hoards_its_tickets_is_refused_and_another_gets_them() -> None:
@@ -246,6 +270,23 @@ def test_a_worker_that_claims_progress_is_refused_when_its_budget_is_spent() -> 
         assert learner.now < budget_s + STALL_S
     assert learner.now > budget_s
     assert [member.peer for member in verdict.refuse] == [A]
+
+
+def test_the_oldest_ticket_of_a_worker_counts() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    made, run = watch(learner), learner.coordinator.run
+    learner.now += 2 * run.copies * (2 * STEP_S + run.rollout_steps * STEP_S) - 1
+    assert made.check(learner.now, "progress") is None
+    learner.coordinator.reject_rollout(A, learner.rollout_of(1), "broken", learner.now)  # the other lane's; dealt again
+    assert made.check(learner.now, "more progress") is None
+    assert made.check(learner.now + 2, "still more") is not None
+
+
+def test_each_step_may_be_a_reset_that_takes_longer() -> None:
+    learner = Learner()
+    learner.joins(A)
+    assert watch(learner, CallTimeouts(10 * STEP_S, STEP_S))._longest_s(copies=1, steps=7) > 7 * 10 * STEP_S
 
 
 def test_without_timeouts_there_is_no_budget() -> None:

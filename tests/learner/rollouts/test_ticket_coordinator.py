@@ -21,6 +21,7 @@ from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     Drain,
+    Evaluate,
     Failure,
     Goodbye,
     Heartbeat,
@@ -226,9 +227,9 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
 
 def test_a_process_that_was_replaced_joins_again_but_two_do_not_take_a_name_from_each_other_for_ever() -> None:
     learner = Learner(lanes=1)
-    for pid, attempt in ((1, 1), (2, 1), (1, 2), (2, 2)):
+    for pid, attempt in ((1, 1), (1, 2), (2, 1), (1, 3), (2, 2)):  # who joins again takes its name from nobody
         assert kinds(learner.joins(A, pid=pid, attempt=attempt), A) == [Welcome, Collect, Weights]
-    (refuse,) = of(learner.joins(A, pid=1, attempt=3), Refuse)
+    (refuse,) = of(learner.joins(A, pid=1, attempt=4), Refuse)
     assert "give each worker a name of its own" in refuse.reason
     assert learner.coordinator.members[A].hello.pid == 2
 
@@ -370,6 +371,27 @@ def test_a_lane_that_is_to_move_finishes_what_it_was_dealt_and_the_others_go_on(
     (permit,) = permits(outs, B)
     assert (permit.lane, permit.incarnation, permit.sequence) == (moving, 1, 0)
     assert [collect.version for collect in of(outs, Collect, B)] == [1]
+
+
+def test_a_lane_that_is_to_move_moves_when_its_last_rollout_is_bad() -> None:
+    """Else nobody would collect its round."""
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B)
+    (moving,) = [lane.number for lane in learner.coordinator.rollouts.lanes if lane.moving]
+    (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == moving]
+    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(last), "broken", 0.0))
+    assert [permit.lane for permit in permits(outs, B)] == [moving]
+
+
+def test_rounds_of_lost_tickets_are_dealt_again_in_their_order() -> None:
+    learner = Learner(lanes=1, max_lag=2)
+    learner.joins(A)
+    learner.coordinator.reject_rollout(A, learner.rollout_of(0), "broken", 0.0)  # its round has the last ticket now
+    process_ends(learner.coordinator, "a", "killed")
+    learner.joins(B)
+    held = learner.coordinator.rollouts.held
+    assert [held[number].round for number in learner.tickets(B)] == [0, 1, 2]
 
 
 def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
@@ -638,6 +660,22 @@ def test_a_lost_collect_is_said_again_only_when_a_reply_said_after_it_has_been_s
     assert learner.coordinator.rollouts.ledger.issued == 1
 
 
+def test_a_lost_order_to_evaluate_and_its_weights_are_said_again_only_when_a_reply_said_after_them_has_been_seen() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.deliver_all()
+    learner.take()
+    learner.coordinator.publish(1, PARAMETERS, BUFFERS)
+    outs = learner.coordinator.begin_evaluation(EvaluationPlan(seeds=(1,), copies=1, most_steps=10))
+    assert kinds(outs, A) == [Evaluate, Weights]
+    (order,) = of(outs, Evaluate)
+    for replies, again in ((0, 0), (1, 1), (1, 0), (2, 1)):
+        outs = learner.beats(A, versions=[0], tickets=[], replies=replies)
+        assert of(outs, Evaluate) == [order] * again
+        assert [weights.version for weights in of(outs, Weights)] == [1] * again
+    assert of(learner.beats(A, versions=[0], tickets=[order.ticket]), Weights) != []
+
+
 def test_lost_weights_are_said_again_only_when_a_reply_said_after_them_has_been_seen() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
@@ -851,7 +889,7 @@ def test_a_silent_worker_is_forgotten_by_tick() -> None:
     assert learner.coordinator.events[-1] == WorkerLeft("a", "silent for 5 s", 1, False)
 
 
-@pytest.mark.parametrize("kind", ["hello", "heartbeat", "rollout", "rubbish"])
+@pytest.mark.parametrize("kind", ["hello", "heartbeat", "rollout", "bad rollout", "rubbish"])
 def test_any_message_of_the_session_is_a_sign_of_life(kind: str) -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
@@ -863,6 +901,8 @@ def test_any_message_of_the_session_is_a_sign_of_life(kind: str) -> None:
             learner.beats(A)
         case "rollout":
             learner.delivers(0)
+        case "bad rollout":
+            learner.coordinator.reject_rollout(A, learner.rollout_of(0), "broken", learner.now)
         case _:
             learner.coordinator.reject_message(A, "rubbish", learner.now)
     learner.coordinator.remove_silent(4.0 + TIMEOUT_S)
@@ -874,6 +914,7 @@ def test_drain_asks_everybody_to_leave_and_deals_no_more() -> None:
     learner.joins(A)
     learner.joins(B)
     assert learner.balanced(learner.coordinator.drain("finished")) == [(A, Drain("finished")), (B, Drain("finished"))]
+    assert learner.coordinator.drain("finished") == [], "each was asked already"
     learner.deliver_all()
     issued = learner.coordinator.rollouts.ledger.issued
     learner.take()
@@ -938,6 +979,18 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
     assert [counts[f"transitions_{name}"] for name in named] == [1, 1, 1, 1]
     assert counts["transitions_received"] == 4
     assert counts["transitions_waiting"] == 0
+
+
+def test_rollouts_of_an_update_that_was_not_made_are_lost_and_their_transitions_late() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.deliver_all()
+    rollouts = learner.coordinator.rollouts
+    rollouts.not_used(rollouts.take() or [])
+    learner.balanced([])
+    counts = rollouts.ledger.counts()
+    named = ("used", "lost", "outstanding", "transitions_used", "transitions_late", "transitions_waiting")
+    assert [counts[name] for name in named] == [0, 2, 0, 0, 2, 0]
 
 
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:

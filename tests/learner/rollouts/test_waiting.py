@@ -118,6 +118,8 @@ def test_with_a_lag_every_lane_that_may_bring_the_next_rollout_counts_once() -> 
     run.does(A, "stepping", 2.6)
     run.does(B, "stepping", 0.1)
     assert run.line == "waiting 3 s for lane 0 (worker a on host-of-a: in step for 3 s) and 1 more"
+    run.learner.delivers(run.learner.tickets(A)[0])  # the rollout of the next update; that of the one after is outstanding
+    assert run.line == "waiting 3 s for lane 1 (worker b on host-of-b: 0.0 steps/s)"
 
 
 @pytest.mark.parametrize(("max_lag", "idle"), [(0, ", 1 of 1 workers waiting for weights"), (1, "")])
