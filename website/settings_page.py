@@ -15,6 +15,7 @@ from learner.config.command_line import BASIC, GROUPS, LAYERS, RunFlags
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.resume_rules import OnResume, declared
+from protocol.bounds import LARGEST
 from protocol.flags.field_texts import field_texts
 from website.tables import anchored
 
@@ -138,10 +139,14 @@ def _bare(hint: Any) -> tuple[Any, list[str]]:
     return kind, notes
 
 
+NO_BOUNDS = (LARGEST, 1e9)  # that a reader of the page would meet
+
+
 def _bounds(meta: msgspec.Meta) -> Iterator[str]:
-    if meta.ge is not None and meta.le is not None:
-        yield f", {meta.ge:g} to {meta.le:g}"
+    le = None if meta.le in NO_BOUNDS else meta.le
+    if meta.ge is not None and le is not None:
+        yield f", {meta.ge:g} to {le:g}"
         return
-    for sign, bound in (("≥", meta.ge), (">", meta.gt), ("≤", meta.le), ("<", meta.lt)):
+    for sign, bound in (("≥", meta.ge), (">", meta.gt), ("≤", le), ("<", meta.lt)):
         if bound is not None:
             yield f" {sign} {bound:g}"
