@@ -89,7 +89,7 @@ def test_what_another_worker_says_of_a_ticket_changes_nothing() -> None:
     for step in range(5):
         played.learner.says(B, msgspec.structs.replace(played.rows(step), session=session))
     played.learner.says(B, msgspec.structs.replace(played.answer(5), session=session))
-    assert not played.learner.coordinator.evaluation.done
+    assert played.learner.coordinator.evaluation.episodes_played == 0
     played.learner.says(A, played.rows(0))
     played.learner.says(A, played.answer(1))
     assert played.learner.coordinator.evaluation.done
