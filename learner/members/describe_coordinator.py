@@ -91,5 +91,5 @@ class DescribeCoordinator(Coordinator[Member]):
             self._decliners.add(member.hello.worker)
             if len(self._decliners) >= self._decliners_to_end:
                 self.membership.take_events()  # the reason is the error's text, and need not be logged too
-                self.unsuitable = self.unsuitable or UsageError(reason)
+                self.unsuitable = UsageError(reason)
         return refusal

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from learner.members.events import Event, Failed, PolicyRaised
-from protocol.bounds import MAX_LINE, one_line
 from protocol.errors import EnvironmentFailed, PolicyFailed
 
 MOST_IN_A_ROW = 10
@@ -58,7 +57,7 @@ class FailureCount:
         if not isinstance(event, Failed) or event.spare or self._error is not None:
             return
         if why := self.failed(event.lanes or (event.worker,), event.stepped, now):
-            line = one_line(f"worker {event.worker} ({event.host}): {event.error}; {why}", 4 * MAX_LINE)
+            line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
             self._error = (PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed)(line, event.traceback)
 
     def check(self) -> None:

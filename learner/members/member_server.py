@@ -146,10 +146,8 @@ class MemberServer:
     def send(self, messages: Sequence[Outgoing], cause: bytes | None = None) -> None:
         """Send these messages, then log what has happened. `cause`: the peer whose message made it happen, if one did."""
         for peer, message in messages:
-            if self._link.send(
-                peer, self._frames(message)
-            ):  # a failed send is ignored: such a worker is soon removed as silent
-                self._callbacks.sent(peer)
+            self._link.send(peer, self._frames(message))  # if it fails, the worker is soon removed as silent
+            self._callbacks.sent(peer)
         if self._membership.events:
             self._log_events(cause)
 

@@ -267,7 +267,7 @@ class Membership(Generic[M]):
             return [(peer, Refuse(one_line(why)))], None
         refused, why = self._refused.get(peer, (-1, ""))
         if refused == hello.process_nonce:
-            return [(peer, Refuse(one_line(why)))], None
+            return [(peer, Refuse(why))], None
         if self.draining is not None:
             return [(peer, Drain(one_line(self.draining)))], None
         member, takeovers = self.members.get(peer), 0
@@ -378,8 +378,7 @@ class Membership(Generic[M]):
 
 
 def _remember(table: dict[K, V], key: K, value: V) -> None:
-    """Put it last in a table that is limited: the oldest entry stands first and goes first."""
-    table.pop(key, None)
+    """Keep it in a table that is limited: the oldest entry goes first."""
     table[key] = value
     if len(table) > REMEMBERED:
         del table[next(iter(table))]

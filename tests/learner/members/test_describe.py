@@ -143,6 +143,14 @@ def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_an
     assert made.unsuitable is None
 
 
+def test_once_the_environment_is_described_a_worker_that_declines_ends_nothing() -> None:
+    made = coordinator()
+    one, two = join(made, A), join(made, B)
+    made.receive(A, Described(one, DESCRIPTION), 1.0)
+    made.receive(B, Goodbye(two, "environment Fake-v0 is not registered", ()), 1.0)
+    assert made.unsuitable is None
+
+
 def test_the_start_ends_once_all_workers_of_the_launcher_have_declined() -> None:
     made = coordinator(decliners_to_end=2)
     for nonce in (1, 2):  # the first is started again, and counts once

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from learner.members.events import EnvironmentRaised, Failed, PolicyRaised
 from learner.members.failure_count import HOUR_S, MOST_IN_A_ROW, FailureCount
+from protocol.errors import EnvironmentFailed, PolicyFailed, RunError
 
 COPIES = 16  # of one lane each
 TWO_HOURS_S = 2 * HOUR_S
@@ -133,3 +135,17 @@ def test_each_worker_that_describes_the_environment_is_counted_by_its_name() -> 
     count = FailureCount(3)
     assert {fails(count, 3, f"w{n}") for n in range(16)} == {""}
     assert fails(count, 1, "w5") == "failure 4 in a row; max_env_failures allows 3 in a row"
+    count = FailureCount(1)
+    for n in range(16):
+        count.count(EnvironmentRaised(f"w{n}", "host", "boom", ""), 0.0)
+    count.check()
+
+
+@pytest.mark.parametrize(("event", "error"), [(EnvironmentRaised, EnvironmentFailed), (PolicyRaised, PolicyFailed)])
+def test_the_error_says_what_has_failed_and_where(event: type[Failed], error: type[RunError]) -> None:
+    count = FailureCount(0)
+    for lane in range(2):
+        count.count(event("w0", "box", f"boom {lane}", "its traceback", (lane,)), 0.0)
+    with pytest.raises(error, match=r"^worker w0 \(box\): boom 0; failure 1 in a row; ") as raised:
+        count.check()
+    assert raised.type is error

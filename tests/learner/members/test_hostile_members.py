@@ -16,7 +16,7 @@ from learner.members.member_log import OF_A_KEY, OF_A_WORKER, MemberLog
 from learner.members.member_server import TURN_S
 from learner.members.membership import MAX_MEMBERS, REMEMBERED
 from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
+from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from learner.rollouts.weight_age import WORKERS, WeightAge
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from protocol.messages import (
@@ -212,6 +212,15 @@ def test_there_is_a_limit_to_the_number_of_members() -> None:
     assert len(learner.coordinator.members) == MAX_MEMBERS
 
 
+def test_a_refusal_is_one_short_line_however_long_its_reason_is() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(b"a")
+    outs = [out for _ in range(STRIKES) for out in learner.coordinator.reject_message(b"a", "rubbish\n" * 1_000, 0.0)]
+    ((_, refusal),) = outs
+    assert decode_to_worker([bytes(frame) for frame in encode(refusal)]) == refusal
+    assert learner.joins(b"a") == [(b"a", refusal)], "what is kept of it is as short"
+
+
 # ---------------------------------------------------------------- time
 
 
@@ -293,7 +302,8 @@ def test_an_error_in_the_learner_costs_its_sender_the_membership_and_nothing_els
     for _ in range(3):
         noisy.hears("spare", Heartbeat(2, 0, (0,), (), 0, {}, 0))
     assert set(noisy.coordinator.members) == {b"honest"}
-    assert decode_to_worker(noisy.link.sent[-1]) == Refuse("its Heartbeat led to an error in the learner: ZeroDivisionError")
+    refusal = Refuse("its Heartbeat led to an error in the learner: ZeroDivisionError")
+    assert [decode_to_worker(frames) for frames in noisy.link.sent[-3:]] == [refusal] * 3
     assert noisy.hub._server.unexpected_errors == 3
     assert len([record for record in caplog.records if record.exc_info]) == 1
 

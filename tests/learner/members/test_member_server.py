@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
-from learner.members.member_server import AWAY_S, MemberServer, ServerCallbacks, ServerSettings
+from learner.members.member_server import (
+    ASK_PROCESSES_S,
+    AWAY_S,
+    FAIR_SHARE,
+    SHORT_TURN_S,
+    TURN_S,
+    MemberServer,
+    ServerCallbacks,
+    ServerSettings,
+)
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import OrderCoordinator
 from learner.vector_env.step_hub import StepHub
 from learner.vector_env.vector_env_status import status
 from protocol.alive import WorkerActivity, WorkerExit
 from protocol.errors import NoWorkers
-from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello
+from protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, ToLearner
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.conversation.fake_link import FakeLink
@@ -29,10 +41,11 @@ class Served:
         self.link = FakeLink()
         self.ended: list[WorkerExit] = []
         self.running: list[WorkerActivity] = []
+        self.asked = 0
         self.coordinator = OrderCoordinator(SPEC, 1, TIMEOUT_S)
         callbacks = ServerCallbacks(self.coordinator.receive, lambda now: status(self.coordinator, now), lambda event: None)
         link = cast(LearnerLink, self.link)
-        processes = ProcessCallbacks(self._ended, lambda: self.running)
+        processes = ProcessCallbacks(self._ended, self._running)
         self.server = MemberServer(link, self.coordinator, callbacks, processes, settings, lambda: self.link.now)
         self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
         self.server.listen(POLL_S)
@@ -40,6 +53,15 @@ class Served:
     def _ended(self) -> list[WorkerExit]:
         ended, self.ended = self.ended, []
         return ended
+
+    def _running(self) -> list[WorkerActivity]:
+        self.asked += 1
+        return self.running
+
+    def says(self, peer: bytes, *messages: ToLearner) -> None:
+        self.link.inbox += [(peer, message) for message in messages]
+        while self.link.inbox:
+            self.server.listen(POLL_S)
 
     def listens_for(self, seconds: float) -> bool:
         """Whether the worker, which says nothing, is still a member afterwards."""
@@ -61,6 +83,43 @@ def test_after_it_was_away_a_worker_has_the_grace_to_be_heard(grace_s: float) ->
     served.link.now += 1000.0
     assert served.listens_for(grace_s)
     assert not served.listens_for(2 * POLL_S)
+
+
+def test_what_started_workers_do_is_asked_now_and_then() -> None:
+    served = Served()
+    served.running.append(WorkerActivity("w0", 1, "stepping", 0.0, 0))
+    assert served.listens_for(2 * TIMEOUT_S), "a worker in environment code is not silent"
+    assert served.asked <= 2 * TIMEOUT_S / ASK_PROCESSES_S + 2
+
+
+def flood(served: Served) -> None:
+    """From now on, the inbox is never empty."""
+
+    def receive() -> Iterator[tuple[bytes, ToLearner]]:
+        while True:
+            served.link.now += 0.001
+            yield b"loud", Heartbeat(7, 0, (), (), 0, {}, 0)
+
+    served.link.receive = receive  # type: ignore[method-assign]
+    served.link.poll = lambda timeout_s: True  # type: ignore[method-assign]
+
+
+def test_a_silent_worker_is_removed_although_others_speak_without_end() -> None:
+    served = Served()
+    flood(served)
+    while served.link.now < 110.0 + FAIR_SHARE * 0.001 and served.coordinator.members:
+        served.server.listen(POLL_S)
+    assert not served.coordinator.members
+
+
+def test_a_short_turn_takes_no_longer_than_the_caller_has_worked() -> None:
+    served = Served()
+    flood(served)
+    for worked_s, turn_s in ((0.05, 0.05), (0.0, SHORT_TURN_S), (10.0, TURN_S)):
+        served.link.now += worked_s
+        began_s = served.link.now
+        served.server.listen(0.0, short=True)
+        assert turn_s < served.link.now - began_s <= turn_s + 0.0021
 
 
 def test_a_learner_that_was_stopped_while_it_waited_was_away_too() -> None:
@@ -112,6 +171,87 @@ def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:
     served.server.listen(POLL_S)
     assert not served.coordinator.members
     assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0))
+
+
+@pytest.mark.parametrize("waits", [False, True], ids=["while it listens", "at the end"])
+def test_one_whose_key_was_revoked_is_shut_out(waits: bool) -> None:
+    served = Served()
+    served.link.keyring = SimpleNamespace(allowed=())
+    served.link.rejection_reason = lambda peer: "its key was revoked"  # type: ignore[method-assign]
+    if waits:
+        served.server.wait_until_all_left(served.link.now + TIMEOUT_S, POLL_S)
+    else:
+        served.server.listen(POLL_S)
+    assert not served.coordinator.members
+
+
+def test_at_the_end_those_are_awaited_that_may_still_speak_until_the_deadline() -> None:
+    served = Served()
+    until_s = served.link.now + 3 * TIMEOUT_S
+    served.server.wait_until_all_left(until_s, POLL_S)
+    assert until_s <= served.link.now < until_s + 2 * POLL_S
+    assert served.coordinator.members, "who is silent may still say Goodbye"
+    served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
+    until_s = served.link.now + TIMEOUT_S
+    served.server.wait_until_all_left(until_s, POLL_S)
+    assert not served.coordinator.members
+    assert served.link.now < until_s
+
+
+def test_a_wait_ends_when_it_has_found_no_worker_all_the_time() -> None:
+    served = Served()
+    for attempt in (2, 3):
+        served.says(b"w0", Goodbye(attempt - 1, "told to stop", ()))
+        served.server.check_members(TIMEOUT_S)
+        served.link.now += TIMEOUT_S - 1
+        served.server.check_members(TIMEOUT_S)
+        served.says(b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, attempt, "fake", 1))
+        served.server.check_members(TIMEOUT_S)
+    served.says(b"w0", Goodbye(3, "told to stop", ()))
+    served.server.check_members(TIMEOUT_S)
+    served.link.now += TIMEOUT_S + 1
+    with pytest.raises(NoWorkers):
+        served.server.check_members(TIMEOUT_S)
+
+
+def test_how_workers_come_and_go_is_a_warning_only_if_somebody_should_look(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+    def level(message: ToLearner) -> str:
+        caplog.clear()
+        served.says(b"w1", message)
+        return " ".join(record.levelname for record in caplog.records)
+
+    def hello(attempt: int) -> Hello:
+        return Hello(PROTOCOL_VERSION, "w1", "host", 1, 1, "fake", attempt)
+
+    served = Served()
+    assert level(Heartbeat(7, 0, (), (), 0, {}, 0)) == "INFO", "it joins again"
+    assert level(hello(1)) == "INFO"
+    assert level(Goodbye(2, "told to stop", ())) == "WARNING"
+    assert level(hello(2)) == "INFO"
+    served.coordinator.drain("done")
+    assert level(Goodbye(3, "done", ())) == "INFO"
+    served = Served(ServerSettings(log_joins=False, log_tracebacks=False))
+    assert level(hello(1)) == "", "it joins the run in a moment"
+    assert level(Failure(2, "boom", "its traceback", None)) == "INFO WARNING"
+    assert caplog.messages == ["worker w1 (host): boom", "worker w1 failed"], "whoever raises the error shows its traceback"
+
+
+def test_what_became_of_workers_is_said_where_one_is_missing() -> None:
+    served = Served()
+    served.link.keyring, served.link.refused = SimpleNamespace(allowed=()), 3
+    says = str(served.server.no_workers(2, 1.0))
+    assert says.endswith("1 joined (3 were not let in; the log says why); start one: millrace worker fake --token FILE")
+    served.says(b"w1", Hello(PROTOCOL_VERSION + 1, "w1", "host", 1, 1, "fake", 1))
+    assert "1 joined (the last one was refused: protocol: expected" in str(served.server.no_workers(2, 1.0))
+
+
+def test_new_members_of_one_key_are_limited() -> None:
+    served = Served()
+    served.server._joins.admits = lambda source, now: False  # type: ignore[method-assign]
+    served.says(b"w1", Hello(PROTOCOL_VERSION, "w1", "host", 1, 1, "fake", 1))
+    assert list(served.coordinator.members) == [b"w0"]
 
 
 def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() -> None:

@@ -789,6 +789,23 @@ def test_a_worker_that_keeps_sending_rubbish_is_refused_and_what_it_held_is_deal
     assert learner.coordinator.events[1:] == [WorkerRefused("a", "not understood", 1)]  # the one line about its end
 
 
+@pytest.mark.parametrize("how", ["rubbish", "revoked", "silent"])
+def test_what_a_lost_worker_held_is_dealt_again_at_once(how: str) -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.now = TIMEOUT_S + 1
+    learner.joins(B)
+    match how:
+        case "rubbish":
+            outs = [out for _ in range(STRIKES) for out in learner.coordinator.reject_message(A, "rubbish", learner.now)]
+        case "revoked":
+            outs = learner.coordinator.revoke(A, "its key was revoked")
+        case _:
+            outs = learner.coordinator.remove_silent(learner.now)
+    assert list(learner.coordinator.members) == [B]
+    assert {permit.lane for permit in permits(outs, B)} == {0, 1}
+
+
 def test_one_that_was_refused_stays_refused_and_another_process_of_its_name_may_join() -> None:
     learner = Learner(lanes=1)
     learner.joins(A, pid=1)

@@ -11,9 +11,11 @@ from protocol.wire.codec import Buffer
 class FakeLink:
     """Holds what workers have said until it is asked for; waiting takes time."""
 
-    address, keyring, refused = "fake", None, 0
+    address = "fake"
 
     def __init__(self) -> None:
+        self.keyring: object | None = None
+        self.refused = 0
         self.now = 100.0
         self.packed_bytes_limit = 0
         self.sent: list[Sequence[Buffer]] = []
