@@ -42,8 +42,8 @@ MUTATIONS = {
     "a reset that lost its worker is not sent again": Mutation(
         SEND_RECV, "self._parts.hub.send_order(lane, reset.order())", "pass"
     ),
-    "a lane that was sent nothing comes back": Mutation(
-        SENT, "        self.sent |= dict.fromkeys(lanes, sent)", '        self._results |= dict.fromkeys(lanes, b"")'
+    "a lane comes back before its answer": Mutation(
+        SENT, "dict.fromkeys(lanes, sent)", 'dict.fromkeys(lanes, sent); self._results |= dict.fromkeys(lanes, b"")'
     ),
     "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),
     "a lane whose loss was reported is not reset": Mutation(LOST, "self.expect_reset(reported)", "pass"),
