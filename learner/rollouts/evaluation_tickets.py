@@ -165,7 +165,7 @@ class EvaluationTickets:
         plan, members, out = self._plan, active, list[Outgoing]()
         assert plan is not None
         if self.most_copies is not None:
-            members = active[: max(1, self.most_copies // min(plan.copies, len(plan.seeds)))]
+            members = active[: max(1, self.most_copies // plan.copies)]
         holds = Counter(member.peer for member in self.held.values())
         for most in range(1, HELD_AT_ONCE + 1):
             for member in members:

@@ -119,8 +119,7 @@ class OrderCoordinator(Coordinator[Member]):
     def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
         """Send an order to a lane that was placed."""
         member, record = self.owner(lane), self.lanes[lane]
-        if member is None:
-            raise ValueError(f"lane {lane}: expected a worker, got none")
+        assert member is not None
         self._tickets += 1
         order = make_order(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))
         record.started = True

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from protocol.bounds import MAX_TICKETS, Stage, last_text, one_line
+from protocol.bounds import Stage, last_text, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
     TOLD_TO_STOP,
@@ -132,10 +132,10 @@ class WorkerIdentity:
         return Hello(
             PROTOCOL_VERSION,
             worker=self.worker,
-            host=one_line(self.host),
+            host=self.host,
             pid=self.pid,
             process_nonce=self.process_nonce,
-            software=one_line(self.software),
+            software=self.software,
             attempt=attempt,
         )
 
@@ -165,8 +165,8 @@ class _SessionState:
     replies: int = 0  # number of the last HeartbeatReply
 
     def unfinished(self) -> tuple[int, ...]:
-        """Tickets that are not yet collected or executed: as many as a message may name."""
-        return (*self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())[:MAX_TICKETS]
+        """Tickets that are not yet collected or executed."""
+        return (*self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
@@ -262,12 +262,12 @@ class Session:
             case Weights(version):
                 current.weights.setdefault(version, message)
                 current.drop_weights()  # a late copy of old weights, too
-            case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
+            case Collect(_, version, permits, received):
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]
-            case Evaluate() if isinstance(self.run, RunSpec):
+            case Evaluate():
                 again = [current.evaluations.take(message.ticket, message)]
-            case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
+            case Reset() | Step() | Call():
                 again = [current.orders.take(message)]
             case Release(_, lanes):
                 return current.release(lanes)
@@ -406,7 +406,7 @@ class Session:
     def _leave_if_drained(self) -> list[WorkerEffect]:
         if self.state is not WorkerState.DRAINING or self._current.in_progress:
             return []
-        goodbye = Goodbye(self.session, one_line(self._reason), self._current.unfinished())
+        goodbye = Goodbye(self.session, self._reason, self._current.unfinished())
         return self._leave(WorkFinished(), 0, self._reason, goodbye)
 
     def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[WorkerEffect]:

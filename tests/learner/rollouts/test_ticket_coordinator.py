@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from learner.config.validation import MOST_TICKETS
-from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, WorkerRefused
+from learner.members.events import EnvironmentRaised, Failed, PolicyRaised, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_tickets import EvaluationPlan
@@ -20,6 +20,7 @@ from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
+    Described,
     Drain,
     Evaluate,
     Failure,
@@ -33,11 +34,14 @@ from protocol.messages import (
     Refuse,
     Rejoin,
     Release,
+    Returned,
     Rollout,
+    Stepped,
     ToLearner,
     Weights,
     Welcome,
 )
+from protocol.specs import OwnPolicySpec
 from protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
@@ -321,6 +325,7 @@ def test_an_update_takes_its_rollouts_in_the_order_of_lanes_whichever_comes_firs
     learner = Learner(lanes=3)
     learner.joins(A)
     for number in (2, 0, 1):
+        assert learner.coordinator.rollouts.take() is None, "a lane lacks its rollout"
         learner.delivers(number)
     assert [rollout.lane for rollout in learner.take()] == [0, 1, 2]
 
@@ -883,6 +888,26 @@ def test_a_failure_belongs_to_its_lane_or_to_all_of_the_workers_lanes(lane: int 
     (failed,) = [event for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
     assert failed.lanes == lanes
     assert failed.stepped, "a rollout has env steps"
+
+
+@pytest.mark.parametrize("kind", [PolicyRaised, EnvironmentRaised])
+def test_a_failure_of_the_users_policy_is_told_as_one(kind: type) -> None:
+    learner = Learner(lanes=1)
+    policy = msgspec.structs.replace(learner.coordinator.run.policy, own=OwnPolicySpec("mine:make", ()))
+    learner.coordinator.run = msgspec.structs.replace(learner.coordinator.run, policy=policy)
+    learner.joins(A)
+    learner.says(A, Failure(learner.session(A), "KeyError", "", None, of_policy=kind is PolicyRaised))
+    (failed,) = [event for event in learner.coordinator.events if isinstance(event, Failed)]
+    assert type(failed) is kind
+
+
+@pytest.mark.parametrize("kind", [Described, Stepped, Returned])
+def test_answers_to_orders_that_a_run_does_not_give_are_ignored(kind: type) -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    for _ in range(STRIKES):
+        assert learner.says(A, next(message for message in EVERY_MESSAGE if type(message) is kind)) == []
+    assert (learner.coordinator.members[A].strikes, learner.tickets(A)) == (0, [0])
 
 
 def test_silent_workers_are_removed_in_tick_only() -> None:

@@ -13,23 +13,27 @@ from learner.members.events import WorkerLeft, WorkerRefused
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.vector_env_status import status
 from protocol.env_spec import EnvSpec
+from protocol.errors import EnvironmentFailed
 from protocol.messages import (
     PROTOCOL_VERSION,
     Answer,
     Call,
     Failure,
     Heartbeat,
+    HeartbeatReply,
     Hello,
     LaneIncarnation,
     Order,
+    Received,
     Refuse,
+    Release,
     Returned,
     Step,
     Stepped,
 )
 from protocol.specs import Leaf, StepSpec
 from protocol.wire.plain_values import pack
-from tests.support.conversation.fake_ends import process_ends
+from tests.support.conversation.fake_ends import fake_rollout, process_ends
 
 A, B = b"a", b"b"
 TIMEOUT_S = 5.0
@@ -88,6 +92,60 @@ def test_an_order_is_answered_once() -> None:
     assert made.answers == {}
 
 
+def test_another_workers_order_is_not_answered() -> None:
+    made = order_coordinator(A, B)
+    ((_, order),) = made.order(0, step)
+    assert made.receive(B, stepped(order, session=made.members[B].session), 0.0) == []
+    assert (list(made.orders), made.answers) == ([order_ticket(order)], {})
+
+
+def test_what_was_not_asked_for_gets_its_sender_refused() -> None:
+    made = order_coordinator(A)
+    ((_, said),) = made.receive(A, fake_rollout(made.members[A].session, 0, 0, 0, 0), 0.0)
+    assert said == Refuse("it sent Rollout, which a vector environment does not ask for")
+
+
+def test_a_loss_is_told_once_and_its_lane_starts_again_in_its_next_incarnation() -> None:
+    made = order_coordinator(A, B)
+    made.give_up(made.members[A], "did not answer")
+    assert made.take_lost() == {0: "worker a (host) did not answer"}
+    assert made.take_lost() == {}
+    assert made.place(0, patient=False)
+    ((peer, order),) = made.order(0, step)
+    assert isinstance(order, Step)
+    assert (peer, order.incarnation) == (B, 1)
+
+
+def test_an_error_of_an_environment_is_raised_once_with_its_traceback() -> None:
+    made = order_coordinator(A)
+    made.receive(A, Failure(made.members[A].session, "boom", "its traceback", 0), 0.0)
+    with pytest.raises(EnvironmentFailed, match=r"^worker a \(host\): boom$") as raised:
+        made.raise_failures()
+    assert raised.value.detail == "its traceback"
+    made.raise_failures()
+
+
+def test_a_lane_stays_where_it_is_until_all_begin_anew() -> None:
+    """While workers may still come, a lane that has none waits for one of its own."""
+    made = order_coordinator(A)
+    assert not made.place(1, patient=True)
+    assert made.place(1, patient=False)
+    made.receive(B, Hello(PROTOCOL_VERSION, "b", "host", 1, 1, "fake", 1), 0.0)
+    assert made.place(1, patient=False)
+    assert [lane.owner for lane in made.lanes] == [A, A]
+    assert [peer for peer, message in made.rebalance() if isinstance(message, Release)] == [A]
+    assert {lane.owner for lane in made.lanes} == {A, B}
+
+
+def test_in_a_tie_the_first_name_gets_the_next_lane_and_numbers_in_names_count() -> None:
+    made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
+    for name in ("w10", "w2"):
+        made.receive(name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, 1, "fake", 1), 0.0)
+    for lane in range(2):
+        assert made.place(lane, patient=False)
+    assert [lane.owner for lane in made.lanes] == [b"w2", b"w10"]
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -138,6 +196,10 @@ def test_infos_that_nobody_waits_for_are_not_used() -> None:
     made.forget(0)
     made.receive(A, in_memory(made, 0, 1), 0.0)
     assert (made.infos, made.answers) == ({}, {})
+    made.shared_orders[0] = 2
+    made.receive(A, in_memory(made, 0, 2), 0.0)
+    made.forget(0)
+    assert made.infos == {}, "they were taken"
 
 
 def test_infos_of_anothers_lane_or_an_earlier_life_are_not_used() -> None:
@@ -199,6 +261,8 @@ def test_what_was_lost_on_the_way_is_said_again() -> None:
     for replies, held in ((0, ()), (1, (order_ticket(order),)), (2, ()), (2, ())):
         outs = made.receive(A, Heartbeat(session, replies, (), held, 0, {}, 0), 1.0)
         said.append([message for _, message in outs if isinstance(message, Step)])
+        (reply,) = (message for _, message in outs if isinstance(message, HeartbeatReply))
+        assert reply.received == (Received(0, 0, 0),), "its lanes; it closes any other"
     assert said == [[], [], [order], []], "again only once it must have arrived, and once for each time"
 
 

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 import millrace
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, Sent, SentLanes, WatchedTime
+from learner.vector_env.lane_orders import packed
+from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
 from protocol.messages import Reset, Step
@@ -670,6 +671,15 @@ def test_a_lane_comes_back_once_and_takes_no_other_order_before() -> None:
     assert list(lanes.take().results.items()) == [(0, b""), (1, b"infos")]
     assert (lanes.take().results, lanes.copies) == ({}, [])
     lanes.send([1], Sent(Asked.STEP, 1.0))
+
+
+def test_a_lost_step_has_all_attempts_to_reset_its_new_copies_and_keeps_the_last_observations() -> None:
+    lanes, reset = SentLanes(BatchLayout([1])), AskedReset((0,), (None,), packed(None))
+    lanes.send([0], Sent(Asked.STEP, 0.0))
+    lanes.reset_instead(0, reset, 1.0, {0: "last"})
+    assert lanes.sent[0] == Sent(reset, 1.0, 1, {0: "last"})
+    lanes.reset_instead(0, reset, 2.0, {})
+    assert lanes.sent[0] == Sent(reset, 2.0, 2, {0: "last"})
 
 
 def test_a_long_time_between_two_looks_counts_as_a_short_one() -> None:

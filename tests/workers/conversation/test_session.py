@@ -39,6 +39,7 @@ from protocol.messages import (
 )
 from protocol.space_spec import DiscreteSpace, EnvDescription
 from protocol.specs import DescribeSpec, StepSpec
+from protocol.wire.codec import decode_to_learner, encode
 from tests.support.conversation.every_message import to_worker
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 from workers.conversation.connection_rules import wait_limits_s
@@ -374,6 +375,7 @@ def test_the_oldest_order_of_all_lanes_is_executed_first() -> None:
     session.handle(later, 0.1)
     session.handle(earlier, 0.1)
     assert session.next_work() == earlier
+    assert sent(session.tick(session.due_s), Heartbeat)[0].tickets == (7, 6)
 
 
 def test_finished_with_nothing_puts_the_tickets_back() -> None:
@@ -518,9 +520,17 @@ def test_a_description_is_sent_at_once_and_with_every_heartbeat_of_its_session()
         effects = session.tick(session.due_s)
         assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [said])
     session.handle(Rejoin(SESSION), 5.0)
+    assert session.described(said.description) == [], "no session may hear of it"
     session.handle(Welcome(SESSION + 1, FIRST + 1, DescribeSpec(EnvSpec("Fake-v0"))), 5.0)
     effects = session.tick(session.due_s)
     assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [])
+
+
+def test_a_heartbeat_reports_what_the_worker_counts() -> None:
+    session = ready()
+    session.update_statistics(Statistics(5, {"step": 1.5}, 1 << 20))
+    (heartbeat,) = sent(session.tick(1.0), Heartbeat)
+    assert (heartbeat.steps, heartbeat.stages, heartbeat.resident_bytes) == (5, {"step": 1.5}, 1 << 20)
 
 
 def test_a_heartbeat_lists_the_ticket_in_progress_and_no_finished_one() -> None:
@@ -646,6 +656,8 @@ def test_a_worker_joins_a_silent_learner_again() -> None:
     assert sent(session.tick(7.0), Heartbeat)
     assert hello_attempt(session.tick(7.1)) == FIRST + 1
     assert (session.state, held_count(session)) == (WorkerState.JOINING, 0)
+    session.handle(Welcome(12, FIRST + 1, RUN), 7.2)
+    assert sent(session.tick(8.2), Heartbeat), "it has just been heard"
 
 
 def test_a_learner_that_was_not_spoken_to_is_not_silent() -> None:
@@ -791,6 +803,21 @@ def test_a_failure_of_the_users_policy_says_so() -> None:
     task_of(session)
     sent, _ = session.fail("policy Mine: act raised KeyError", "Traceback: …", None, of_policy=True)
     assert sent == SendMessage(Failure(SESSION, "policy Mine: act raised KeyError", "Traceback: …", None, True))
+
+
+@pytest.mark.parametrize(
+    "leave",
+    [
+        lambda session: session.fail("boom\n" * 10_000, "a frame\n" * 100_000, None),
+        lambda session: session.decline("no display\n" * 10_000),
+    ],
+    ids=["failed", "declined"],
+)
+def test_last_words_fit_into_their_message(leave: Callable[[Session], list[WorkerEffect]]) -> None:
+    session = ready(collect((0, 3)))
+    (said,) = (effect.message for effect in leave(session) if isinstance(effect, SendMessage))
+    assert decode_to_learner([bytes(frame) for frame in encode(said)]) == said
+    assert session.next_work() is None
 
 
 def test_a_failure_before_any_session_is_not_reported() -> None:

@@ -1,0 +1,106 @@
+"""The tickets of an evaluation: what is asked for, who holds it, and what its answers make. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+
+from learner.members.membership import Outgoing
+from learner.rollouts.evaluation_tickets import FIRST_TICKET, EvaluationPlan, evaluation_of
+from protocol.bounds import LARGEST
+from protocol.messages import EpisodeRows, Evaluate, Evaluated
+from protocol.rollout import Episode
+from tests.learner.rollouts.test_ticket_coordinator import Learner, of
+from tests.support.conversation.fake_ends import fake_rollout, fake_rows
+
+A, B = b"a", b"b"
+
+
+def learner_with(*peers: bytes) -> Learner:
+    learner = Learner(lanes=1)
+    for peer in peers:
+        learner.joins(peer, host=peer.decode())
+    return learner
+
+
+def plan(*seeds: int, copies: int = 2, send_rows: bool = False) -> EvaluationPlan:
+    return EvaluationPlan(seeds, copies, most_steps=9, greedy=False, send_rows=send_rows, send_frames=send_rows)
+
+
+def orders(outs: Sequence[Outgoing]) -> list[Evaluate]:
+    return sorted(of(outs, Evaluate), key=lambda order: order.ticket)
+
+
+def answer(order: Evaluate) -> Evaluated:
+    """Each episode is as long as its seed says, and that of seed 1 was cut."""
+    episodes = tuple(Episode(0.0, seed, 0.0) for seed in order.seeds if seed is not None)
+    return Evaluated(order.session, order.ticket, episodes, tuple(seed == 1 for seed in order.seeds))
+
+
+@pytest.mark.parametrize(("episodes", "max_steps", "most_steps"), [(10, 5_000, 500), (10, 5, 1), (1, 10 * LARGEST, LARGEST)])
+def test_each_episode_has_an_equal_share_of_the_env_steps(episodes: int, max_steps: int, most_steps: int) -> None:
+    assert EvaluationPlan.of(episodes, seed=1, copies=2, max_steps=max_steps).most_steps == most_steps
+
+
+def test_seeds_are_cut_into_tickets_whose_orders_say_what_the_plan_says() -> None:
+    learner = learner_with(A, B)
+    found = orders(learner.coordinator.begin_evaluation(plan(5, 6, 7, send_rows=True), lambda episode, rows: None))
+    assert [(order.ticket - FIRST_TICKET, order.seeds) for order in found] == [(0, (5, 6)), (1, (7,))]
+    for order in found:
+        assert (order.version, order.greedy, order.most_steps) == (0, False, 9)
+        assert (order.send_rows, order.send_frames) == (True, True)
+
+
+def test_the_episodes_are_in_the_order_of_the_seeds_whoever_answers_first() -> None:
+    learner = learner_with(A, B)
+    evaluation = learner.coordinator.evaluation
+    first, second = orders(learner.coordinator.begin_evaluation(plan(1, 2, 3)))
+    for peer, order in ((B, second), (A, first)):
+        learner.says(peer, answer(order))
+    played = evaluation.end()
+    assert [one.episode.length for one in played] == [1, 2, 3]
+    assert evaluation_of(played).cut == 1
+
+
+def test_nothing_of_an_evaluation_counts_in_the_next() -> None:
+    learner = learner_with(A)
+    evaluation = learner.coordinator.evaluation
+    (before,) = orders(learner.coordinator.begin_evaluation(plan(1, 2)))
+    learner.says(A, answer(before))
+    evaluation.end()
+    (order,) = orders(learner.coordinator.begin_evaluation(plan(3, 4)))
+    assert evaluation.episodes_played == 0
+    learner.says(A, answer(before))
+    assert evaluation.episodes_played == 0
+    learner.says(A, answer(order))
+    assert [one.episode.length for one in evaluation.end()] == [3, 4]
+
+
+def test_rows_come_in_the_order_of_the_episodes_with_their_numbers_in_the_plan() -> None:
+    learner = learner_with(A)
+    taken: list[tuple[int, int]] = []
+
+    def take(episode: int, rows: EpisodeRows) -> None:
+        taken.append((episode, rows.first_step))
+
+    learner.coordinator.evaluation.most_copies = 2
+    found = EvaluationPlan((2, 2, 2, 2), copies=2, most_steps=9, send_rows=True)
+    (order,) = orders(learner.coordinator.begin_evaluation(found, take))
+    while not learner.coordinator.evaluation.done:
+        for episode in (1, 0):
+            for step in range(2):
+                learner.says(A, fake_rows(order.session, order.ticket, episode, step))
+        (order, *_) = orders(learner.says(A, answer(order))) or [order]
+    assert taken == [(episode, step) for episode in range(4) for step in range(2)]
+
+
+def test_a_rollout_on_a_ticket_of_an_evaluation_costs_the_evaluation_nothing() -> None:
+    learner = learner_with(A)
+    (order,) = orders(learner.coordinator.begin_evaluation(plan(1, 2)))
+    rollout = fake_rollout(order.session, 0, order.ticket, 0, 0)
+    learner.balanced(learner.coordinator.reject_rollout(A, rollout, "broken", 0.0))
+    learner.says(A, rollout)
+    assert learner.coordinator.members[A].strikes == 1
+    learner.says(A, answer(order))
+    assert learner.coordinator.evaluation.done
