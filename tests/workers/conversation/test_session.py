@@ -32,6 +32,7 @@ from protocol.messages import (
     Release,
     Reset,
     Rollout,
+    Stepped,
     ToLearner,
     ToWorker,
     Weights,
@@ -139,6 +140,11 @@ def collected(session: Session) -> list[Rollout]:
 def drained(session: Session) -> list[WorkerEffect]:
     """The learner asks the worker to leave."""
     return session.handle(Drain("finished"), 0.1)
+
+
+def stepped(order: Reset) -> Stepped:
+    flag, nothing = np.zeros(1, bool), np.zeros(0, np.uint8)
+    return Stepped(SESSION, order.ticket, order.lane, order.incarnation, (), np.zeros(1), flag, flag, nothing)
 
 
 def hello_attempt(effects: Sequence[WorkerEffect]) -> int:
@@ -317,6 +323,7 @@ def test_a_late_repeat_of_a_ticket_whose_rollout_was_received_is_ignored() -> No
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=1)), 1.0)
     assert session.handle(collect((0, 0), received=lanes(0, below=1)), 1.1) == []
     assert session.next_work() is None
+    assert held_count(session) == 0
 
 
 def test_the_next_rollout_of_every_lane_is_collected_together_in_lane_order() -> None:
@@ -356,6 +363,37 @@ def test_an_evaluation_of_an_older_version_is_dropped() -> None:
     assert sent(session.tick(1.0), Heartbeat)[0].tickets == ()
 
 
+def test_an_evaluation_waits_for_its_weights_and_the_oldest_comes_first() -> None:
+    session = ready(*(msgspec.structs.replace(EVALUATE, version=1, ticket=ticket) for ticket in (9, 8)))
+    assert session.next_work() is None
+    session.handle(weights(1), 0.1)
+    task = session.next_work()
+    assert isinstance(task, EvaluationTask)
+    assert task.order.ticket == 8
+
+
+def test_a_repeated_evaluation_is_answered_again() -> None:
+    session = ready(EVALUATE)
+    task = session.next_work()
+    assert isinstance(task, EvaluationTask)
+    answer = fake_evaluated(task)
+    session.work_ended([answer])
+    assert session.handle(EVALUATE, 0.1) == [SendMessage(answer)]
+    assert session.next_work() is None
+
+
+@pytest.mark.parametrize("field", ["send_rows", "send_frames"])
+def test_a_repeated_evaluation_whose_rows_were_sent_is_played_again(field: str) -> None:
+    """Rows are large: they are not kept."""
+    order = msgspec.structs.replace(EVALUATE, **{field: True})
+    session = ready(order)
+    for _ in range(2):
+        task = session.next_work()
+        assert isinstance(task, EvaluationTask)
+        session.work_ended([fake_evaluated(task)])
+        assert session.handle(order, 0.1) == []
+
+
 def test_the_number_of_kept_results_of_evaluations_is_bounded() -> None:
     session = ready()
     for ticket in range(KEPT_RESULTS + 1):
@@ -376,6 +414,23 @@ def test_the_oldest_order_of_all_lanes_is_executed_first() -> None:
     session.handle(earlier, 0.1)
     assert session.next_work() == earlier
     assert sent(session.tick(session.due_s), Heartbeat)[0].tickets == (7, 6)
+
+
+def test_only_the_newest_order_of_a_lane_counts() -> None:
+    session = joining()
+    session.handle(Welcome(SESSION, FIRST, StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ())), 0.0)
+    earlier, later = (Reset(SESSION, ticket, 0, 0, (0,), (None,), np.zeros(0, np.uint8)) for ticket in (6, 7))
+    for order in (earlier, later, earlier):
+        assert session.handle(order, 0.1) == []
+    assert session.next_work() == later
+    answer = stepped(later)
+    session.work_ended([answer])
+    assert session.next_work() is None
+    (again,) = session.handle(later, 0.2)
+    assert isinstance(again, SendMessage)
+    assert again.message is answer
+    assert session.handle(earlier, 0.2) == []
+    assert session.next_work() is None
 
 
 def test_finished_with_nothing_puts_the_tickets_back() -> None:
@@ -553,6 +608,15 @@ def test_a_higher_incarnation_starts_the_lane_anew_with_sequence_0() -> None:
     assert (assignment.ticket, assignment.incarnation, assignment.sequence) == (2, 1, 0)
 
 
+def test_a_rollout_of_a_lane_that_started_anew_while_it_was_collected_is_not_sent() -> None:
+    session = ready(collect((0, 0)))
+    task = task_of(session)
+    session.handle(collect((2, 0), incarnation=1), 0.1)
+    assert sent(session.work_ended(fake_rollouts(task)), Rollout) == []
+    (assignment,) = task_of(session).assignments
+    assert (assignment.ticket, assignment.sequence) == (2, 0)
+
+
 def test_a_ticket_of_an_older_incarnation_is_ignored() -> None:
     session = ready(collect((2, 0), incarnation=1))
     session.handle(collect((1, 0), received=lanes(0, incarnation=1)), 0.1)
@@ -566,6 +630,12 @@ def test_release_closes_the_lane_and_drops_its_tickets_and_rollouts() -> None:
     assert session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.1) == [CloseLanes((LaneIncarnation(0, 0),))]
     assert held_count(session) == 1
     assert session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.2) == []  # a repeat
+
+
+def test_a_release_of_a_later_incarnation_closes_the_one_that_is_here() -> None:
+    """The order that would have started the later one was lost."""
+    session = ready(collect((0, 0)))
+    assert session.handle(Release(SESSION, (LaneIncarnation(0, 1),)), 0.1) == [CloseLanes((LaneIncarnation(0, 0),))]
 
 
 def test_a_late_release_does_not_close_a_later_incarnation() -> None:
