@@ -236,7 +236,6 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ask the workers to leave, and end the local ones. Never hangs."""
-        self._send_recv.closed = True
         self._close_once()
 
     def __enter__(self) -> ZmqVectorEnv:

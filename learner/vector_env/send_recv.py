@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
@@ -58,7 +58,7 @@ class SendRecv:
 
     def __init__(self, parts: VectorEnvParts, timeout_s: float) -> None:
         """`timeout_s`: how long a worker may take, if no other time is given."""
-        self.timeout_s, self.closed = timeout_s, False
+        self.timeout_s = timeout_s
         self._parts = parts
         self._sent = SentLanes(parts.layout)
         self._all_were_reset = False
@@ -202,8 +202,6 @@ class SendRecv:
     # ---------------------------------------------------------------- inside
 
     def _check_back(self, lanes: Iterable[int]) -> None:
-        if self.closed:
-            raise ClosedEnvironmentError("call after close()")
         if out := self._sent.among(lanes):
             copies = self._parts.layout.copies_of(out)
             raise AlreadyPendingCallError(

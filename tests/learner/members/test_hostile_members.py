@@ -308,6 +308,22 @@ def test_an_error_in_the_learner_costs_its_sender_the_membership_and_nothing_els
     assert len([record for record in caplog.records if record.exc_info]) == 1
 
 
+def test_what_a_worker_held_whose_message_led_to_an_error_is_dealt_again() -> None:
+    noisy = Noisy()
+    spare = noisy.joins("spare")
+    hears = noisy.coordinator.receive
+
+    def raises(peer: bytes, message: ToLearner, now: float) -> object:
+        if peer == b"honest":
+            raise ZeroDivisionError("not expected")
+        return hears(peer, message, now)
+
+    noisy.coordinator.receive = raises  # type: ignore[method-assign, assignment]
+    noisy.hears("honest", Heartbeat(1, 0, (0,), (), 0, {}, 0))
+    noisy.hears("spare", Heartbeat(spare, 0, (), (), 0, {}, 0))
+    assert [ticket.peer for ticket in noisy.coordinator.rollouts.held.values()] == [b"spare"]
+
+
 def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
     noisy = Noisy(max_env_failures=0)
     for number in range(10):

@@ -11,8 +11,8 @@ from learner.rollouts.evaluation_tickets import FIRST_TICKET, EvaluationPlan, ev
 from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.rollout import Episode
-from tests.learner.rollouts.test_ticket_coordinator import Learner, of
-from tests.support.conversation.fake_ends import fake_rollout, fake_rows
+from tests.learner.rollouts.test_ticket_coordinator import Learner, of, permits
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows, process_ends
 
 A, B = b"a", b"b"
 
@@ -75,6 +75,19 @@ def test_nothing_of_an_evaluation_counts_in_the_next() -> None:
     assert evaluation.episodes_played == 0
     learner.says(A, answer(order))
     assert [one.episode.length for one in evaluation.end()] == [3, 4]
+
+
+def test_while_it_is_pending_no_rollout_is_dealt() -> None:
+    learner = Learner(lanes=1, max_lag=1)
+    for peer in (A, B):
+        learner.joins(peer)
+    learner.deliver_round()
+    learner.take()
+    learner.coordinator.publish(1, PARAMETERS, BUFFERS)
+    learner.coordinator.begin_evaluation(plan(1, 2))
+    assert permits(learner.balanced(process_ends(learner.coordinator, "a", "killed"))) == []
+    learner.coordinator.evaluation.end()
+    assert [permit.lane for permit in permits(learner.coordinator.begin_update(), B)] == [0, 0]
 
 
 def test_rows_come_in_the_order_of_the_episodes_with_their_numbers_in_the_plan() -> None:

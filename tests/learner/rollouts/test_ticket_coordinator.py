@@ -189,9 +189,12 @@ def test_hello_is_answered_by_welcome_collect_and_weights_in_this_order() -> Non
 
 def test_before_the_first_weights_a_worker_is_welcomed_and_given_nothing() -> None:
     learner = Learner(publish=False)
-    assert kinds(learner.joins(A), A) == [Welcome]
+    for peer in (A, B):
+        ((to, welcome),) = learner.joins(peer)  # lanes are placed when all are here, and do not move from one to the next
+        assert (to, type(welcome)) == (peer, Welcome)
     assert learner.coordinator.rollouts.ledger.issued == 0
-    assert kinds(learner.publish(0), A) == [Collect, Weights]
+    outs = learner.publish(0)
+    assert kinds(outs, A) == kinds(outs, B) == [Collect, Weights]
 
 
 def test_a_repeated_hello_is_answered_by_the_same_welcome() -> None:

@@ -24,6 +24,7 @@ from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
 from protocol.messages import Reset, Step
+from protocol.wire.plain_values import unpack
 from protocol.wire.wake_up import WakeReason
 from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
@@ -171,6 +172,7 @@ def test_the_example_of_send_runs() -> None:
 # ---------------------------------------------------------------- losses
 
 NEXT, SAME, DISABLED = "NextStep", "SameStep", "Disabled"
+LEFT = "worker w1 (host) left: killed"
 
 
 def zeros(ids: Sequence[int]) -> Any:
@@ -182,7 +184,9 @@ def send(env: ZmqVectorEnv, ids: Sequence[int]) -> None:
 
 
 @BOTH_WAYS
-def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_results(shared: bool) -> None:
+def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_results(
+    shared: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     with made(shared=shared) as (env, link):
         env.reset_async(seed=1)
         env.recv(3)
@@ -195,6 +199,7 @@ def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_res
         link.leave("w1")
         rows = received(env, 2)
         assert {n: row.truncated for n, row in rows.items()} == {0: False, 1: True}
+        assert caplog.messages[-1] == f"{LEFT}; its lane 1 comes back truncated (copies 1 to 1)"
         assert rows[1].observation == np.float32(0.8), "the newest that arrived"
         assert (rows[1].reward, rows[1].terminated, rows[1].info) == (0.0, False, {"worker_lost": True})
         send(env, [1, 0])
@@ -271,7 +276,9 @@ def test_results_that_came_before_the_loss_are_returned_first(shared: bool) -> N
 
 
 @BOTH_WAYS
-def test_with_same_step_the_row_of_a_lost_copy_has_its_last_observation_and_a_new_first_one(shared: bool) -> None:
+def test_with_same_step_the_row_of_a_lost_copy_has_its_last_observation_and_a_new_first_one(
+    shared: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     with made(shared=shared, autoreset_mode=SAME) as (env, link):
         env.reset_async(seed=1)
         env.recv(3)
@@ -285,6 +292,7 @@ def test_with_same_step_the_row_of_a_lost_copy_has_its_last_observation_and_a_ne
         assert row.info["final_obs"] == np.float32(0.8)
         assert row.info["worker_lost"]
         assert row.info["final_info"] == {"worker_lost": True}
+        assert caplog.messages[-1] == f"{LEFT}; its lane 1 comes back truncated (copies 1 to 1)"
         resets = [order for order in link.orders if isinstance(order, Reset)]
         assert len(resets) == 4
         assert resets[-1].seeds[0] not in (None, 2), "a seed of its own, but the same whenever this loss is repeated"
@@ -518,6 +526,94 @@ def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> 
         assert {n: float(row.observation[0]) for n, row in received(env, 3).items()} == pytest.approx(
             {0: 0.4, 1: 1.0, 2: 0.4}
         )
+
+
+def test_an_error_that_a_step_in_lock_step_has_raised_is_not_told_again_by_the_next() -> None:
+    with made("workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
+        env.reset(seed=1), env.step(zeros([0, 1, 2]))
+        with pytest.raises(EnvironmentFailed, match="lane 1, copy 0, step 1: its environment raised ValueError"):
+            env.step(zeros([0, 1, 2]))
+        assert not env.step(zeros([0, 1, 2]))[3].any(), "this step resets the new copy"
+
+
+def test_a_copy_that_was_never_reset_is_not_stepped_although_another_of_its_lane_was() -> None:
+    with made(copies=2, lanes=1, workers=1) as (env, _):
+        env.reset_async(env_ids=[0])
+        env.recv(1)
+        with pytest.raises(UsageError, match=r"step before reset of copies \[1\]"):
+            env.step(zeros([0, 1]))
+
+
+def interrupt_after(env: ZmqVectorEnv, *calls: Callable[[], None]) -> None:
+    """While the environment waits, each of these is called, and then the wait is interrupted."""
+    steps = iter(calls)
+
+    def stop() -> None:
+        if (call := next(steps, None)) is None:
+            raise InterruptedError("stop")
+        call()
+
+    env.hub.while_waiting = stop
+
+
+def test_a_loss_of_which_an_interrupted_step_did_not_tell_is_over_when_all_are_reset() -> None:
+    with made(copies=2, lanes=2, workers=2, on_worker_loss="raise") as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0", "w1"}
+        interrupt_after(env, lambda: link.leave("w1"), lambda: None, lambda: None)
+        with pytest.raises(InterruptedError):
+            env.step(zeros([0, 1]))
+        env.hub.while_waiting = lambda: None
+        link.frozen = set()
+        env.reset()
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+
+
+def test_a_lane_whose_results_had_come_has_them_although_its_worker_is_lost_before_another_is_done() -> None:
+    with made(copies=2, lanes=2, workers=2) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0"}
+        send(env, [0, 1])
+        interrupt_after(env, lambda: None, lambda: None)
+        with pytest.raises(InterruptedError):
+            env.recv(2)
+        env.hub.while_waiting = lambda: None
+        link.leave("w1")
+        interrupt_after(env, lambda: None)
+        with pytest.raises(InterruptedError):
+            env.recv(2)
+        env.hub.while_waiting = lambda: None
+        link.frozen = set()
+        assert [row.truncated for row in received(env, 2).values()] == [False, False]
+
+
+def test_each_copy_has_its_own_options_also_if_not_all_are_reset() -> None:
+    with made(copies=2, lanes=1, workers=1) as (env, link):
+        env.reset_async(options=[{"of": 0}, {"of": 1}], env_ids=[1])
+        env.recv(1)
+        (order,) = (order for order in link.orders if isinstance(order, Reset))
+        assert (order.copies, unpack(order.options.data)) == ((1,), [{"of": 1}])
+
+
+def test_a_reset_of_all_copies_moves_lanes_to_newcomers() -> None:
+    with made(copies=2, lanes=2, workers=1) as (env, link):
+        env.reset(seed=1)
+        link.join("w9")
+        env.reset()
+        assert len({lane.owner for lane in env.hub.coordinator.lanes}) == 2
+
+
+def test_a_copy_that_is_reset_without_a_seed_keeps_its_own_for_its_replacement() -> None:
+    with made(autoreset_mode=SAME) as (env, link):
+        for seed in (1, None):
+            env.reset_async(seed=seed)
+            env.recv(3)
+        link.frozen = {"w1"}
+        send(env, [1])
+        link.leave("w1")
+        received(env)
+        last = [order for order in link.orders if isinstance(order, Reset)][-1]
+        assert last.seeds[0] not in (None, 2)
 
 
 def test_without_any_worker_the_wait_ends_and_goes_on_when_one_joins() -> None:
