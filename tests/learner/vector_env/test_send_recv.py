@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 import millrace
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.lane_orders import packed
+from learner.vector_env.lane_orders import packed, step_order
 from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
-from protocol.messages import Reset, Step
+from protocol.messages import LaneIncarnation, Reset, Step
 from protocol.wire.plain_values import unpack
 from protocol.wire.wake_up import WakeReason
 from tests.support.in_process.any_order import AnyOrder, any_order
@@ -207,6 +207,8 @@ def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_res
         assert rows[1].observation == 1.0, "this step resets the new copy"
         assert (rows[1].reward, rows[1].truncated, rows[1].info) == (0.0, False, {})
         assert rows[0].observation == np.float32(0.2), "the other episode went on"
+        (reset,) = [order for order in link.orders if isinstance(order, Reset)][3:]
+        assert (reset.lane, reset.seeds[0] in (None, 2)) == (1, False), "with a seed of the new copy's own"
         send(env, [1])
         assert received(env)[1].observation == np.float32(0.8)
 
@@ -569,6 +571,19 @@ def test_a_loss_of_which_an_interrupted_step_did_not_tell_is_over_when_all_are_r
         assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
 
 
+def test_an_order_that_waited_for_a_worker_is_not_sent_once_nobody_waits_for_it() -> None:
+    with made(copies=1, lanes=1, workers=1) as (env, link):
+        link.leave("w0")
+        interrupt_after(env, lambda: None)
+        with pytest.raises(InterruptedError):
+            env.reset(seed=1)
+        env.hub.while_waiting = lambda: None
+        link.join("w9")
+        env.hub.wait(1.0, together=True)
+        env.reset(seed=2)
+        assert [order.seeds for order in link.orders if isinstance(order, Reset)] == [(2,)]
+
+
 def test_a_lane_whose_results_had_come_has_them_although_its_worker_is_lost_before_another_is_done() -> None:
     with made(copies=2, lanes=2, workers=2) as (env, link):
         env.reset(seed=1)
@@ -776,6 +791,16 @@ def test_a_lost_step_has_all_attempts_to_reset_its_new_copies_and_keeps_the_last
     assert lanes.sent[0] == Sent(reset, 1.0, 1, {0: "last"})
     lanes.reset_instead(0, reset, 2.0, {})
     assert lanes.sent[0] == Sent(reset, 2.0, 2, {0: "last"})
+
+
+def test_an_order_keeps_the_actions_of_its_step_whatever_the_caller_writes_afterwards() -> None:
+    """It may wait for a worker, or be sent again."""
+    actions = np.zeros(2, np.int64)
+    make = step_order([actions])
+    actions[:] = 1
+    order = make(1, 1, LaneIncarnation(0, 0))
+    assert isinstance(order, Step)
+    assert order.actions[0].tolist() == [0, 0]
 
 
 def test_a_long_time_between_two_looks_counts_as_a_short_one() -> None:
