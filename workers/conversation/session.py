@@ -262,12 +262,12 @@ class Session:
             case Weights(version):
                 current.weights.setdefault(version, message)
                 current.drop_weights()  # a late copy of old weights, too
-            case Collect(_, version, permits, received):
+            case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]
-            case Evaluate():
+            case Evaluate() if isinstance(self.run, RunSpec):
                 again = [current.evaluations.take(message.ticket, message)]
-            case Reset() | Step() | Call():
+            case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
                 again = [current.orders.take(message)]
             case Release(_, lanes):
                 return current.release(lanes)

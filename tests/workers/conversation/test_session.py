@@ -32,6 +32,7 @@ from protocol.messages import (
     Release,
     Reset,
     Rollout,
+    Step,
     Stepped,
     ToLearner,
     ToWorker,
@@ -39,7 +40,7 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.space_spec import DiscreteSpace, EnvDescription
-from protocol.specs import DescribeSpec, StepSpec
+from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from protocol.wire.codec import decode_to_learner, encode
 from tests.support.conversation.every_message import to_worker
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
@@ -430,6 +431,23 @@ def test_only_the_newest_order_of_a_lane_counts() -> None:
     assert isinstance(again, SendMessage)
     assert again.message is answer
     assert session.handle(earlier, 0.2) == []
+    assert session.next_work() is None
+
+
+@pytest.mark.parametrize(
+    ("run", "order"),
+    [
+        (RUN, Step(SESSION, 3, 0, 0, ())),
+        (StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ()), collect((0, 0))),
+        (StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ()), EVALUATE),
+    ],
+)
+def test_an_order_of_another_kind_of_session_is_not_taken(run: RunSpec | StepSpec, order: ToWorker) -> None:
+    session = joining()
+    session.tick(0.0)
+    session.handle(Welcome(SESSION, FIRST, run), 0.0)
+    session.handle(weights(0), 0.0)
+    session.handle(order, 0.1)
     assert session.next_work() is None
 
 
