@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+import msgspec
+
 from learner.members.events import (
     Event,
     Failed,
@@ -28,7 +30,7 @@ from learner.members.events import (
 from learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import key_of_peer, name_for_people, worker_name
 from protocol.alive import NO_ENVIRONMENT_CODE
-from protocol.bounds import Stage, Stages, one_line
+from protocol.bounds import Stage, Stages, escaped, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
@@ -109,7 +111,7 @@ class Member:
     ) -> Failed:
         """The event that says that the worker failed, in this lane if it is known."""
         lanes = (lane,) if lane in self.lanes else tuple(sorted(self.lanes))
-        return kind(self.hello.worker, self.hello.host, error, traceback, lanes, self.stepped, spare)
+        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, self.stepped, spare)
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
         """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
@@ -125,7 +127,7 @@ class Member:
         """
         if self.heartbeat is None and not self.hello.is_first_attempt:
             self.stages_before = heartbeat.stages
-        self.heartbeat = heartbeat
+        self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
         self.stepped |= heartbeat.steps > 0
         steps, since_s = self.measured
         if self.heard_s - since_s >= MEASURE_S:  # several may be read at once

@@ -871,6 +871,24 @@ def test_goodbye_forgets_the_worker_and_deals_what_it_held() -> None:
     assert learner.coordinator.events[-1] == WorkerLeft("a", "left: told to stop", 2, True)
 
 
+def test_of_a_heartbeat_no_tickets_are_kept() -> None:
+    """They may be many, and there is one heartbeat for each worker."""
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.beats(A, tickets=range(1000))
+    heartbeat = learner.coordinator.members[A].heartbeat
+    assert heartbeat is not None
+    assert heartbeat.tickets == ()
+
+
+def test_a_traceback_is_safe_to_show() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: \x1b[2J", 0))
+    raised = [event.traceback for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
+    assert raised == ["Traceback: \\x1b[2J"]
+
+
 def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
