@@ -274,7 +274,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.infos_by_copy = self._info_reader.by_copy(ready)
         infos = merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
         observation = batch.observation(copy=self.copy) if copies is None else batch.observation_of_some(copies)
-        return observation, batch.reward.copy()[rows], batch.terminated.copy()[rows], truncated[rows], infos
+        return observation, batch.reward[rows].copy(), batch.terminated[rows].copy(), truncated[rows], infos
 
 
 def _call_in_process(pid: int, function: Callable[[], None]) -> None:
