@@ -139,11 +139,8 @@ def _bare(hint: Any) -> tuple[Any, list[str]]:
     return kind, notes
 
 
-NO_BOUNDS = (LARGEST, 1e9)  # that a reader of the page would meet
-
-
 def _bounds(meta: msgspec.Meta) -> Iterator[str]:
-    le = None if meta.le in NO_BOUNDS else meta.le
+    le = None if meta.le == LARGEST else meta.le  # no reader of the page meets that
     if meta.ge is not None and le is not None:
         yield f", {meta.ge:g} to {le:g}"
         return

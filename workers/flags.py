@@ -10,10 +10,9 @@ import msgspec
 from msgspec import Meta
 
 from protocol.alive import CallTimeouts
-from protocol.bounds import Seconds
-from protocol.flags.fields import Flag
+from protocol.flags.fields import Flag, NotNegative
 
-SecondsFlag = Annotated[Seconds, Flag("S")]
+SecondsFlag = Annotated[NotNegative, Flag("S")]
 HIDDEN = Flag(hidden=True)
 
 

@@ -13,11 +13,11 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
-from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, NotNegative, PPOConfig
+from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, PPOConfig
 from learner.config.resume_rules import Fixed, Free
 from learner.config.rollout_config import RolloutConfig
-from protocol.bounds import MAX_SEEDS, Count, Natural, Seconds
-from protocol.flags.fields import Flag
+from protocol.bounds import MAX_SEEDS, Count, Natural
+from protocol.flags.fields import Flag, NotNegative
 
 TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
 PRESETS = Path(__file__).with_name("presets.toml")
@@ -85,7 +85,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     changes the last bits of results.
     """
 
-    grace_s: Free[Seconds] = 30.0
+    grace_s: Free[NotNegative] = 30.0
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
     it is undone, and the state before it is saved. 0: wait until the update has ended.
     """

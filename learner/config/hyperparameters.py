@@ -11,10 +11,9 @@ from typing import Annotated, Literal
 import msgspec
 
 from learner.config.resume_rules import Fixed, Free
-from protocol.bounds import Count
+from protocol.bounds import Count, Natural
+from protocol.flags.fields import NotNegative, Positive
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Schedule = Literal["constant", "linear"]
 Optimizer = Literal["rmsprop", "adam"]
@@ -66,7 +65,7 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
-    clone_epochs: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
+    clone_epochs: Free[Natural] = 0
     """Number of epochs of cloning on the dataset of --prior, before the first rollouts are collected: the actor learns its
     actions, the critic its returns. Needs --prior.
     """
@@ -183,7 +182,7 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """linear: the learning rate falls to zero over the run."""
     batch_size: Free[Count] = 64
     """Number of transitions in a gradient step."""
-    learning_starts: Free[Annotated[int, msgspec.Meta(ge=0)]] = 1000
+    learning_starts: Free[Natural] = 1000
     """Number of env steps before the first gradient step."""
     replay_size: Fixed[Count] = 100_000
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
@@ -197,7 +196,7 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
     prior_share: Free[Fraction] = 0.5
     """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
-    prior_steps: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
+    prior_steps: Free[Natural] = 0
     """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
     n_step: Free[Count] = 1
     """Number of rewards in a target before it bootstraps."""
@@ -257,13 +256,13 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     """Sizes of the hidden layers: of the actor and of each critic."""
     batch_size: Free[Count] = 256
     """Number of transitions in a gradient step."""
-    learning_starts: Free[Annotated[int, msgspec.Meta(ge=0)]] = 100
+    learning_starts: Free[Natural] = 100
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     replay_size: Fixed[Count] = 1_000_000
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
     the place of one.
     """
-    clone_epochs: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
+    clone_epochs: Free[Natural] = 0
     """Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the actor learns its
     actions. Needs --prior.
     """

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 import msgspec
 
@@ -23,6 +22,7 @@ from learner.config.validation import convert, validate
 from learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError, did_you_mean
+from protocol.flags.fields import fields_of
 
 
 def resolve(
@@ -152,16 +152,10 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     if isinstance(value, str) and value == "none" and default is None:
         return None
     if isinstance(value, float) and value.is_integer():
-        hint = _types(type(record))[name]
-        options = get_args(hint) or (hint,)
+        kind = fields_of(type(record))[name].kind
+        options = get_args(kind) or (kind,)
         return int(value) if int in options and float not in options else value
     return value
-
-
-@cache
-def _types(record: type[msgspec.Struct]) -> dict[str, Any]:
-    """Of each field. Kept, because each look-up evaluates the annotations of the whole record, which takes milliseconds."""
-    return get_type_hints(record)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from msgspec import Meta
 
 from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
-from protocol.bounds import Count, Natural, PositiveSeconds, Seconds
+from protocol.bounds import Count, Natural
 from protocol.env_spec import Scalar
-from protocol.flags.fields import Flag
+from protocol.flags.fields import Flag, NotNegative, Positive
 from protocol.specs import Vector
 from protocol.wire.weight_dtypes import ActingDtype
 
@@ -113,17 +113,17 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     # --------------------------------------------------------------------------------------------- timeouts and failures
 
-    worker_timeout_s: Free[PositiveSeconds] = 5.0
+    worker_timeout_s: Free[Positive] = 5.0
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
     is not silent while its supervisor says that its environment is busy, however long that takes.
     """
-    no_workers_timeout_s: Free[PositiveSeconds] = 600.0
+    no_workers_timeout_s: Free[Positive] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
-    start_timeout_s: Free[Seconds] = 600.0
+    start_timeout_s: Free[NotNegative] = 600.0
     """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
     imports, takes longer than this many seconds. 0: never.
     """
-    step_timeout_s: Free[Seconds] = 600.0
+    step_timeout_s: Free[NotNegative] = 600.0
     """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
     max_env_failures: Free[Natural] = 3
     """End the run when a lane fails more often than this in a row, without a rollout in between, and at the latest after 10

@@ -15,10 +15,9 @@ from millrace.conformance.examiner import Check, CheckResult
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import as_data, explanation, line_of, summary
-from protocol.bounds import PositiveSeconds
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
-from protocol.flags.fields import Flag
+from protocol.flags.fields import Flag, Positive
 from protocol.flags.parse import cut_at_dashes, parse_flags
 
 
@@ -44,11 +43,11 @@ class ConformFlags(msgspec.Struct, frozen=True, kw_only=True):
     """also write the report to FILE, as JSON"""
     with_keys: bool = False
     """encrypt the connection; {token} in COMMAND does so too"""
-    patience_s: PositiveSeconds = 5.0
+    patience_s: Positive = 5.0
     """seconds that an answer of the client may take"""
-    start_s: PositiveSeconds = 20.0
+    start_s: Positive = 20.0
     """seconds that the client may take to start"""
-    limit_s: PositiveSeconds = 300.0
+    limit_s: Positive = 300.0
     """seconds that the whole test may take"""
 
 

@@ -7,11 +7,15 @@ says what neither name nor type can. A field that is a record of its own is no f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import msgspec
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class FlagField(NamedTuple):
         return f"{shown}|none" if self.optional else shown
 
 
+@cache  # each look-up evaluates the annotations of the whole record, which takes milliseconds
 def fields_of(record: type[msgspec.Struct]) -> dict[str, FlagField]:
     """The fields of a record by name, those of its bases first."""
     found = {}
