@@ -21,7 +21,7 @@ from learner.config.config import TABLES, Config
 from learner.config.layers import config_of_run, resolve
 from learner.config.presets import added, environment_name
 from learner.policy_player import saved_policy
-from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder, Which
 from millrace.launch.policy_workers import PlayingWorkers, policy_player

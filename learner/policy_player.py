@@ -17,7 +17,7 @@ from learner.config.rollout_config import RolloutConfig
 from learner.conversations import describe_settings, open_hub
 from learner.members.describe import described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
+from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats

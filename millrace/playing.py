@@ -15,7 +15,7 @@ from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy, saved_policy, useful_workers
 from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_dataset
-from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation
 from millrace.arguments import checked
 from millrace.cli.flags import EvaluateFlags, RecordFlags

@@ -28,7 +28,7 @@ import numpy as np
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import convert_rollout_settings
 from learner.interrupts import Interrupts
-from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.episode_window import EpisodeWindow

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from learner.between_updates.run_parts import RunParts
 from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
-from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Best, Evaluation
 from protocol.errors import UsageError
 from protocol.logs.notices import log_notice

@@ -10,7 +10,7 @@ import numpy as np
 
 from learner.policy_player import PolicyPlayer
 from learner.recording.episodes import RecordedEpisode
-from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
+from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from protocol.arrays import Array
 from protocol.envs.spaces import action_converter_of
 from protocol.messages import EpisodeRows

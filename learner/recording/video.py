@@ -15,7 +15,7 @@ from typing import Any
 
 from learner.policy_player import PolicyPlayer
 from learner.recording.played_episodes import PlayedEpisodes
-from learner.rollouts.evaluation_tickets import PlayedEpisode, episode_seeds, evaluation_of
+from learner.rollouts.evaluation_dealer import PlayedEpisode, episode_seeds, evaluation_of
 from learner.run_folder.regular_files import subfolder
 from learner.run_folder.results import Evaluation
 from protocol.errors import EnvironmentFailed, RunError, UsageError

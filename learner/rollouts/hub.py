@@ -20,7 +20,7 @@ from learner.members.member_states import MemberState
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
+from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.run_status import status

@@ -1,7 +1,7 @@
 """The learner's half of the conversation of a run. Pure: messages and `now` in, messages out; no socket, clock or torch.
 
 Rule: whatever a worker is asked for has a ticket. Two dealers decide what is asked and what an answer means:
-`rollout_tickets.py` and `evaluation_tickets.py`. Here they meet the workers. A lane has one owner at a time and moves only
+`rollout_dealer.py` and `evaluation_dealer.py`. Here they meet the workers. A lane has one owner at a time and moves only
 between rollouts; its new owner starts it afresh, so its incarnation rises. When a worker is lost, its lanes go to other
 workers, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows that a message was lost on
 the way, the message is sent again.
@@ -19,9 +19,9 @@ from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.member_states import SentUnusable
 from learner.members.membership import Member, Membership, Outgoing
 from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_tickets import EvaluationPlan, EvaluationTickets, OnRows
+from learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.rollout_tickets import RolloutTickets
+from learner.rollouts.rollout_dealer import RolloutDealer
 from learner.rollouts.sent_weights import SentWeights
 from protocol.messages import (
     Array,
@@ -57,8 +57,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         incarnations: Sequence[int] = (),
     ) -> None:
         """`ledger` and `incarnations` come from a checkpoint."""
-        self.rollouts = RolloutTickets(run.lanes, max_lag, ledger, incarnations)
-        self.evaluation = EvaluationTickets(run.policy, len(run.facts))
+        self.rollouts = RolloutDealer(run.lanes, max_lag, ledger, incarnations)
+        self.evaluation = EvaluationDealer(run.policy, len(run.facts))
         lanes = self.rollouts.lanes
         membership = Membership(run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, lanes))
         super().__init__(membership, worker_timeout_s)

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 from learner.members.held_up import LONG_S, held_up
 from learner.members.membership import Member
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.bounds import one_line
 

@@ -14,7 +14,7 @@ from learner.between_updates.evaluations import Evaluations
 from learner.between_updates.run_parts import RunParts
 from learner.between_updates.tally import Tally
 from learner.config.config import Config
-from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
+from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.run_folder.atomic_write import Writes
 from learner.run_folder.run_folder import RunFolder

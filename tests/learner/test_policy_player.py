@@ -13,7 +13,7 @@ from learner.config.layers import resolve
 from learner.config.rollout_config import RolloutConfig
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves

@@ -13,7 +13,7 @@ import pytest
 import millrace
 from learner.config.layers import resolve
 from learner.policy_player import saved_policy
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from protocol.arrays import Array

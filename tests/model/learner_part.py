@@ -13,7 +13,7 @@ from learner.members.membership import Membership, Outgoing
 from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.rollout_tickets import RolloutTickets
+from learner.rollouts.rollout_dealer import RolloutDealer
 from learner.rollouts.rounds import Rounds
 from learner.rollouts.sent_weights import SentWeights
 from learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -38,7 +38,7 @@ from tests.support.conversation.rules import check_tickets, waiting_rollouts
 
 SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},
-    RolloutTickets: {"lanes", "ledger", "held", "ready", "rounds", "_to_deal"},
+    RolloutDealer: {"lanes", "ledger", "held", "ready", "rounds", "_to_deal"},
     SentWeights: {"kept"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "versions"}
@@ -52,7 +52,7 @@ SAVED: dict[type, set[str]] = {
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation"},
-    RolloutTickets: {"_absent"},
+    RolloutDealer: {"_absent"},
     SentWeights: set(),
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
     | {"_removed_for_silence", "_stages_of_left"},

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from learner.members.membership import Member, Membership
 from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_tickets import FIRST_TICKET
+from learner.rollouts.evaluation_dealer import FIRST_TICKET
 from tests.model.conversation import Content
 from tests.model.message_content import hello, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, Name, name

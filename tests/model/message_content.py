@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from learner.rollouts.evaluation_tickets import FIRST_TICKET
+from learner.rollouts.evaluation_dealer import FIRST_TICKET
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,

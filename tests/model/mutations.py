@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parent.parent.parent
 COORDINATOR = "learner.rollouts.ticket_coordinator"
-ROLLOUTS = "learner.rollouts.rollout_tickets"
+ROLLOUTS = "learner.rollouts.rollout_dealer"
 WEIGHTS = "learner.rollouts.sent_weights"
 MEMBERS = "learner.members.coordinator"
 LANES = "learner.rollouts.lanes"

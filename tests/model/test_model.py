@@ -14,9 +14,9 @@ import pytest
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership
 from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_tickets import EvaluationTickets
+from learner.rollouts.evaluation_dealer import EvaluationDealer
 from learner.rollouts.lanes import Ticket, TicketedLane
-from learner.rollouts.rollout_tickets import RolloutTickets
+from learner.rollouts.rollout_dealer import RolloutDealer
 from learner.rollouts.rounds import Rounds
 from learner.rollouts.sent_weights import SentWeights
 from learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -109,10 +109,10 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         session._current.rollouts,
         RolloutLane(0),
     ]
-    types = TicketCoordinator, Membership, CollectingMember, RolloutTickets, SentWeights, TicketedLane, Ticket, LanePlacement
+    types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, TicketedLane, Ticket, LanePlacement
     assert [type(each) for each in objects] == [*types, Rounds, Session, _SessionState, HeldRollouts, RolloutLane]
     assert {type(each): set(vars(each)) for each in objects} == known
-    assert set(vars(EvaluationTickets(settings.run.policy))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
+    assert set(vars(EvaluationDealer(settings.run.policy))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
     assert set(vars(HeldEvaluations())) == evaluating_worker.SAVED
     stepping = of_vector_env.Learner(Stepping(workers=1, lanes=1, calls=(), faults=0), 0, 0.0).coordinator
     assert type(stepping) is OrderCoordinator

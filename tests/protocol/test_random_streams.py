@@ -18,7 +18,7 @@ from learner.algorithms.ppo import PPO
 from learner.algorithms.sac import SAC
 from learner.config.hyperparameters import PPOConfig, SACConfig
 from learner.recording.played_episodes import recording_seeds
-from learner.rollouts.evaluation_tickets import episode_seeds
+from learner.rollouts.evaluation_dealer import episode_seeds
 from learner.vector_env.lost_lanes import replacement_seeds
 from protocol.messages import Evaluate
 from protocol.policy.called_policy import Acted, CalledPolicy

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye

@@ -12,7 +12,7 @@ from learner.config.rollout_config import RolloutConfig
 from learner.conversations import open_hub
 from learner.members.events import WorkerLeft, WorkerProcessFailed
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
 from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
 from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello

@@ -13,7 +13,7 @@ from learner.config.validation import MOST_TICKETS
 from learner.members.events import EnvironmentRaised, Failed, PolicyRaised, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.lanes import TicketedLane
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator

@@ -6,7 +6,7 @@ import pytest
 
 from learner.members.held_up import LONG_S
 from learner.members.membership import Member
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
 from protocol.alive import Alive, Doing, WorkerActivity
 from protocol.messages import Goodbye, Heartbeat

@@ -19,7 +19,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
 from learner.policy_player import PolicyPlayer
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_tickets import FIRST_TICKET, EvaluationTickets
+from learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer
 from protocol.messages import EpisodeRows, ToLearner
 from tests.model import learner_part
 from tests.model.conversation import Content
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
 SAVED = {"_plan", "_version", "_first", "_seeds", "_undealt", "held", "_played", "_rows"}
-"""What of `EvaluationTickets` is saved. `_seeds` follow from the plan."""
+"""What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
 NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies"}
 
 
@@ -131,7 +131,7 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     learner = EvaluatingLearner(settings, training.coordinator)
     vars(learner).update(vars(training))
     learner.rows = []
-    tickets: EvaluationTickets = learner.coordinator.evaluation
+    tickets: EvaluationDealer = learner.coordinator.evaluation
     tickets._first = FIRST_TICKET + first
     if not of_evaluation:
         tickets._seeds = [()] * number

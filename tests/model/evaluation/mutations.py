@@ -13,7 +13,7 @@ from tests.model.mutations import COORDINATOR, HELD, SESSION, Mutation, play
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
-TICKETS = "learner.rollouts.evaluation_tickets"
+TICKETS = "learner.rollouts.evaluation_dealer"
 
 MUTATIONS = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),

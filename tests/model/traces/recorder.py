@@ -29,8 +29,8 @@ METHODS = {
         *COMMON,
         *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "drain"),
     ),
-    "RolloutTickets": ("take", "not_used", "incarnations"),
-    "EvaluationTickets": ("end",),
+    "RolloutDealer": ("take", "not_used", "incarnations"),
+    "EvaluationDealer": ("end",),
     "DescribeCoordinator": (*COMMON, "finish"),
     "Membership": ("refuse", "record_activity"),
     "Session": (
@@ -42,7 +42,7 @@ NOT_RECORDED = {  # it changes nothing, or nobody calls it
     "DescribeCoordinator": {"drain", "status"},
     "Session": {"is_unwanted"},
 }
-MADE_BY_THE_COORDINATOR = ("Membership", "RolloutTickets", "EvaluationTickets")
+MADE_BY_THE_COORDINATOR = ("Membership", "RolloutDealer", "EvaluationDealer")
 CHANGE_NOTHING_IF_EMPTY = ("tick", "heartbeat_if_due")
 
 
@@ -142,7 +142,7 @@ class _Finder(MetaPathFinder):
     """Imports some modules with recorded classes."""
 
     classes = {
-        COORDINATOR: ("TicketCoordinator", "Membership", "RolloutTickets", "EvaluationTickets"),
+        COORDINATOR: ("TicketCoordinator", "Membership", "RolloutDealer", "EvaluationDealer"),
         DESCRIBE: ("DescribeCoordinator", "Membership"),
         SESSION: ("Session",),
     }

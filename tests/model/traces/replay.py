@@ -21,7 +21,7 @@ from tests.support.conversation.rules import waiting_rollouts
 from workers.conversation.session import Session
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
-MADE_BY_THE_COORDINATOR = {"Membership": "membership", "RolloutTickets": "rollouts", "EvaluationTickets": "evaluation"}
+MADE_BY_THE_COORDINATOR = {"Membership": "membership", "RolloutDealer": "rollouts", "EvaluationDealer": "evaluation"}
 
 
 class NotAccepted(AssertionError):

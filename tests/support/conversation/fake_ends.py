@@ -18,7 +18,7 @@ import numpy as np
 
 from learner.members.coordinator import Coordinator
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from learner.rollouts.evaluation_tickets import FIRST_TICKET, HELD_AT_ONCE
+from learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from learner.config.layers import resolve
-from learner.rollouts.evaluation_tickets import episode_seeds
+from learner.rollouts.evaluation_dealer import episode_seeds
 from millrace.launch.training import train
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec

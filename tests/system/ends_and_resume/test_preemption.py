@@ -22,7 +22,7 @@ from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms.ppo import PPO
 from learner.config.layers import resolve
 from learner.interrupts import Interrupts
-from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
+from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows

@@ -15,7 +15,7 @@ import millrace
 from learner.config.layers import resolve
 from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.run_folder.metrics_log import read_rows
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.launch.training import train

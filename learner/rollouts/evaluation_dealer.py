@@ -96,7 +96,7 @@ def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) ->
     return msgspec.structs.replace(evaluation, facts=fact_means(facts, [episode.facts for episode in episodes]))
 
 
-class EvaluationTickets:
+class EvaluationDealer:
     """The tickets of the evaluation that is pending, if there is one."""
 
     def __init__(self, policy: PolicySpec, facts: int = 0) -> None:

@@ -18,7 +18,7 @@ from learner.rollouts.rounds import Rounds
 from protocol.messages import Collect, Permit, Received, Rollout
 
 
-class RolloutTickets:
+class RolloutDealer:
     """Lanes, rounds, tickets and the ledger."""
 
     def __init__(self, lanes: int, max_lag: int, ledger: Ledger | None = None, incarnations: Sequence[int] = ()) -> None:

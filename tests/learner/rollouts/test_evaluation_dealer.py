@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pytest
 
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_tickets import FIRST_TICKET, EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationPlan, evaluation_of
 from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.rollout import Episode
