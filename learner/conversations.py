@@ -56,7 +56,7 @@ def rollout_spec(
         images_dtype=config.acting_dtype if policy.convolves else "float32",
         masked=masked,
         extras=extras,
-        facts=config.fact_names(),
+        facts=config.info_keys,
         heartbeat_s=config.heartbeat_s(),
     )
     _check_weights_can_be_sent(env.id, policy, config)

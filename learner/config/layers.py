@@ -147,8 +147,6 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     default = getattr(type(record)(), name)
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    if name == "info_keys" and isinstance(value, list | tuple):
-        return ",".join(map(str, value))
     if isinstance(value, str) and value == "none" and default is None:
         return None
     if isinstance(value, float) and value.is_integer():

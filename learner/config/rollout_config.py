@@ -64,9 +64,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights that
     are sent. With images it halves the work of acting on CPUs with AMX, and is slower elsewhere.
     """
-    info_keys: Free[str] = ""
-    """Names of numbers that the environment reports in info at the end of an episode, separated by commas,
-    such as is_success,distance. Their means are logged.
+    info_keys: Free[tuple[str, ...]] = ()
+    """Names of numbers that the environment reports in info at the end of an episode, such as is_success distance. Their
+    means are logged.
     """
     action_masks: Fixed[Literal["auto", "info", "none"]] = "auto"
     """Which actions are allowed, as the environment says it for a Discrete or MultiDiscrete action. auto: by the key
@@ -131,10 +131,6 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     copy and each hour since the learner began. A failure is an exception or an unusable result of the environment or of an
     `OwnPolicy`, or the end of a worker process without an order: the environment may have ended it.
     """
-
-    def fact_names(self) -> tuple[str, ...]:
-        """The names in `info_keys`."""
-        return tuple(name for part in self.info_keys.split(",") if (name := part.strip()))
 
     def call_timeouts(self) -> CallTimeouts:
         """How long a call of an env copy may take."""

@@ -135,10 +135,10 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
     if (tickets := config.lanes * (1 + config.max_lag)) > MOST_TICKETS:
         expected = f"expected lanes * (1 + max_lag) of at most {MOST_TICKETS}"
         raise UsageError(f"{at}{config.lanes} lanes with max_lag {config.max_lag}: {expected}, got {tickets}")
-    names = config.fact_names()
+    names = config.info_keys
     if len(names) > MAX_FACTS or len(set(names)) < len(names):
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
-    if wrong := [name for name in names if name != one_line(name, MAX_NAME)]:
+    if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
         raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(repr(wrong[0]), MAX_NAME)}")
     if config.wrapper and config.vector != "loop":
         raise UsageError(

@@ -63,7 +63,7 @@ def train(
         env = started.vector_env(known.described)
         stack.callback(env.close)
         masked, timeout_s = known.spaces.masked, config.no_workers_timeout_s
-        lanes = lanes_of(env, config.lanes, config.fact_names(), workers, timeout_s, masked=masked)
+        lanes = lanes_of(env, config.lanes, config.info_keys, workers, timeout_s, masked=masked)
         thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(config.eval_copies), lambda: torch_device(config))
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))

@@ -28,7 +28,7 @@ from website.pages import ROOT
 
 KNOWN = {name for group in METRICS.values() for name in group}
 RUNS: dict[str, dict[str, Any]] = {
-    "ppo": {"algo": "ppo", "info_keys": "distance"},
+    "ppo": {"algo": "ppo", "info_keys": ("distance",)},
     "ppo, Box actions": {"env": "Pendulum-v1", "algo": "ppo"},
     "a2c": {"algo": "a2c"},
     "impala": {"algo": "impala"},

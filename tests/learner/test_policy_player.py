@@ -54,7 +54,7 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     env = EnvSpec("CartPole-v1")
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(8,))
-    folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path), info_keys="of_config"))
+    folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path), info_keys=("of_config",)))
     folder.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32), facts=("of_card",))
     assert saved_policy(folder.path).facts == ("of_card",)
 

@@ -17,7 +17,7 @@ from tests.system.stage.run_folders import policy_of
 ENV = "tests.support.users_code.fact_envs:Facts-v0"
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 4, "envs": 4, "rollout_steps": 32, "n_epochs": 1, "net": (8,),
-    "steps": 1000, "eval_episodes": 4, "info_keys": "level", "progress": False,
+    "steps": 1000, "eval_episodes": 4, "info_keys": ("level",), "progress": False,
 }  # fmt: skip
 
 

@@ -29,7 +29,7 @@ def rows(folder: Path, *names: str) -> list[Any]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("facts")
-    return Path(millrace.train(ENV, run_dir=str(folder), info_keys="is_success, distance", **SMALL))
+    return Path(millrace.train(ENV, run_dir=str(folder), info_keys=("is_success", "distance"), **SMALL))
 
 
 def test_means_of_the_facts_are_logged(run: Path) -> None:
@@ -72,11 +72,11 @@ def test_with_inference_learner_they_are_the_same(run: Path, tmp_path: Path) -> 
 def test_a_resumed_run_may_ask_for_others(run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "millrace")
     few = {**SMALL, "steps": 600, "eval_every": 0}
-    folder = Path(millrace.train(ENV, run_dir=str(tmp_path), info_keys="is_success,distance", **few))
+    folder = Path(millrace.train(ENV, run_dir=str(tmp_path), info_keys=("is_success", "distance"), **few))
     assert rows(folder, *KEYS) == rows(run, *KEYS)[: len(rows(folder))]
     said = [record.getMessage() for record in caplog.records if "info_keys" in record.getMessage()]
     assert said == []
-    assert Path(millrace.train(resume=folder, steps=1000, info_keys="distance,is_sucess")) == folder
+    assert Path(millrace.train(resume=folder, steps=1000, info_keys=("distance", "is_sucess"))) == folder
     found = rows(folder, "rollout/distance", "rollout/distance_missing", "rollout/is_sucess", "rollout/is_success")
     first, later = found[0], found[len(rows(run)) // 2 + 1]
     assert (first[2], later[3]) == (None, None)
@@ -91,12 +91,13 @@ def test_a_resumed_run_may_ask_for_others(run: Path, tmp_path: Path, caplog: pyt
 @pytest.mark.parametrize(
     ("keys", "line"),
     [
-        ("a,a", "info_keys: expected at most 32 different names, got 2"),
-        (",".join(f"k{n}" for n in range(33)), "info_keys: expected at most 32 different names, got 33"),
-        ("a\tb", "info_keys: expected names in one line"),
+        (["a", "a"], "info_keys: expected at most 32 different names, got 2"),
+        ([f"k{n}" for n in range(33)], "info_keys: expected at most 32 different names, got 33"),
+        (["a\tb"], "info_keys: expected names in one line"),
+        ([""], "info_keys: expected names in one line, got ''"),
     ],
 )
-def test_names_that_are_refused(keys: str, line: str, tmp_path: Path) -> None:
+def test_names_that_are_refused(keys: list[str], line: str, tmp_path: Path) -> None:
     with pytest.raises(millrace.UsageError, match=line):
         millrace.train(ENV, run_dir=str(tmp_path), info_keys=keys, **SMALL)
     assert not list(tmp_path.glob("*Facts*"))
@@ -104,4 +105,6 @@ def test_names_that_are_refused(keys: str, line: str, tmp_path: Path) -> None:
 
 def test_text_in_info_ends_the_run_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(millrace.EnvironmentFailed, match="info name: expected a number, got str 'north'"):
-        millrace.train(ENV, run_dir=str(tmp_path), info_keys="name", env_kwargs={"text": True}, max_env_failures=0, **SMALL)
+        millrace.train(
+            ENV, run_dir=str(tmp_path), info_keys=("name",), env_kwargs={"text": True}, max_env_failures=0, **SMALL
+        )
