@@ -73,7 +73,7 @@ TABLE: dict[WorkerState, dict[type, WorkerState]] = {
         WorkerFailed: WorkerState.LEFT,
     },
     WorkerState.DRAINING: {
-        Weights: WorkerState.DRAINING,
+        Weights: WorkerState.DRAINING,  # the next Heartbeat lists them; else the learner would send them after each
         HeartbeatReply: WorkerState.DRAINING,
         Rejoin: WorkerState.LEFT,
         Refuse: WorkerState.LEFT,

@@ -842,6 +842,14 @@ def test_heartbeats_go_on_while_draining() -> None:
     assert sent(session.tick(10.0), Heartbeat)
 
 
+def test_weights_that_come_while_draining_are_listed_so_that_they_are_not_sent_after_each_heartbeat() -> None:
+    session = ready(collect((0, 0)))
+    task_of(session)
+    session.stop()
+    session.handle(weights(1), 0.1)
+    assert versions_held(session) == (0, 1)
+
+
 def test_the_drain_that_answers_its_heartbeats_is_a_sign_of_life_to_a_draining_worker() -> None:
     """The rollout in hand takes longer than learner_timeout_s; a draining learner answers each heartbeat by Drain."""
     session = ready(collect((0, 0)))
