@@ -83,9 +83,8 @@ class Tally:
         state.next_evaluation += every * (1 + (state.env_steps - state.next_evaluation) // every)
 
     def checkpoint_is_due(self) -> bool:
-        """Whether a checkpoint is due now. Before the first update, the time alone asks for one."""
-        since_s = time.monotonic() - self._saved_s
-        return checkpoint_is_due(self._config, since_last_s=since_s, updates=self.state.version)
+        """Whether a checkpoint is due: by time, or after the first update. Until then a killed run has nothing to resume."""
+        return self.state.version == 1 or time.monotonic() - self._saved_s >= self._config.checkpoint_every_s
 
     def saved(self, began_s: float) -> None:
         """A checkpoint was begun at this time, and is written, or refused by the disk. -inf: all are gone, so one is due."""
@@ -114,11 +113,3 @@ class Tally:
     def wall_s(self, snapshot: HubSnapshot) -> float:
         """Seconds of training."""
         return self.wall_before_s + time.monotonic() - self._started_s - snapshot.evaluate_s
-
-
-def checkpoint_is_due(config: Config, *, since_last_s: float, updates: int) -> bool:
-    """Whether to write a checkpoint, `since_last_s` after the last one and after `updates` in all.
-
-    The first update is saved at once: until then a killed run has nothing to resume.
-    """
-    return updates == 1 or since_last_s >= config.checkpoint_every_s

@@ -1,13 +1,16 @@
 """What a run decides by its settings and by numbers."""
 
+import time
 from typing import Any
 
 import pytest
 
 from learner.between_updates.stop_rules import reason_to_stop
-from learner.between_updates.tally import checkpoint_is_due
+from learner.between_updates.tally import Tally
 from learner.config.config import Config
 from learner.config.evaluation_size import evaluation_size, final_evaluation_size
+from learner.run_state import RunState
+from tests.support.conversation.fake_ends import run_spec
 
 
 def reason(config: Config, **numbers: Any) -> str | None:
@@ -31,20 +34,16 @@ def test_a_run_ends_when_a_target_is_reached() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "numbers", "due"),
-    [
-        ({}, {"since_last_s": 59.9}, False),
-        ({}, {"since_last_s": 60.0}, True),
-        ({}, {"updates": 1000}, False),
-        ({"checkpoint_every_s": 0.0}, {}, True),
-        ({}, {"updates": 1}, True),
-    ],
+    ("every_s", "since_last_s", "updates", "due"),
+    [(60.0, 59.9, 0, False), (60.0, 60.0, 0, True), (60.0, 0.0, 1000, False), (0.0, 0.0, 2, True), (60.0, 0.0, 1, True)],
 )
 def test_a_checkpoint_is_due_after_the_first_update_and_by_time(
-    settings: dict[str, Any], numbers: dict[str, Any], due: bool
+    every_s: float, since_last_s: float, updates: int, due: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    none: dict[str, Any] = {"since_last_s": 0.0, "updates": 2}
-    assert checkpoint_is_due(Config(**settings), **{**none, **numbers}) is due
+    monkeypatch.setattr(time, "monotonic", lambda: 0.0)
+    tally = Tally(Config(checkpoint_every_s=every_s), run_spec(), RunState(version=updates))
+    tally.saved(-since_last_s)
+    assert tally.checkpoint_is_due() is due
 
 
 @pytest.mark.parametrize(
