@@ -231,7 +231,8 @@ class EnvironmentFailed(RunError):
 class PolicyFailed(RunError):
     """A policy that the user wrote raised in a worker, or returned what no rollout can hold.
 
-    The line names the worker and the policy. `detail` is the traceback of the worker, if the policy raised.
+    The line names the worker and the policy. `detail` is the traceback of the worker, if the policy raised, and `__cause__`
+    its exception, as that of `EnvironmentFailed`.
 
     >>> import millrace
     >>> class Policy:
@@ -244,9 +245,13 @@ class PolicyFailed(RunError):
     ...         version = service.publish({"w": [[0, 0]] * 4})
     ...         batch = service.gather()
     ... except millrace.PolicyFailed as error:
-    ...     print(error.detail.splitlines()[-1])
-    AttributeError: 'Policy' object has no attribute 'weights'
+    ...     error.__cause__
+    AttributeError("'Policy' object has no attribute 'weights'")
     """
+
+    def __init__(self, line: str, detail: str = "") -> None:
+        super().__init__(line, detail)
+        self.__cause__ = worker_exception(detail)
 
 
 class PeerError(MillraceError):

@@ -115,6 +115,7 @@ def test_an_error_in_it_arrives_with_its_traceback() -> None:
     )
     assert raised.value.exit_code == 1
     assert 'raise ZeroDivisionError("of the user\'s")' in raised.value.detail
+    assert repr(raised.value.__cause__) == repr(ZeroDivisionError("of the user's"))
 
 
 def test_an_environment_that_raises_beside_it_is_not_called_a_policy() -> None:
