@@ -81,7 +81,7 @@ class ActorCritic(Clones):
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
         self.tensors = {"parameters": self.net.flat}
-        optimizer = make_optimizer(config.optimizer, self.net.flat, config.learning_rate, eps=1e-5)  # ε of Stable-Baselines3
+        optimizer = make_optimizer(config.optimizer, self.net.flat, eps=1e-5)  # ε of Stable-Baselines3
         self.optimizers = {"optimizer": optimizer}
 
     # ---------------------------------------------------------------- what an algorithm defines

@@ -54,7 +54,7 @@ class DQN(OffPolicy):
         super().__init__(config, policy, total_steps=total_steps, seed=seed)
         self.net, self.target = (q_network(policy, device, seed) for _ in range(2))
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
-        optimizer = make_optimizer(config.optimizer, self.net.flat, config.learning_rate, amsgrad=config.amsgrad)
+        optimizer = make_optimizer(config.optimizer, self.net.flat, amsgrad=config.amsgrad)
         self.optimizers = {"optimizer": optimizer}
 
     def steps_due(self) -> int:

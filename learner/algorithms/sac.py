@@ -37,7 +37,7 @@ class SAC(Continuous):
         if config.ent_coef is None:
             self.log_temperature.grad = torch.zeros_like(self.log_temperature)
             self.tensors["log_temperature"] = self.log_temperature
-            self.optimizers["ent_coef_optimizer"] = make_optimizer("adam", self.log_temperature, config.learning_rate)
+            self.optimizers["ent_coef_optimizer"] = make_optimizer("adam", self.log_temperature)
         self.target_entropy = -math.prod(policy.action.shape) if config.target_entropy is None else config.target_entropy
 
     @property

@@ -31,8 +31,8 @@ OptimizerState = dict[str, Tensor]
 Kernel = Callable[..., Any]
 
 
-def make_optimizer(kind: str, flat: Tensor, learning_rate: float, **settings: Any) -> Optimizer:
-    """Adam, AdamW or RMSprop for one flat tensor that has a gradient.
+def make_optimizer(kind: str, flat: Tensor, **settings: Any) -> Optimizer:
+    """Adam, AdamW or RMSprop for one flat tensor that has a gradient. Each update sets its learning rate.
 
     Adam has β 0.9 and 0.999, and ε 1e-8 outside the square root; AdamW also decays weights by 0.01; RMSprop has α 0.99.
     `settings`: what torch's optimizer gets instead, such as `eps` and `amsgrad`.
@@ -40,9 +40,9 @@ def make_optimizer(kind: str, flat: Tensor, learning_rate: float, **settings: An
     avoid_compiler_import()
     match kind:
         case "rmsprop":
-            return RMSprop([flat], lr=learning_rate, **{"alpha": 0.99} | settings)
+            return RMSprop([flat], **{"alpha": 0.99} | settings)
         case _:
-            return (AdamW if kind == "adamw" else Adam)([flat], lr=learning_rate, fused=True, **settings)
+            return (AdamW if kind == "adamw" else Adam)([flat], fused=True, **settings)
 
 
 def avoid_compiler_import() -> None:

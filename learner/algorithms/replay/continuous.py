@@ -77,7 +77,7 @@ class Continuous(Clones, OffPolicy):
         self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
-        self.optimizers = {name: make_optimizer("adam", part, config.learning_rate) for name, part in trained.items()}
+        self.optimizers = {name: make_optimizer("adam", part) for name, part in trained.items()}
 
     def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> UpdateMetrics:
         """See `Clones`: the actor alone. It acts from the first env step."""

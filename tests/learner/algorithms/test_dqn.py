@@ -203,6 +203,7 @@ def test_optimizers_differ_as_they_should() -> None:
     start = made["adam"].net.flat.clone()
     for each in made.values():
         each.replay.add(batch(0))
+        each.set_schedules()
         each.step(each.transitions(each.replay.sample(64)))
     adam = made["adam"].net.flat
     torch.testing.assert_close(
