@@ -162,7 +162,7 @@ class RolloutService:
         spec = EnvSpec.of(env, config.env_kwargs, wrappers, config.eval_env_kwargs)
         try:
             with self._interrupts:
-                started = start(
+                self._hub, self.run, described = start(
                     config,
                     spec,
                     policy,
@@ -172,18 +172,17 @@ class RolloutService:
                     listens=listens,
                     past=past,
                 )
-            self._hub, self.run = started.hub, started.run
             if state is not None:
-                _check_restored(state, spec.id, started.run.policy, str(restore))
+                _check_restored(state, spec.id, self.run.policy, str(restore))
                 if state.moments is not None:
                     self.moments.restore(state.moments)
         except BaseException:
             self._resources.close()
             raise
-        self.policy = PolicyParameters(started.run.policy)
+        self.policy = PolicyParameters(self.run.policy)
         """Names, shapes and offsets of the parameters, and initial values."""
-        self.observation_space: gymnasium.Space[Any] = started.described.observation_space
-        self.action_space: gymnasium.Space[Any] = started.described.action_space
+        self.observation_space: gymnasium.Space[Any] = described.observation_space
+        self.action_space: gymnasium.Space[Any] = described.action_space
         self._thread = threading.Thread(target=self._answer_workers, name="millrace-service", daemon=True)
         self._thread.start()
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import workers_to_wait_for
@@ -27,15 +26,6 @@ from protocol.specs import DescribeSpec, RunSpec
 from workers.supervise.supervisor import core_flags, timeout_flags
 
 
-@dataclass(frozen=True)
-class StartedService:
-    """A hub whose workers have joined."""
-
-    hub: Hub
-    run: RunSpec
-    described: DescribedEnv
-
-
 def start(
     config: RolloutConfig,
     env: EnvSpec,
@@ -46,8 +36,8 @@ def start(
     *,
     listens: bool,
     past: tuple[Ledger, Sequence[int]] | None = None,
-) -> StartedService:
-    """Start, and wait until the workers have joined. Closing `resources` releases all that was acquired.
+) -> tuple[Hub, RunSpec, DescribedEnv]:
+    """A hub whose workers have joined, with its run and environment. Closing `resources` releases all that was acquired.
 
     `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
     """
@@ -70,4 +60,4 @@ def start(
         run = rollout_spec(config, env, policy_spec, rollout_steps, policy.extra_arrays, masked=spaces.masked)
         hub = open_hub(config, run, link, processes, check_interrupt, past=past)
         hub.wait_for(workers)
-    return StartedService(hub, run, described)
+    return hub, run, described
