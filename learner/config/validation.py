@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -18,6 +18,7 @@ from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
+from protocol.flags.fields import fields_of
 from protocol.flags.values import what_was_expected
 from protocol.own_module import is_name
 
@@ -213,4 +214,5 @@ def _reworded(message: str, settings: dict[str, Any]) -> str:
     record = settings_record(settings["algo"]) if name in algorithm else Config
     given = algorithm.get(name, settings.get(name))
     given = list(given) if isinstance(given, tuple) else given
-    return f"{name}: {what_was_expected(message, get_type_hints(record).get(name))}, got {given!r}"
+    field = fields_of(record).get(name)
+    return f"{name}: {what_was_expected(message, field and field.hint)}, got {given!r}"
