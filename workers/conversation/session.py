@@ -54,28 +54,28 @@ NO_LEARNER = "no learner answered"
 
 @dataclass(frozen=True)
 class SendMessage:
-    """WorkerEffect: send this message."""
+    """Effect: send this message."""
 
     message: ToLearner
 
 
 @dataclass(frozen=True)
 class StartSession:
-    """WorkerEffect: a new session starts; close every env copy of the last one."""
+    """Effect: a new session starts; close every env copy of the last one."""
 
     run: DescribeSpec | RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
 class CloseLanes:
-    """WorkerEffect: close the env copies of these lanes."""
+    """Effect: close the env copies of these lanes."""
 
     lanes: tuple[LaneIncarnation, ...]
 
 
 @dataclass(frozen=True)
 class Leave:
-    """WorkerEffect: the conversation is over; end with this exit code."""
+    """Effect: the conversation is over; end with this exit code."""
 
     exit_code: int
     reason: str

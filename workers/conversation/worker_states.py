@@ -1,4 +1,4 @@
-"""WorkerState machine of a worker, as a table: the next state for each state and each message or event. Plain data."""
+"""A worker's states in the conversation, as a table: the next one for each state and each message or event. Plain data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from protocol.messages import (
 
 
 class WorkerState(Enum):
-    """WorkerState of a worker in the conversation."""
+    """The state of a worker in the conversation."""
 
     JOINING = "joining"
     READY = "ready"

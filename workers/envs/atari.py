@@ -232,7 +232,7 @@ def _lives_left(env: gymnasium.Env[Any, Any]) -> int:
 
 
 def _silence_emulator() -> None:
-    """Otherwise the emulator prints its name and version in every process."""
+    """Keep the emulator from printing its name and version in every process."""
     import ale_py
 
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
