@@ -28,6 +28,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
     },
     "Evaluations": {
         "eval/mean_reward": Meaning(REWARD, "Mean return of the greedy episodes of an evaluation, in raw rewards."),
+        "eval/env_steps": Meaning(STEPS, "With `--eval-workers`: those of the policy that was evaluated."),
         "eval/mean_ep_length": Meaning(STEPS, "Mean length of these episodes."),
         "eval/NAME": Meaning("its own", "Mean over these episodes of a number of `--info-keys`."),
         "eval/NAME_missing": Meaning(EPISODES, "How many of these episodes did not report the number."),

@@ -129,7 +129,6 @@ class PolicyPlayer:
             heartbeat_s=settings.heartbeat_s(),
         )
         hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
-        hub.wait_for(1)
         hub.publish(0, policy.parameters, policy.buffers, deal=False)
         return hub
 

@@ -47,7 +47,7 @@ LAGS = (0, 1, 2, 4, 8, 16, 32)
 STAGES = {"learner": ("wait", "update", "evaluate", "other"), "worker": ("wait", "open", "act", "step", "evaluate")}
 TICKET_ENDS = ("used", "lost")
 TRANSITION_ENDS = ("used", "duplicate", "late", "invalid")
-STATES = ("active", "spare", "draining")
+STATES = ("active", "spare", "evaluating", "draining")
 
 
 class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):

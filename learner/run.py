@@ -20,7 +20,7 @@ from learner.between_updates.tally import Tally
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
-from learner.config.validation import unused_target
+from learner.config.validation import unused_setting
 from learner.conversations import open_hub
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.prior_dataset import PriorDataset
@@ -134,7 +134,7 @@ def open_run(
     everything fits.
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callback)
-    if line := unused_target(setup.config):
+    if line := unused_setting(setup.config):
         log.warning("%s", line)
     spec = run_spec(setup.config, setup.known.env, setup.known.spaces)
     setup = _use_threads(setup, spec.policy, processes)

@@ -33,7 +33,15 @@ log = logging.getLogger("millrace.learner")
 
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, BadMessage)
 """What loading a state of another form raises."""
+POLICIES = ("best_policy", "pending_policy")  # of a `RunState`; a checkpoint has them as tensors
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
+
+
+class EvaluatedPolicy(msgspec.Struct, frozen=True):
+    """Which policy an evaluation is of."""
+
+    version: Version
+    env_steps: Natural
 
 
 class RunState(msgspec.Struct, kw_only=True):
@@ -54,12 +62,16 @@ class RunState(msgspec.Struct, kw_only=True):
     best: list[Real] | None = None
     """Mean return and env steps of the best evaluation."""
     best_policy: Any = None
-    """Parameters [P] and buffers of the best policy, both float32. None if there is none, or if a checkpoint of an earlier
-    millrace lacks it; then the run folder has it.
-    """
+    """Parameters [P] and buffers of the best policy, both float32."""
     newest_evaluation: Evaluation | None = None
     evaluated_version: Version = -1
     """The version that `newest_evaluation` belongs to."""
+    evaluated_env_steps: Natural = 0
+    """Its env steps."""
+    pending: EvaluatedPolicy | None = None
+    """Of the evaluation beside training that has no result yet."""
+    pending_policy: Any = None
+    """Its parameters [P] and buffers, both float32."""
     next_evaluation: Natural = 0
     """Env steps at which the next evaluation is due; 0 if that is not known."""
 
@@ -67,9 +79,10 @@ class RunState(msgspec.Struct, kw_only=True):
         """The content of a checkpoint: plain data and tensors."""
         import torch
 
-        best = None if self.best_policy is None else [torch.from_numpy(array) for array in self.best_policy]
-        past = msgspec.to_builtins(msgspec.structs.replace(self, best_policy=None))
-        return {"past": past, "best_policy": best, "algorithm": algorithm.state_dict()}
+        policies = {name: getattr(self, name) for name in POLICIES}
+        tensors = {name: each and [torch.from_numpy(array) for array in each] for name, each in policies.items()}
+        past = msgspec.to_builtins(msgspec.structs.replace(self, **dict.fromkeys(POLICIES)))
+        return {"past": past, **tensors, "algorithm": algorithm.state_dict()}
 
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
@@ -78,8 +91,9 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
     try:
         state = msgspec.convert(found.state["past"], RunState)
         EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for what no run has
-        if (best := found.state.get("best_policy")) is not None:
-            state.best_policy = tuple(array.numpy() for array in best)
+        for name in POLICIES:
+            if (policy := found.state[name]) is not None:
+                setattr(state, name, tuple(array.numpy() for array in policy))
         algorithm.load_state_dict(found.state["algorithm"])
     except MISFITS as error:
         raise CheckpointError(

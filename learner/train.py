@@ -1,6 +1,7 @@
 """The training loop. Everything else is called from here; `hub.gather` is the only place that waits for rollouts.
 
 An evaluation belongs to one version: it comes after that version's checkpoint, and before the next rollouts are collected.
+With `eval_workers` it is played beside training: see `evaluations.py`.
 
 With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
 workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
@@ -53,13 +54,15 @@ def train(
         hub.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
 
     def evaluate() -> None:
-        audience.evaluated(evaluations.evaluate_newest(audience.show_now))
-        files.save()
+        if (found := evaluations.evaluate_when_due(audience.show_now)) is not None:
+            audience.evaluated(found)
+            files.save()
 
     files.save()
     try:
         hub.wait_for(workers)
         audience.start()
+        evaluations.begin_again()
         publish(files.weights())
         if tally.evaluation_is_due():  # the run was interrupted before it
             evaluate()
@@ -86,6 +89,8 @@ def train(
                 else:
                     files.save_if_due()
         files.save()
+        if (found := evaluations.end_pending(audience.show_now)) is not None:
+            audience.evaluated(found)
         if evaluations.conclude(audience.show_now):
             audience.evaluated()
         files.save_unless_saved()  # the final policy may be the best

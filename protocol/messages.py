@@ -32,7 +32,7 @@ from protocol.rollout import Episode, Rollout
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
-PROTOCOL_VERSION = 7
+PROTOCOL_VERSION = 8
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
 
@@ -51,6 +51,8 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     attempt: Natural
     """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
     Hello keeps the number. So it also tells which process a Welcome answers."""
+    evaluates: bool = False
+    """true: the worker only plays evaluations, and gets no lane"""
 
     @property
     def is_first_attempt(self) -> bool:
@@ -360,7 +362,7 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     host: str
     pid: int
     state: str
-    """active, or draining"""
+    """active, evaluating (it does only that), or draining"""
     lanes: tuple[int, ...]
     """its lanes; none if it is a spare worker"""
     tickets: int

@@ -63,7 +63,7 @@ def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> i
     timeouts = flags.timeouts()
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s), *timeout_flags(timeouts)]
-    passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "insecure", "no_code") if getattr(flags, flag)]
+    passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "evaluate", "insecure", "no_code") if getattr(flags, flag)]
     passed += [] if flags.core is None else ["--core", str(flags.core)]
 
     def start(number: str) -> WorkerProcess:

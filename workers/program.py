@@ -60,7 +60,7 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
     threading.Thread(target=_end_after_supervisor, args=(flags.parent, flags.address), daemon=True).start()
     join_timeout_s, rejoin_timeout_s = wait_limits_s(flags.join_timeout_s, stay=flags.stay)
     session = Session(
-        identity(flags.called, nonce),
+        identity(flags.called, nonce, evaluates=flags.evaluate),
         time.monotonic(),
         join_timeout_s=join_timeout_s,
         rejoin_timeout_s=rejoin_timeout_s,

@@ -334,7 +334,10 @@ class Worker:
         self._update_statistics()
         self._earlier = self._statistics
         self._collector = self._evaluator = self._stepper = None
-        if why := run.rejection_reason(self._options.code):
+        why = run.rejection_reason(self._options.code)
+        if self._session.identity.evaluates and isinstance(run, StepSpec):
+            why = "a vector environment has no evaluations to play; start this worker without --evaluate"
+        if why:
             self._do(self._session.decline(why))
             return
         try:
@@ -395,15 +398,18 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {first_line(error, '')}".strip()
 
 
-def identity(name: str, process_nonce: int | None = None) -> WorkerIdentity:
-    """Identity of this process, or of a thread of it. `process_nonce`: its secret number; None: draw one."""
+def identity(name: str, process_nonce: int | None = None, *, evaluates: bool = False) -> WorkerIdentity:
+    """Identity of this process, or of a thread of it. `process_nonce`: its secret number; None: draw one.
+
+    `evaluates`: whether it only plays evaluations.
+    """
     try:
         software = f"millrace {version('millrace-rl')}"
     except PackageNotFoundError:
         software = "millrace"
     software = f"{software}, python {platform.python_version()}"
     nonce = int.from_bytes(os.urandom(6), "little") if process_nonce is None else process_nonce
-    return WorkerIdentity(name, socket.gethostname(), os.getpid(), nonce, software)
+    return WorkerIdentity(name, socket.gethostname(), os.getpid(), nonce, software, evaluates)
 
 
 def parent_is_gone(parent: int) -> bool:

@@ -23,9 +23,16 @@ class WorkerThread:
     """A worker in a thread of this process. A thread cannot be killed."""
 
     def __init__(
-        self, address: str, name: str, context: zmq.Context[Any], make_actors: MakeActors = make_local_actors
+        self,
+        address: str,
+        name: str,
+        context: zmq.Context[Any],
+        make_actors: MakeActors = make_local_actors,
+        *,
+        evaluates: bool = False,
     ) -> None:
-        self.name, self._identity = name, identity(name)
+        """`evaluates`: whether it only plays evaluations."""
+        self.name, self._identity = name, identity(name, evaluates=evaluates)
         self.process_nonce = self._identity.process_nonce
         self._page = Activity()
         self._reader = ActivityReader(self._page)

@@ -99,7 +99,7 @@ class Audience:
             self._write_logged()
 
     def evaluated(self, metrics: Row | None = None) -> None:
-        """The newest policy was evaluated. Without `metrics`, its update's row gets only what callbacks log."""
+        """A policy was evaluated. Without `metrics`, its update's row gets only what callbacks log."""
         progress = self.progress()
         if metrics is not None:
             self._write_row(progress, metrics)
@@ -166,6 +166,8 @@ class Audience:
             settings=self._settings,
             episodes=tally.new_episodes,
             evaluation=state.newest_evaluation,
+            evaluated_version=state.evaluated_version,
+            evaluated_env_steps=state.evaluated_env_steps,
             checkpoint=self._files.checkpoint,
             requests=self._requests,
             **self._update,

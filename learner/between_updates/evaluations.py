@@ -2,6 +2,10 @@
 
 The highest of several evaluations is biased upwards. So the summary reports the best policy by a
 second evaluation, on other episodes.
+
+Rule: without `eval_workers`, training waits for each evaluation. With them, an evaluation is beside training: its result
+counts when the next one is due, or at the end, and is awaited there. So it does not depend on anybody's speed what a run
+does. The policy that was evaluated is kept until then.
 """
 
 from __future__ import annotations
@@ -13,8 +17,10 @@ from collections.abc import Callable
 from learner.between_updates.run_parts import RunParts
 from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
 from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from learner.run_folder.results import Best, Evaluation
-from protocol.errors import UsageError
+from learner.run_folder.progress import Row
+from learner.run_folder.results import EVALUATED_AT_KEY, Best, Evaluation
+from learner.run_state import EvaluatedPolicy
+from protocol.arrays import Floats
 from protocol.logs.notices import log_notice
 from protocol.random_streams import Purpose
 
@@ -32,15 +38,42 @@ class Evaluations:
         self._tally, self._state = run.tally, run.tally.state
         self.write_best()  # the folder may have that of a later version, which was lost
 
-    def evaluate_newest(self, watch: Callable[[], None]) -> dict[str, float | None]:
+    def begin_again(self) -> None:
+        """Begin the evaluation again that was beside training when the run was interrupted. Its weights are published."""
+        if (pending := self._state.pending) is not None:
+            self._run.hub.publish(pending.version, *self._state.pending_policy, deal=False)
+            self._begin_beside()
+
+    def evaluate_when_due(self, watch: Callable[[], None]) -> Row | None:
         """Make the evaluation that is due, of the newest policy. Returns its metrics.
 
-        `watch` is called several times a second during an evaluation.
+        With `eval_workers`, begin it, and return those of the one before: None for the first. `watch` is called several
+        times a second during an evaluation.
         """
-        found = self._evaluate_newest(evaluation_size(self._config), watch)
-        self._keep_if_best(found)
+        if not self._config.eval_workers:
+            found = self._evaluate_newest(evaluation_size(self._config), watch)
+            self._keep_if_best(found, self._state.env_steps, self._run.algorithm.weights)
+            self._tally.evaluated()
+            return found.metrics()
+        metrics = self.end_pending(watch)
         self._tally.evaluated()
-        return found.metrics()
+        if self._tally.stop_reason() is None:
+            self._state.pending = EvaluatedPolicy(self._state.version, self._state.env_steps)
+            self._state.pending_policy = self._run.algorithm.weights()
+            self._begin_beside()
+        return metrics
+
+    def end_pending(self, watch: Callable[[], None]) -> Row | None:
+        """Wait for the evaluation beside training, if there is one. Returns its metrics, and which policy they are of."""
+        state = self._state
+        pending, policy = state.pending, state.pending_policy
+        if pending is None:
+            return None
+        found = self._end(watch)
+        state.pending = state.pending_policy = None
+        self._found(found, pending)
+        self._keep_if_best(found, pending.env_steps, lambda: policy)
+        return found.metrics() | {EVALUATED_AT_KEY: pending.env_steps}
 
     def conclude(self, watch: Callable[[], None]) -> bool:
         """Evaluate the final policy. If the run kept a best policy, evaluate that one too, on other episodes: `confirmed`.
@@ -53,7 +86,7 @@ class Evaluations:
             log_notice(log, _smaller(size, usual))
         found = self._evaluate_newest(size, watch)
         if self._config.eval_every or state.best is not None:  # best: of a run that was resumed with eval_every 0
-            self._keep_if_best(found)
+            self._keep_if_best(found, state.env_steps, self._run.algorithm.weights)
         self.confirmed = self._confirm(size, watch)
         return found is not before
 
@@ -77,13 +110,6 @@ class Evaluations:
         state = self._state
         if state.best is None:
             return None
-        if state.best_policy is None:
-            try:
-                _, parameters, buffers = self._run.folder.read_policy("best")
-            except UsageError as error:
-                log.warning("%s", error)
-                return None
-            state.best_policy = parameters, buffers
         chosen_by, at_env_steps = state.best
         self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
         confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
@@ -93,25 +119,43 @@ class Evaluations:
         """Evaluate the newest policy; the same version is not evaluated twice."""
         state, found = self._state, self.of_newest()
         if found is None or found.episodes != size.episodes:
-            state.newest_evaluation = found = self._evaluate(Purpose.EVALUATION, size, watch)
-            state.evaluated_version = state.version
-            self._tally.note = f"{state.env_steps:,} env steps: greedy {found}"
+            found = self._evaluate(Purpose.EVALUATION, size, watch)
+            self._found(found, EvaluatedPolicy(state.version, state.env_steps))
         return found
 
+    def _found(self, found: Evaluation, of: EvaluatedPolicy) -> None:
+        """The newest evaluation found this, of this policy."""
+        state = self._state
+        state.newest_evaluation, state.evaluated_version, state.evaluated_env_steps = found, of.version, of.env_steps
+        self._tally.note = f"{of.env_steps:,} env steps: greedy {found}"
+
     def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
-        """Evaluate the weights that were published last."""
-        config, began_s = self._config, time.monotonic()
-        plan = EvaluationPlan.of(size.episodes, config.seed, config.eval_copies, size.max_steps, purpose)
-        played = self._run.hub.evaluate(plan, lambda played, env_steps: watch())
+        """Evaluate the weights that were published last, while training waits."""
+        self._run.hub.begin_evaluation(self._plan(purpose, size))
+        return self._end(watch)
+
+    def _begin_beside(self) -> None:
+        """Begin to evaluate the weights that were published last, beside training."""
+        self._run.hub.begin_evaluation(self._plan(Purpose.EVALUATION, evaluation_size(self._config)), beside=True)
+
+    def _plan(self, purpose: Purpose, size: EvaluationSize) -> EvaluationPlan:
+        return EvaluationPlan.of(size.episodes, self._config.seed, self._config.eval_copies, size.max_steps, purpose)
+
+    def _end(self, watch: Callable[[], None]) -> Evaluation:
+        """Wait for the evaluation that was begun."""
+        began_s = time.monotonic()
+        played = self._run.hub.end_evaluation(lambda played, env_steps: watch())
         self._tally.evaluate_s += time.monotonic() - began_s
         return evaluation_of(played, self._run.spec.facts)
 
-    def _keep_if_best(self, found: Evaluation) -> None:
-        """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""
+    def _keep_if_best(self, found: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
+        """Keep the policy, of which this was found after so many env steps, if it is the best.
+
+        A tie keeps the earlier one, which needed fewer steps.
+        """
         state = self._state
         if state.best is None or found.return_mean > state.best[0]:
-            state.best = [found.return_mean, state.env_steps]
-            state.best_policy = self._run.algorithm.weights()
+            state.best, state.best_policy = [found.return_mean, env_steps], policy()
             self.write_best()
 
 

@@ -47,7 +47,9 @@ class RunFiles:
         self.on_saved: Callable[[], None] = lambda: None
         """Called after a checkpoint was written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps)
-        self._saved: tuple[int, int, list[float] | None, int] | None = None  # what `_position` was in the newest checkpoint
+        self._saved: tuple[int, int, int, list[float] | None, int] | None = (
+            None  # what `_position` was in the newest checkpoint
+        )
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
 
     def weights(self) -> tuple[Floats, Floats]:
@@ -187,10 +189,10 @@ class RunFiles:
         if self._folder.lock is not None:
             self._folder.lock.confirm()
 
-    def _position(self) -> tuple[int, int, list[float] | None, int]:
-        """What of the state changes when the run goes on: version, next evaluation, best policy, set attributes."""
+    def _position(self) -> tuple[int, int, int, list[float] | None, int]:
+        """What of the state changes when the run goes on: version, evaluations, best policy, set attributes."""
         state = self._state
-        return state.version, state.next_evaluation, state.best, self._attributes.changes
+        return state.version, state.next_evaluation, state.evaluated_version, state.best, self._attributes.changes
 
     def _summary(self, reason: str, cut_short: bool) -> Summary:
         config, state, tally, snapshot = self._config, self._state, self._tally, self._hub.snapshot()

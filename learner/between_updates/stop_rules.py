@@ -6,16 +6,23 @@ from learner.config.config import Config
 
 
 def reason_to_stop(
-    config: Config, *, env_steps_after_next_update: int, evaluation_return: float | None, training_return: float | None
+    config: Config,
+    *,
+    env_steps_after_next_update: int,
+    evaluation_return: float | None,
+    training_return: float | None,
+    evaluated_before: int | None = None,
 ) -> str | None:
     """Why the run should end now, or None.
 
     `evaluation_return`: mean return of the newest greedy evaluation, if there was one. `training_return`: mean return of
-    the last episodes of training, if there were enough of them.
+    the last episodes of training, if there were enough of them. `evaluated_before`: env steps of the policy of this
+    evaluation, if training went on meanwhile.
     """
     target = config.target_return
     if target is not None and evaluation_return is not None and evaluation_return >= target:
-        return f"target return {target:g} reached"
+        by = "" if evaluated_before is None else f" by the policy of {evaluated_before:,} env steps"
+        return f"target return {target:g} reached{by}"
     target = config.target_mean_return
     if target is not None and training_return is not None and training_return >= target:
         return f"mean return {target:g} of the last episodes reached"

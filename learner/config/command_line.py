@@ -37,7 +37,7 @@ BASIC = (
     "preset", "config", "resume", "run_dir", "eval_episodes", "eval_every", "target_return", "target_mean_return",
 )  # fmt: skip
 GROUPS = {
-    "evaluation": ("eval_env_kwargs", "eval_copies", "eval_max_steps", "info_keys"),
+    "evaluation": ("eval_env_kwargs", "eval_workers", "eval_copies", "eval_max_steps", "info_keys"),
     "workers": (
         "lanes", "max_lag", "vector", "action_masks", "inference", "acting_dtype", "torch_threads", "max_env_copies",
         "min_workers", "launched_workers",

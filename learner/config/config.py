@@ -59,6 +59,12 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
+    eval_workers: Free[Natural] = 0
+    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them, beside workers; a learner
+    waits for none, and takes those that `millrace worker --evaluate` starts. The result counts at the next evaluation, or at
+    the end, where the learner waits for it. If no such worker is left by then, the others play. 0: all workers evaluate,
+    and training waits.
+    """
     eval_copies: Free[Annotated[int, Meta(ge=1, le=MAX_SEEDS)]] = 4
     """Number of evaluation episodes that a worker plays at the same time, on env copies of their own. The last bits of
     results may depend on this number. Results do not depend on the number of workers.
@@ -98,8 +104,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # -------------------------------------------------------------------------------------------------------------- files
 
     checkpoint_every_s: Free[NotNegative] = 60.0
-    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation. 0: after
-    each update.
+    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation for which
+    training waits. 0: after each update.
     """
     keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""

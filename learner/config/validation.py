@@ -74,7 +74,8 @@ def validate(config: Config, where: str = "") -> Config:
 
 def check_copies(config: Config, limit: str, most: int) -> None:
     """Raise `UsageError` if `most` env copies (0: any number) are too few for the run. `limit`: what sets this number."""
-    evaluate = min(config.eval_copies, evaluation_size(config).episodes)  # on one worker
+    # Each worker that evaluates keeps its copies: one, or those that only evaluate and one that does if they are lost.
+    evaluate = min(config.eval_copies, evaluation_size(config).episodes) * (config.eval_workers + 1)
     if 0 < most < config.envs + evaluate:
         raise UsageError(
             f"{limit} {most}: expected at least {config.envs + evaluate}, for {config.envs} env copies and {evaluate} "
@@ -109,9 +110,13 @@ def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
     return config.min_workers or local
 
 
-def unused_target(config: Config) -> str:
-    """A line for the user if no evaluation during training can reach `target_return`, or nothing."""
-    if config.target_return is None or config.eval_every:
+def unused_setting(config: Config) -> str:
+    """A line for the user if a setting of evaluations during training has no effect, because there are none; or nothing."""
+    if config.eval_every:
+        return ""
+    if config.eval_workers:
+        return f"eval_workers {config.eval_workers}: there is nothing to evaluate during training; take --eval-every N too"
+    if config.target_return is None:
         return ""
     return f"target_return {config.target_return:g} ends no run without evaluations during training; take --eval-every N too"
 
@@ -190,6 +195,8 @@ def _check_learner_inference(config: Config, at: str) -> None:
         wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
     elif config.vector != "loop":
         wrong = f"vector: expected loop, got {config.vector}; its workers step copies one by one"
+    elif config.eval_workers:
+        wrong = f"eval_workers: expected 0, got {config.eval_workers}; its workers step copies, and cannot evaluate alone"
     else:
         return
     raise UsageError(f"{at}inference learner: {wrong}")

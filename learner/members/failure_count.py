@@ -69,6 +69,9 @@ class FailureCount:
         """A rollout of this lane has arrived."""
         self._in_a_row.pop(lane, None)
 
-    def evaluated(self) -> None:
-        """Episodes of an evaluation were played; they belong to no lane."""
-        self._in_a_row.clear()
+    def evaluated(self, worker: str | None = None) -> None:
+        """Episodes of an evaluation were played; they belong to no lane. `worker`: who played them beside training."""
+        if worker is None:
+            self._in_a_row.clear()
+        else:
+            self._in_a_row.pop(worker, None)

@@ -1,8 +1,8 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
-Rule: every lane has an owner as long as there are workers, and no worker has two lanes more than another. A lane moves
-only between its rollouts. Placement is computed again only after an event that can change it: with a thousand workers, to
-look at all of them at each rollout would cost more than the rollout.
+Rule: every lane has an owner as long as there are workers, and no worker has two lanes more than another. Workers that only
+evaluate have none. A lane moves only between its rollouts. Placement is computed again only after an event that can change
+it: with a thousand workers, to look at all of them at each rollout would cost more than the rollout.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ L = TypeVar("L", bound=PlacedLane)
 
 
 def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
-    """Whether the run needs no environment of this worker: it holds no lane, and every lane has a worker."""
-    return not member.lanes and all(lane.owner is not None for lane in lanes)
+    """Whether the run needs no environment of this worker: it may have a lane and has none, and every lane has a worker."""
+    return not (member.hello.evaluates or member.lanes) and all(lane.owner is not None for lane in lanes)
 
 
 class LanePlacement(Generic[L]):
@@ -80,8 +80,9 @@ class LanePlacement(Generic[L]):
         if not self._unplaced and len({lane.owner for lane in self._lanes}) == len(self._lanes):
             self._stop_waiting()
             return []  # every lane has a worker of its own: nothing moves, however many spares there are
-        members = sorted(active, key=lambda member: member.join_number)
-        self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
+        members = sorted((each for each in active if not each.hello.evaluates), key=lambda member: member.join_number)
+        if members:
+            self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
         return self.even_out(members)
 
     def assign(self, lanes: Iterable[L], members: Iterable[Member]) -> None:

@@ -156,17 +156,23 @@ class MemberServer:
         self._log.warn_limited(peer, line)
 
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
-        """Call `turn`, which listens, until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`."""
+        """Call `turn`, which listens, until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`.
+
+        Workers that only evaluate do not count.
+        """
         deadline_s = self._clock() + timeout_s
-        while len(self._membership.members) < workers:
+        while len(self._membership.collectors()) < workers:
             if self._clock() > deadline_s:
                 raise self.no_workers(workers, timeout_s)
             turn()
 
-    def check_members(self, timeout_s: float) -> None:
-        """Raise `NoWorkers` if every call for `timeout_s` has found no worker. Call it after each turn of a wait."""
+    def check_members(self, timeout_s: float, *, collecting: bool = False) -> None:
+        """Raise `NoWorkers` if every call for `timeout_s` has found no worker. Call it after each turn of a wait.
+
+        `collecting`: workers that only evaluate are no help.
+        """
         now = self._clock()
-        if self._membership.members:
+        if any(not (collecting and member.hello.evaluates) for member in self._membership.members.values()):
             self._no_members_since_s = math.inf
             return
         self._no_members_since_s = min(self._no_members_since_s, now)

@@ -165,7 +165,7 @@ class Member:
             worker=self.hello.worker,
             host=self.hello.host,
             pid=self.hello.pid,
-            state=self.state.value,
+            state="evaluating" if self.hello.evaluates and self.state is MemberState.ACTIVE else self.state.value,
             lanes=tuple(sorted(self.lanes)),
             tickets=len(self.tickets),
             steps=heartbeat.steps if heartbeat else 0,
@@ -204,8 +204,10 @@ class Membership(Generic[M]):
         self.events: list[Event] = []
         self.draining: str | None = None
         """why the workers were asked to leave; None while they were not"""
-        self.progress = 0
-        """how often a member has reported more env steps, or more calls of the environment that have returned"""
+        self.progress = {False: 0, True: 0}
+        """how often a member has reported more env steps, or more calls of the environment that have returned: by whether it
+        only evaluates
+        """
         self._run, self._member_class, self._on_removed, self.is_spare = run, member_class, on_removed, is_spare
         self._next_session = first_session
         self._joins = 0
@@ -218,6 +220,10 @@ class Membership(Generic[M]):
     def active(self) -> list[M]:
         """The members that are given work, in the order in which they joined."""
         return [member for member in self.members.values() if member.state is MemberState.ACTIVE]
+
+    def collectors(self) -> list[M]:
+        """The members that may have lanes."""
+        return [member for member in self.members.values() if not member.hello.evaluates]
 
     def status(self, now: float) -> tuple[WorkerStatus, ...]:
         """A row of `millrace status` for each member, in the order in which they joined."""
@@ -242,7 +248,7 @@ class Membership(Generic[M]):
             return None
         member.heard_s = now
         if isinstance(message, Heartbeat) and message.steps > (member.heartbeat.steps if member.heartbeat else 0):
-            self.progress += 1
+            self.progress[member.hello.evaluates] += 1
         return member
 
     def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
@@ -322,8 +328,8 @@ class Membership(Generic[M]):
     def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> None:
         """Record what a member's process does. `key`: that of the supervisor which says so; None: this program is it."""
         member = self._of_process.get((activity.worker, activity.process_nonce))
-        if member is not None and (key is None or key == key_of_peer(member.peer)):
-            self.progress += member.record_activity(activity, now)
+        if member is not None and (key is None or key == key_of_peer(member.peer)) and member.record_activity(activity, now):
+            self.progress[member.hello.evaluates] += 1
 
     def record_exit(self, worker_exit: WorkerExit, key: bytes | None = None) -> bool:
         """A member's process has ended: remove the member. True if it was one. `key`: as for `record_activity`."""

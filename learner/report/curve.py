@@ -12,6 +12,7 @@ from learner.config.presets import environment_name
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.regular_files import reason
+from learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.run_format import check_format, read_config
 from protocol.arrays import Doubles
@@ -44,8 +45,12 @@ class RunRecord(NamedTuple):
     rows: list[dict[str, Any]]
 
     def points(self, key: str) -> list[tuple[float, float]]:
-        """Env steps and value of this metric, for each row that has it. Values are cut to ±1e300: axes are longer."""
-        found = ((row[ENV_STEPS_KEY], row.get(key)) for row in self.rows)
+        """Env steps and value of this metric, for each row that has it. Values are cut to ±1e300: axes are longer.
+
+        The env steps of an evaluation are those of the policy that was evaluated.
+        """
+        at = EVALUATED_AT_KEY if key == EVALUATION_KEY else ENV_STEPS_KEY
+        found = ((row.get(at, row[ENV_STEPS_KEY]), row.get(key)) for row in self.rows)
         return [(steps, min(max(value, -LARGEST_DRAWN), LARGEST_DRAWN)) for steps, value in found if value is not None]
 
     def curve(self) -> Curve | None:

@@ -1,8 +1,9 @@
 """The tickets of one evaluation: which episodes are still to be played, and who plays them. Pure.
 
 Rule: the seeds are cut into tickets of `copies` seeds, whatever the number of workers, so the result does not depend on that
-number. Every active worker gets tickets, also one without a lane. A ticket whose worker is lost goes to another. The numbers
-of these tickets start at `FIRST_TICKET`, far above those of rollouts, and the ledger does not count them.
+number. An evaluation beside training is played by the workers that only evaluate; any other, by every active worker, also
+one without a lane. A ticket whose worker is lost goes to another. The numbers of these tickets start at `FIRST_TICKET`, far
+above those of rollouts, and the ledger does not count them.
 
 Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
 an answer that could not be used, is dropped, and its ticket is played again from the start.
@@ -106,8 +107,12 @@ class EvaluationDealer:
         self.most_copies: int | None = None
         """most env copies that play, on all workers together, unless one worker has more; None: no limit"""
         self._policy, self._facts = policy, facts
+        self.beside = False
+        """whether the pending evaluation is beside training"""
+        self._most_workers = 0  # that play, if there is a limit of copies; 0: as many as it allows
         self._plan: EvaluationPlan | None = None
-        self._version = -1
+        self.version = -1
+        """of the weights that are evaluated"""
         self._on_rows: OnRows | None = None
         self._first = FIRST_TICKET  # number of the first ticket of this evaluation
         self._seeds: list[tuple[int, ...]] = []  # of each ticket
@@ -140,14 +145,18 @@ class EvaluationDealer:
         """The workers that hold tickets."""
         return list({member.peer: member for member in self.held.values()}.values())
 
-    def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None) -> None:
-        """Begin to evaluate this version. `deal` then gives out the tickets."""
+    def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
+        """Begin to evaluate this version, `beside` training if so. `deal` then gives out the tickets."""
         assert not self.pending, "an evaluation is pending"
         self._first += len(self._seeds)
-        self._plan, self._version, self._on_rows = plan, version, on_rows
+        self._plan, self.version, self._on_rows, self.beside, self._most_workers = plan, version, on_rows, beside, 0
         self._seeds = [plan.seeds[i : i + plan.copies] for i in range(0, len(plan.seeds), plan.copies)]
         self._undealt = list(range(len(self._seeds)))
         self._played, self._rows = {}, {}
+
+    def all_play(self) -> None:
+        """The pending evaluation is beside training no more. With a limit of copies, one other worker plays."""
+        self.beside, self._most_workers = False, 1
 
     def end(self) -> list[PlayedEpisode]:
         """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
@@ -158,14 +167,17 @@ class EvaluationDealer:
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
     def deal(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give tickets to these workers, in the order of joining: one to each, then a second while there are plenty.
+        """Give tickets to those of these workers that play: one to each, then a second while there are plenty.
 
-        With a limit of copies, the first to join play, because a worker keeps its copies.
+        They are in the order of joining, those that only evaluate first. With a limit of copies, the first of them play,
+        because a worker keeps its copies.
         """
-        plan, members, out = self._plan, active, list[Outgoing]()
+        plan, out = self._plan, list[Outgoing]()
         assert plan is not None
+        members = [member for member in active if member.hello.evaluates]
+        members += [] if self.beside else [member for member in active if not member.hello.evaluates]
         if self.most_copies is not None:
-            members = active[: max(1, self.most_copies // plan.copies)]
+            members = members[: self._most_workers or max(1, self.most_copies // plan.copies)]
         holds = Counter(member.peer for member in self.held.values())
         for most in range(1, HELD_AT_ONCE + 1):
             for member in members:
@@ -183,7 +195,7 @@ class EvaluationDealer:
 
     def versions(self, tickets: Iterable[int]) -> set[int]:
         """The versions that these tickets name, those of an evaluation among them."""
-        return {self._version for number in tickets if number in self.held}
+        return {self.version for number in tickets if number in self.held}
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
         """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""
@@ -242,7 +254,7 @@ class EvaluationDealer:
         return Evaluate(
             session=member.session,
             ticket=number,
-            version=self._version,
+            version=self.version,
             seeds=self._seeds[number - self._first],
             greedy=plan.greedy,
             most_steps=plan.most_steps,

@@ -29,7 +29,7 @@ from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.rollouts.waiting import LearnerTime
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
-from protocol.address import name_for_people
+from protocol.address import name_for_people, worker_name
 from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import Stages, one_line
@@ -96,14 +96,14 @@ class HubSnapshot(NamedTuple):
     refused_handshakes: int
 
     def worker_states(self) -> Counter[str]:
-        """Number of workers that are active, draining, or spare (active without a lane)."""
+        """Number of workers that are active, draining, spare (active without a lane), or evaluating (they do only that)."""
         return Counter(_state(member) for member in self.members)
 
 
 def _state(member: CollectingMember) -> str:
     if member.state is MemberState.DRAINING:
         return "draining"
-    return "active" if member.lanes else "spare"
+    return "evaluating" if member.hello.evaluates else "active" if member.lanes else "spare"
 
 
 HubObserver = Callable[["Hub"], None]
@@ -190,10 +190,12 @@ class Hub:
         self.coordinator.rollouts.not_used(taken)
         self.weight_age.not_used(self._lags)
 
-    def evaluate(
-        self, plan: EvaluationPlan, watch: Callable[[int, int], None], on_rows: OnRows | None = None
-    ) -> list[PlayedEpisode]:
-        """Let the workers play these episodes under the newest weights. Returns them in the order of their seeds.
+    def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
+        """Let the workers play these episodes under the newest weights; `beside` training, those that only evaluate."""
+        self._server.send(self.coordinator.begin_evaluation(plan, on_rows, beside=beside))
+
+    def end_evaluation(self, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
+        """Wait for the evaluation that was begun. Returns its episodes in the order of their seeds.
 
         `watch` is called with the numbers of episodes played and of env steps, at least every `POLL_S`. Raises as `gather`
         does.
@@ -203,11 +205,15 @@ class Hub:
         def env_steps() -> int:
             return max(0, self._worker_steps() - steps_before)  # it falls if a worker is lost
 
+        def done() -> bool | None:
+            if not evaluation.done and evaluation.beside:
+                self._server.send(self.coordinator.await_evaluation())
+            return evaluation.done or None
+
         self._time.turn("evaluating", self._clock())
-        self._server.send(self.coordinator.begin_evaluation(plan, on_rows))
         try:
             self._wait(
-                lambda: evaluation.done or None,
+                done,
                 lambda: self._worker_steps() + evaluation.episodes_played,
                 lambda: watch(evaluation.episodes_played, env_steps()),
                 "no env step of an evaluation was made",
@@ -217,6 +223,13 @@ class Hub:
             self._time.turn("learning", self._clock())
         self.weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
         return played
+
+    def evaluate(
+        self, plan: EvaluationPlan, watch: Callable[[int, int], None], on_rows: OnRows | None = None
+    ) -> list[PlayedEpisode]:
+        """`begin_evaluation` and `end_evaluation`: all workers play, and meanwhile none collects."""
+        self.begin_evaluation(plan, on_rows)
+        return self.end_evaluation(watch)
 
     def pulse(self) -> None:
         """Answer the workers, then remove those that have been silent for too long, unless that was just done.
@@ -290,7 +303,7 @@ class Hub:
         while (result := done()) is None:
             self._turn(POLL_S)
             now = self._clock()
-            match self._stall_watch.check(now, progress()):
+            match self._stall_watch.check(now, progress(), evaluating=self._evaluating):
                 case Standstill(refuse=()):
                     raise Stalled(f"{nothing_came} for {self.settings.stall_timeout_s:.0f} s; {self.waiting(now)}")
                 case Standstill(members, why):
@@ -299,6 +312,10 @@ class Hub:
             watch()
         self._time.turn("learning", self._clock())
         return result
+
+    @property
+    def _evaluating(self) -> bool:
+        return self._time.phase == "evaluating"
 
     def _worker_steps(self) -> int:
         """Env steps of all workers, as of their last heartbeats."""
@@ -312,7 +329,7 @@ class Hub:
         while self._processes.failed:
             self._failures.count(self._processes.failed.pop(0), self._clock())
         self._failures.check()
-        self._server.check_members(self.settings.no_workers_timeout_s)
+        self._server.check_members(self.settings.no_workers_timeout_s, collecting=not self._evaluating)
 
     def _listen(self, timeout_s: float, short: bool = False) -> None:
         self._server.listen(timeout_s, short)
@@ -320,7 +337,7 @@ class Hub:
 
     def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
         if isinstance(message, Evaluated):
-            self._failures.evaluated()
+            self._failures.evaluated(worker_name(peer).decode() if self.coordinator.evaluation.beside else None)
         if not isinstance(message, Rollout):
             return self.coordinator.receive(peer, message, now)
         try:

@@ -1,7 +1,8 @@
 """The weights that orders name, and which workers hold them. Pure.
 
-Rule: weights are kept while they are the newest or act in a round that is open. They are sent to a worker after the first
-order that names them, and again if its Heartbeat shows that they were lost on the way.
+Rule: weights are kept while they are the newest, act in a round that is open, or are evaluated. They are sent to a worker
+after the first order that names them, and again if its Heartbeat shows that they were lost on the way. Of those that were
+sent, a worker keeps the newest and those that its tickets name.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ class SentWeights:
         """by version"""
 
     def publish(self, weights: Weights, acts: Callable[[int], bool]) -> None:
-        """Set the newest weights. `acts`: whether a version acts in an open round; others are dropped."""
+        """Set the newest weights. `acts`: whether a version acts in an open round or is evaluated; others are dropped."""
         self.kept = {version: each for version, each in self.kept.items() if acts(version)}
         self.kept[weights.version] = weights
 
@@ -45,3 +46,8 @@ class SentWeights:
         lost = sorted(set(named) - held.keys())
         member.versions = held | dict.fromkeys(lost, member.replies)
         return [(member.peer, self.kept[version]) for version in lost]
+
+    def dropped(self, member: CollectingMember, named: Collection[int]) -> None:
+        """A piece of work of this worker has ended: it keeps the `named` versions, and the newest that it was sent."""
+        newest = max(member.versions, default=-1)
+        member.versions = {version: at for version, at in member.versions.items() if version in named or version == newest}

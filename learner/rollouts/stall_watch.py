@@ -1,6 +1,7 @@
 """Judges whether a run stands still, and through which workers. Pure.
 
-Rule: env steps, constructions and resets are progress, as are rollouts. While a call of the environment is under way within
+Rule: env steps, constructions and resets are progress, as are rollouts. Those of workers that only evaluate do not count
+while rollouts are awaited. While a call of the environment is under way within
 its timeout, the run does not stand still: the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`,
 the workers that hold tickets are refused, and others get the tickets. The run ends only if no worker would remain. A worker
 that holds its tickets, of rollouts or of an evaluation, for longer than all calls of the environment may take together is
@@ -43,17 +44,23 @@ class StallWatch:
         """The learner begins to wait."""
         self._progress_s = now
 
-    def check(self, now: float, progress: object) -> Standstill | None:
-        """`progress`: anything that changes when what the learner waits for makes progress. None: the run goes on."""
-        mark = (self._coordinator.membership.progress, progress)
+    def check(self, now: float, progress: object, *, evaluating: bool = False) -> Standstill | None:
+        """None: the run goes on. `progress`: anything that changes when what the learner waits for makes progress.
+
+        `evaluating`: whether the learner waits for an evaluation, and not for rollouts.
+        """
+        of_collectors, of_evaluators = self._coordinator.membership.progress.values()
+        mark = (of_collectors, evaluating and of_evaluators, progress)
         if mark != self._mark:
             self._mark, self._progress_s = mark, now
         if now >= self._budgets_due_s:
             self._budgets_due_s = now + CHECK_BUDGETS_EVERY_S
             if over := self._over_budget(now):
                 return Standstill(over, "it holds tickets for longer than they can take")
-        members = self._coordinator.members.values()
-        if now - self._progress_s <= self._stall_timeout_s or any(self._in_call(member, now) for member in members):
+        if now - self._progress_s <= self._stall_timeout_s:
+            return None
+        members = [each for each in self._coordinator.members.values() if evaluating or not each.hello.evaluates]
+        if any(self._in_call(member, now) for member in members):
             return None
         self._progress_s = now
         idle = tuple(member for member in members if member.tickets)

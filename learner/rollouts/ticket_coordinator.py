@@ -6,12 +6,13 @@ between rollouts; its new owner starts it afresh, so its incarnation rises. When
 workers, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows that a message was lost on
 the way, the message is sent again.
 
-An evaluation is of the newest version: while it is pending, no ticket for a rollout is dealt, and no weights are published.
+While an evaluation is pending, no ticket for a rollout is dealt, unless the evaluation is beside training: then workers that
+only evaluate play it, whatever the others do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from learner.members.coordinator import Coordinator
 from learner.members.events import Failed, PolicyRaised
@@ -94,18 +95,26 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def publish(self, version: int, parameters: Array, buffers: Array, *, env_attributes: Array | None = None) -> None:
         """Set the newest weights. Orders name them from now on: call `begin_update`, or `begin_evaluation`."""
-        assert not self.evaluation.pending, "an evaluation is pending"
         self.version = version
-        self.weights.publish(Weights(version, parameters, buffers, env_attributes), self.rollouts.rounds.acts)
+        self.weights.publish(Weights(version, parameters, buffers, env_attributes), self._is_needed)
 
     def begin_update(self) -> list[Outgoing]:
         """The next update begins, unless it has begun, with the newest weights: deal the rounds that it opens."""
         self.rollouts.begin_update(self.version)
         return self._deal()
 
-    def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None) -> list[Outgoing]:
-        """Begin to evaluate the newest weights. `self.evaluation` says when it is done."""
-        self.evaluation.begin(plan, self.version, on_rows)
+    def begin_evaluation(
+        self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False
+    ) -> list[Outgoing]:
+        """Begin to evaluate the newest weights, `beside` training if so. `self.evaluation` says when it is done."""
+        self.evaluation.begin(plan, self.version, on_rows, beside=beside)
+        return self._deal()
+
+    def await_evaluation(self) -> list[Outgoing]:
+        """The learner waits for the evaluation beside training: if no worker only evaluates any more, all play it."""
+        if any(member.hello.evaluates for member in self.membership.active()):
+            return []
+        self.evaluation.all_play()
         return self._deal()
 
     # ---------------------------------------------------------------- inside
@@ -116,10 +125,18 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             return []
         out = self._placement.place(self.members.values())
         if self.evaluation.pending:
-            orders = self.evaluation.deal(self.membership.active())
-        else:
-            orders = self.rollouts.deal(self.members)
-        return self.weights.after(out + orders, self.members)
+            out += self.evaluation.deal(self.membership.active())
+        if self.evaluation.beside or not self.evaluation.pending:
+            out += self.rollouts.deal(self.members)
+        return self.weights.after(out, self.members)
+
+    def _is_needed(self, version: int) -> bool:
+        """Whether these weights are needed, although they are not the newest."""
+        return self.rollouts.rounds.acts(version) or (self.evaluation.pending and version == self.evaluation.version)
+
+    def _named(self, tickets: Collection[int]) -> set[int]:
+        """The versions that these tickets name."""
+        return self.rollouts.versions(tickets) | self.evaluation.versions(tickets)
 
     def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
         match message:
@@ -127,9 +144,11 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 if why := self.rollouts.take_in(member, message):
                     return self.reject_rollout(member.peer, message, why, member.heard_s)
                 self._placement.ticket_ended(member)
+                self.weights.dropped(member, self._named(member.tickets))
                 return self._deal()
             case Evaluated():
                 why = self.evaluation.take_in(member, message)
+                self.weights.dropped(member, self._named(member.tickets))
             case EpisodeRows():
                 why = self.evaluation.take_rows(member, message)
             case _:
@@ -145,8 +164,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        named = self.rollouts.versions(heartbeat.tickets) | self.evaluation.versions(heartbeat.tickets)
-        out = self.weights.again(member, heartbeat, named)
+        out = self.weights.again(member, heartbeat, self._named(heartbeat.tickets))
         orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
         return out + self.weights.after(orders, self.members)
 

@@ -56,7 +56,7 @@ class LearnerTime:
     def line(self, now: float) -> str:
         """Who waits for whom; empty if nobody waits long."""
         lasts_s, members, spent_s, text = now - self.since_s, self._coordinator.members, self.until(now), ""
-        if members and (plan := self._coordinator.evaluation.plan) is not None:
+        if members and self.phase == "evaluating" and (plan := self._coordinator.evaluation.plan) is not None:
             return one_line(f"evaluating{' the best policy' * plan.of_best} for {lasts_s:.0f} s: {self._played(plan, now)}")
         if lasts_s < LONG_S:
             text = self._last

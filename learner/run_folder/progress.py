@@ -76,6 +76,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """lag of each rollout of the last update"""
     evaluation: Evaluation | None = None
     """the last evaluation"""
+    evaluated_version: int = -1
+    """the version of the policy that it is of: with `eval_workers` an earlier one than the newest"""
+    evaluated_env_steps: int = 0
+    """env steps of training of that policy"""
     checkpoint: str = ""
     """path of the newest checkpoint; empty before the first"""
     rollouts: tuple[Rollout, ...] = ()

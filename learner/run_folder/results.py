@@ -12,6 +12,8 @@ import numpy as np
 from protocol.bounds import Natural, Real, Seconds
 
 EVALUATION_KEY = "eval/mean_reward"
+EVALUATED_AT_KEY = "eval/env_steps"
+"""env steps of the policy that was evaluated beside training: fewer than those of the row with the result"""
 
 
 class FactMean(msgspec.Struct, frozen=True):

@@ -190,7 +190,7 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
         "worker": _printable(worker.worker) + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
         "host": _printable(worker.host),
         "pid": str(worker.pid),
-        "lanes": "draining" if worker.state == "draining" else ",".join(map(str, worker.lanes)) or "spare",
+        "lanes": ",".join(map(str, worker.lanes)) or "spare" if worker.state == "active" else worker.state,
         "tickets": str(worker.tickets),
         "steps/s": f"{worker.steps_per_s:,.0f}",
         "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",

@@ -632,20 +632,30 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
 
 
 def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
-    """Newer weights than those of an evaluation are held too: it is dropped, or acts under its own, which the watch sees."""
+    """Newer weights than those of an evaluation are held too: it acts under its own, which the watch sees by its rows."""
     session = yield from collecting(learner)
-    session.permit()  # its Collect was lost, so the next one waits, and its weights are held
-    session.deal(session.permit(), version=1)
     session.give(session.weights(2, -session.random_parameters(1)))
     order = _evaluation(learner, send_rows=True)
     learner.send(order)
-    found = yield Wait(
-        2 * QUIET_S, lambda event: isinstance(event, Heard) and isinstance(event.message, Evaluated | Goodbye)
+    session.give(session.weights(1))
+    yield from learner.takes_part(
+        Evaluated, rules.EVALUATE_VERSION, f"Evaluated for ticket {order.ticket}", within_s=_long(learner)
     )
-    if isinstance(found, Heard) and isinstance(found.message, Goodbye):
-        yield from learner.left(rules.DECLINED, "Goodbye", (2,))
-        raise Skipped(f"it declines: {found.message.reason}")
-    yield from _evaluate(session, _evaluation(learner, version=2))
+
+
+def ends_evaluations(learner: Learner) -> Script[None]:
+    """The order of a later evaluation ends the one before, whose weights never came. An older evaluation is of use too."""
+    session = yield from collecting(learner)
+    over, order = _evaluation(learner, version=3), _evaluation(learner, version=2)
+    learner.send(over)
+    yield from _evaluate(session, order)
+    found = yield from heartbeats(learner, 1)
+    if over.ticket in found.tickets:
+        got = f"ticket {over.ticket}"
+        raise Broken(rules.EVALUATE_ENDS, "no ticket of version 3 in a Heartbeat, after an Evaluate of version 2", got)
+    session.give(session.weights(3))
+    text = f"no Evaluated for ticket {over.ticket}, which ticket {order.ticket} has ended"
+    yield from learner.quiet(Evaluated, rules.EVALUATE_ENDS, text)
 
 
 def _long(learner: Learner) -> float:

@@ -87,6 +87,7 @@ COLLECTING = [
     Check("evaluates under the version that is asked for", collect_checks.evaluates_one_version),
     Check("evaluates with rows, or declines", collect_checks.evaluates_with_rows),
     Check("evaluates under no other version, or declines rows", collect_checks.evaluates_under_no_other_version),
+    Check("ends an evaluation when a later one comes", collect_checks.ends_evaluations),
     Check("drains while it collects", collect_checks.drains_while_it_collects),
     Check("takes no work while it drains", collect_checks.takes_no_work_while_it_drains),
     Check("leaves when it is refused while it drains", collect_checks.leaves_when_refused_while_it_drains),

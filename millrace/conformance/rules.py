@@ -447,9 +447,14 @@ EVALUATE_ONCE = Rule(
 )
 EVALUATE_VERSION = Rule(
     "Collector profile",
-    "An `Evaluate` is executed once, under exactly its version: it waits until those weights are held, and is "
-    "dropped if newer ones are",
+    "An `Evaluate` is executed once, under exactly its version: it waits until those weights are held",
     "look for the order's version among the weights held before the first episode",
+)
+EVALUATE_ENDS = Rule(
+    "Collector profile",
+    "An `Evaluate` of a higher ticket and another version ends the evaluation before it: what is left of that one is "
+    "dropped",
+    "when an Evaluate comes, drop the orders with lower tickets that name another version",
 )
 REAPPEARS = Rule(
     "Hello",

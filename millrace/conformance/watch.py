@@ -266,7 +266,8 @@ class WatchedSession:
             return False
         order = self.orders.get(ticket) or self.permits[ticket].permit
         if isinstance(order, Evaluate):
-            return max(self.versions, default=-1) <= order.version
+            later = (each for each in self.orders.values() if isinstance(each, Evaluate) and each.ticket > ticket)
+            return all(each.version == order.version for each in later)
         of_lane = (
             each.ticket for each in self.orders.values() if not isinstance(each, Evaluate) and each.lane == order.lane
         )

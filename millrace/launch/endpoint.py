@@ -47,8 +47,11 @@ class Endpoint(Bound):
         timeouts: CallTimeouts,
         stop_within_s: float = STOP_WITHIN_S,
         handed: Callable[[str], InheritedDescriptors | None] = lambda name: None,
+        evaluating: int = 0,
     ) -> Iterator[StartedWorkers]:
         """Start `count` workers here; or, if they join from elsewhere, start none, and log how one joins.
+
+        The last `evaluating` of them only evaluate.
 
         A worker is a thread if the address is inproc, else a process. `flags` and `handed`: its flags and log, and the file
         descriptors that it inherits, by its name. `timeouts`: of a call of the environment. At the end, workers that still
@@ -56,9 +59,11 @@ class Endpoint(Bound):
         """
 
         def start(name: str) -> Running:
+            evaluates = int(name.removeprefix("w")) >= count - evaluating
             if self.link.address.startswith("inproc://"):
-                return WorkerThread(self.link.address, name, self.context)
+                return WorkerThread(self.link.address, name, self.context, evaluates=evaluates)
             own, log_file = flags(name)
+            own = [*own, "--evaluate"] if evaluates else own
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, own, handed(name)))
 
         if self.where.bind:

@@ -76,7 +76,7 @@ def worker_flags(config: Config, run: Path) -> FlagsOfWorker:
             os.close(open_regular(log))
     except OSError as error:
         raise UsageError(f"{error.filename}: {reason(error)}; the workers' logs go there: remove it") from error
-    cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
+    cores, timeouts = [] if config.eval_workers else worker_cores(config), timeout_flags(config.call_timeouts())
 
     def flags(name: str) -> tuple[list[str], Path]:
         return [*timeouts, *core_flags(cores, name)], logs / f"{name}.log"

@@ -66,7 +66,9 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
             folder = folder or stack.enter_context(run_folder(config, None))
             if config.transport != "inproc":
                 flags = worker_flags(config, folder.path)
-        supervisor, processes = stack.enter_context(endpoint.workers(config.workers, flags, config.call_timeouts()))
+        count, timeouts = config.workers + config.eval_workers, config.call_timeouts()
+        started = endpoint.workers(count, flags, timeouts, evaluating=config.eval_workers)
+        supervisor, processes = stack.enter_context(started)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         with stopped_on_error(supervisor):

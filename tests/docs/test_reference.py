@@ -30,7 +30,7 @@ KNOWN = {name for group in METRICS.values() for name in group}
 RUNS: dict[str, dict[str, Any]] = {
     "ppo": {"algo": "ppo", "info_keys": ("distance",)},
     "ppo, Box actions": {"env": "Pendulum-v1", "algo": "ppo"},
-    "a2c": {"algo": "a2c"},
+    "a2c": {"algo": "a2c", "eval_workers": 1},
     "impala": {"algo": "impala"},
     "reinforce": {"algo": "reinforce", "rollout_steps": 501, "steps": 2_100},
     "dqn": {"algo": "dqn", "learning_starts": 0, "gradient_steps": 1},

@@ -40,10 +40,12 @@ class Fakes:
     def weights(self) -> Any:
         return np.array([self.evaluated], np.float32), np.zeros(0, np.float32)
 
-    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
+    def begin_evaluation(self, plan: EvaluationPlan, *, beside: bool = False) -> None:
         self.evaluated += 1
         self.seeds.append(plan.seeds)
-        return [PlayedEpisode(Episode(next(self.returns), 1, 0.0), cut=False)] * len(plan.seeds)
+
+    def end_evaluation(self, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
+        return [PlayedEpisode(Episode(next(self.returns), 1, 0.0), cut=False)] * len(self.seeds[-1])
 
     def publish(self, version: int, *weights: Any, deal: bool) -> None:
         pass
@@ -64,7 +66,7 @@ def due(parts: tuple[Tally, Evaluations], *env_steps: int) -> list[int]:
     tally, evaluations = parts
     for tally.state.version, tally.state.env_steps in enumerate(env_steps, 1):
         if tally.evaluation_is_due():
-            evaluations.evaluate_newest(lambda: None)
+            evaluations.evaluate_when_due(lambda: None)
             made.append(tally.state.env_steps)
     return made
 

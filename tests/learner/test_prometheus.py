@@ -128,7 +128,7 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     assert set(ended) == {"used", "duplicate", "late", "invalid"}
     received = found["millrace_transitions_received_total", ()]
     assert received == ledger["transitions_received"] == sum(ended.values()) + found["millrace_transitions_waiting", ()] > 0
-    assert by(found, "millrace_workers", "state") == {"active": 2, "spare": 0, "draining": 0}
+    assert by(found, "millrace_workers", "state") == {"active": 2, "spare": 0, "evaluating": 0, "draining": 0}
     assert by(found, "millrace_refused_messages_total", "reason") == {"unreadable": 1, "key": 0}
     assert found["millrace_weights_version", ()] == 1
     assert by(found, "millrace_rollout_lag_versions_bucket", "le") == {
@@ -136,7 +136,7 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     }  # fmt: skip
     assert (found["millrace_rollout_lag_versions_count", ()], found["millrace_rollout_lag_versions_sum", ()]) == (3, 3)
     learning.coordinator.drain("done")
-    assert by(scraped.metrics(), "millrace_workers", "state") == {"active": 0, "spare": 0, "draining": 2}
+    assert by(scraped.metrics(), "millrace_workers", "state") == {"active": 0, "spare": 0, "evaluating": 0, "draining": 2}
 
 
 def test_the_numbers_of_info_keys_are_gauges_whatever_their_names_are(scraped: Scraped) -> None:
@@ -149,7 +149,7 @@ def test_the_numbers_of_info_keys_are_gauges_whatever_their_names_are(scraped: S
     assert by(found, "millrace_episode_info_mean", "key") == {name: fact.mean for name, fact in facts.items()}
     missing = {name: fact.missing for name, fact in facts.items()}
     assert by(found, "millrace_episode_info_missing", "key") == {**missing, "never": 9}
-    assert by(found, "millrace_workers", "state").keys() == {"active", "spare", "draining"}
+    assert by(found, "millrace_workers", "state").keys() == {"active", "spare", "evaluating", "draining"}
 
 
 def test_no_more_numbers_of_info_keys_are_shown_than_a_run_may_have(scraped: Scraped) -> None:
@@ -170,7 +170,7 @@ def test_a_worker_without_a_lane_is_a_spare(scraped: Scraped) -> None:
     for name in (A, B, C):
         scraped.learner.joins(name)
     scraped.learner.publish(0)
-    assert by(scraped.metrics(), "millrace_workers", "state") == {"active": 2, "spare": 1, "draining": 0}
+    assert by(scraped.metrics(), "millrace_workers", "state") == {"active": 2, "spare": 1, "evaluating": 0, "draining": 0}
 
 
 def test_progress_is_that_of_the_last_update_and_updates_are_this_learners_own(scraped: Scraped) -> None:

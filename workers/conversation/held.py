@@ -45,14 +45,23 @@ class Held(Generic[AskedT, AnsweredT]):
 
 
 class HeldEvaluations(Held[Evaluate, Evaluated]):
-    """Evaluations. They belong to no lane."""
+    """Evaluations. They belong to no lane. One evaluation is of one version, and has higher tickets than those before it."""
+
+    def take(self, ticket: int, asked: Evaluate) -> Evaluated | None:
+        """Take an order. The evaluations before that of the highest ticket are over: what is left of them is dropped."""
+        answer = super().take(ticket, asked)
+        newest = max(self.asked, default=ticket)
+        self.asked = {n: order for n, order in self.asked.items() if order.version == self.asked[newest].version}
+        return answer
 
     def next(self, versions: Collection[int]) -> Evaluate | None:
-        """The oldest of those whose weights are held. Those of a version that is not the newest held are over: dropped."""
-        newest = max(versions, default=-1)
-        self.asked = {ticket: order for ticket, order in self.asked.items() if order.version >= newest}
-        due = [ticket for ticket, order in self.asked.items() if order.version == newest]
+        """The oldest whose weights are held."""
+        due = [ticket for ticket, order in self.asked.items() if order.version in versions]
         return self.asked[min(due)] if due else None
+
+    def versions(self) -> set[int]:
+        """The versions that are asked for."""
+        return {order.version for order in self.asked.values()}
 
     def keep(self, answer: Evaluated) -> bool:
         """Keep a result, unless rows belong to it; False if it is no longer asked for."""

@@ -126,6 +126,8 @@ class WorkerIdentity:
     process_nonce: int
     """random number that tells this process, or thread, from any other of the same name"""
     software: str
+    evaluates: bool = False
+    """whether it only plays evaluations"""
 
     def hello(self, attempt: int) -> Hello:
         """The Hello of this attempt to join. Attempts are counted from the nonce: no two processes have the same one."""
@@ -137,6 +139,7 @@ class WorkerIdentity:
             process_nonce=self.process_nonce,
             software=self.software,
             attempt=attempt,
+            evaluates=self.evaluates,
         )
 
 
@@ -181,7 +184,7 @@ class _SessionState:
 
     def drop_weights(self) -> None:
         """Drop the weights that are neither the newest nor asked for."""
-        asked = {*self.rollouts.versions(), max(self.weights, default=-1)}  # evaluations ask for the newest
+        asked = {*self.rollouts.versions(), *self.evaluations.versions(), max(self.weights, default=-1)}
         self.weights = {version: weights for version, weights in self.weights.items() if version in asked}
 
     def keep(self, answer: Rollout | Evaluated | Answer) -> bool:

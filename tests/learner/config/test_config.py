@@ -13,7 +13,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.config.layers import config_from_toml, lower_layers, resolve
 from learner.config.presets import PRESETS, named_presets
-from learner.config.validation import check_copies, idle_workers, unused_target, workers_to_wait_for
+from learner.config.validation import check_copies, idle_workers, unused_setting, workers_to_wait_for
 from learner.run_folder.run_format import write_format
 from protocol.errors import UsageError
 
@@ -137,11 +137,11 @@ def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: i
 
 
 def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
-    assert unused_target(resolve("CartPole-v1", preset="none", target_return=475.0)) == (
+    assert unused_setting(resolve("CartPole-v1", preset="none", target_return=475.0)) == (
         "target_return 475 ends no run without evaluations during training; take --eval-every N too"
     )
-    assert not unused_target(resolve("CartPole-v1", preset="none", target_return=475.0, eval_every=100))
-    assert not unused_target(resolve("CartPole-v1", preset="none"))
+    assert not unused_setting(resolve("CartPole-v1", preset="none", target_return=475.0, eval_every=100))
+    assert not unused_setting(resolve("CartPole-v1", preset="none"))
 
 
 @pytest.mark.parametrize(

@@ -212,9 +212,9 @@ def test_env_steps_calls_and_rollouts_are_progress() -> None:
 def test_the_first_call_that_has_returned_is_progress_although_nothing_was_said_before(calls: int, progress: int) -> None:
     learner = Learner()
     learner.joins(A)
-    before = learner.coordinator.membership.progress
+    before = learner.coordinator.membership.progress[False]
     speaks(learner, activity("waiting", calls=calls))
-    assert learner.coordinator.membership.progress - before == progress
+    assert learner.coordinator.membership.progress[False] - before == progress
 
 
 def test_a_call_within_its_timeout_is_no_standstill_and_one_beyond_it_is() -> None:

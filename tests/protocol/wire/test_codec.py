@@ -201,7 +201,7 @@ def test_a_default_stands_at_the_end_alone() -> None:
     """By position nothing else can be left out."""
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
     assert defaults == {
-        Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ()),
+        Hello: (False,), Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ()),
     }  # fmt: skip
     assert Rollout.__struct_fields__[-3:] == ("episodes", "mask", "extras")
 
@@ -246,7 +246,7 @@ def test_hello_and_refuse_are_for_ever_what_they_were() -> None:
         "73735f6e6f6e63654da8736f667477617265a173a7617474656d707401"
     )
     assert decode_to_learner([hello]) == Hello(2, "w0", "h", 7, 77, "s", 1)
-    assert sent(Hello(2, "w0", "h", 7, 77, "s", 1)) == [hello]
+    assert msgpack.unpackb(*sent(Hello(2, "w0", "h", 7, 77, "s", 1))) == msgpack.unpackb(hello) | {"evaluates": False}
     refuse = bytes.fromhex("82a474797065a6526566757365a6726561736f6ea26e6f")
     assert decode_to_worker([refuse]) == Refuse("no")
     assert sent(Refuse("no")) == [refuse]

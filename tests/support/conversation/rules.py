@@ -42,11 +42,11 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
 
 
 def check_evaluation(coordinator: TicketCoordinator) -> None:
-    """While an evaluation is pending, it is of the newest version, and each of its tickets is in one place."""
+    """While an evaluation is pending, its weights are kept, and each of its tickets is in one place."""
     tickets, members = coordinator.evaluation, coordinator.members
     if not tickets.pending:
         return
-    assert tickets._version == coordinator.version, "an evaluation belongs to another version"
+    assert tickets.version in coordinator.weights.kept, "the weights of an evaluation were dropped"
     held = [number - tickets._first for number in tickets.held]
     every = sorted([*tickets._undealt, *held, *tickets._played])
     assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
@@ -54,5 +54,6 @@ def check_evaluation(coordinator: TicketCoordinator) -> None:
         assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"
         assert number in member.tickets, "a worker does not know its ticket of an evaluation"
     for member in tickets.players:
+        assert member.hello.evaluates or not tickets.beside, "a worker that collects plays an evaluation beside training"
         mine = [number for number in member.tickets if number >= FIRST_TICKET]
         assert len(mine) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"

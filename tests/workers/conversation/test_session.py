@@ -358,10 +358,20 @@ def test_an_evaluation_comes_before_rollouts() -> None:
     assert task_of(session).assignments[0].ticket == 0
 
 
-def test_an_evaluation_of_an_older_version_is_dropped() -> None:
-    session = ready(EVALUATE, weights(1))
-    assert session.next_work() is None
-    assert sent(session.tick(1.0), Heartbeat)[0].tickets == ()
+def test_an_evaluation_is_played_under_its_version_although_newer_weights_are_held() -> None:
+    session = ready(weights(1), EVALUATE, weights(0))
+    task = session.next_work()
+    assert isinstance(task, EvaluationTask)
+    assert task.weights.version == EVALUATE.version == 0
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_order_of_a_later_evaluation_ends_those_before_it(late: bool) -> None:
+    """Also if the earlier one comes late. The version does not say which is later: the tickets do."""
+    earlier = msgspec.structs.replace(EVALUATE, version=4)
+    later = msgspec.structs.replace(EVALUATE, version=3, ticket=EVALUATE.ticket + 2)
+    session = ready(*([later, earlier] if late else [earlier, later]))
+    assert sent(session.tick(1.0), Heartbeat)[0].tickets == (later.ticket,)
 
 
 def test_an_evaluation_waits_for_its_weights_and_the_oldest_comes_first() -> None:

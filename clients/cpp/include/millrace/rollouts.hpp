@@ -199,13 +199,9 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     held.kept.push_back(std::move(rollout));
     drop_weights();
   }
-  const Evaluation* next_evaluation() {  // the oldest of the newest version held; those of older versions are dropped
-    if (weights_.empty()) return nullptr;
-    const std::uint64_t newest = weights_.rbegin()->first;
-    auto older = [&](const Evaluation& order) { return order.version < newest; };
-    orders_.erase(std::remove_if(orders_.begin(), orders_.end(), older), orders_.end());
+  const Evaluation* next_evaluation() {  // the oldest order whose weights are held
     for (const Evaluation& order : orders_)
-      if (order.version == newest) return load(newest), &order;
+      if (weights_.count(order.version)) return load(order.version), &order;
     return nullptr;
   }
   void evaluated(const Evaluation& evaluation) {
@@ -266,7 +262,9 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   void take_evaluation(const Message& m) {
     if (m.send_rows) return decline(no_rows());
     for (const Evaluation& answer : answers_) if (answer.ticket == m.ticket) return send_evaluation(answer);
-    for (const Evaluation& order : orders_) if (order.ticket == m.ticket) return;
+    for (const Evaluation& order : orders_) if (order.ticket == m.ticket || (order.ticket > m.ticket && order.version != m.version)) return;
+    auto over = [&](const Evaluation& order) { return order.version != m.version; };  // the order of a later evaluation ends those before it
+    orders_.erase(std::remove_if(orders_.begin(), orders_.end(), over), orders_.end());
     orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}, {}, {}});
     for (auto& seed : m.seeds) orders_.back().seeds.push_back(*seed);
   }
