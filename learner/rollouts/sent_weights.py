@@ -13,6 +13,9 @@ from learner.members.membership import Outgoing
 from learner.rollouts.collecting_member import CollectingMember
 from protocol.messages import Collect, Evaluate, Heartbeat, Weights
 
+Named = Callable[[Collection[int]], set[int]]
+"""Returns the versions that these tickets name."""
+
 
 class SentWeights:
     """The weights of a run that workers need."""
@@ -26,7 +29,7 @@ class SentWeights:
         self.kept = {version: each for version, each in self.kept.items() if acts(version)}
         self.kept[weights.version] = weights
 
-    def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
+    def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember], named: Named) -> list[Outgoing]:
         """These messages; after each order that names a version that its worker does not hold, these weights."""
         out: list[Outgoing] = []
         for peer, message in orders:
@@ -34,8 +37,8 @@ class SentWeights:
             member = members[peer]
             if isinstance(message, Collect | Evaluate) and message.version not in member.versions:
                 out.append((peer, self.kept[message.version]))
-                needed = {version: sent_at for version, sent_at in member.versions.items() if version in self.kept}
-                member.versions = needed | {message.version: member.replies}
+                member.versions[message.version] = member.replies
+                drop_versions(member, named)
         return out
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
@@ -47,7 +50,8 @@ class SentWeights:
         member.versions = held | dict.fromkeys(lost, member.replies)
         return [(member.peer, self.kept[version]) for version in lost]
 
-    def dropped(self, member: CollectingMember, named: Collection[int]) -> None:
-        """A piece of work of this worker has ended: it keeps the `named` versions, and the newest that it was sent."""
-        newest = max(member.versions, default=-1)
-        member.versions = {version: at for version, at in member.versions.items() if version in named or version == newest}
+
+def drop_versions(member: CollectingMember, named: Named) -> None:
+    """The worker got new weights, or a piece of its work has ended: it keeps the newest, and what its tickets name."""
+    kept = {*named(member.tickets), max(member.versions, default=-1)}
+    member.versions = {version: sent_at for version, sent_at in member.versions.items() if version in kept}

@@ -23,7 +23,7 @@ from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.rollout_dealer import RolloutDealer
-from learner.rollouts.sent_weights import SentWeights
+from learner.rollouts.sent_weights import SentWeights, drop_versions
 from protocol.messages import (
     Array,
     EpisodeRows,
@@ -128,7 +128,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             out += self.evaluation.deal(self.membership.active())
         if self.evaluation.beside or not self.evaluation.pending:
             out += self.rollouts.deal(self.members)
-        return self.weights.after(out, self.members)
+        return self.weights.after(out, self.members, self._named)
 
     def _is_needed(self, version: int) -> bool:
         """Whether these weights are needed, although they are not the newest."""
@@ -144,11 +144,11 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 if why := self.rollouts.take_in(member, message):
                     return self.reject_rollout(member.peer, message, why, member.heard_s)
                 self._placement.ticket_ended(member)
-                self.weights.dropped(member, self._named(member.tickets))
+                drop_versions(member, self._named)
                 return self._deal()
             case Evaluated():
                 why = self.evaluation.take_in(member, message)
-                self.weights.dropped(member, self._named(member.tickets))
+                drop_versions(member, self._named)
             case EpisodeRows():
                 why = self.evaluation.take_rows(member, message)
             case _:
@@ -166,7 +166,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         out = self.weights.again(member, heartbeat, self._named(heartbeat.tickets))
         orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
-        return out + self.weights.after(orders, self.members)
+        return out + self.weights.after(orders, self.members, self._named)
 
     def _received(self, member: CollectingMember) -> tuple[Received, ...]:
         return self.rollouts.received(member)

@@ -144,7 +144,7 @@ class Learner:
         """Which versions the orders of which workers name."""
         members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation
         versions = {number: each.version for number, each in self.coordinator.rollouts.held.items()}
-        versions |= dict.fromkeys(evaluation.held, self.coordinator.version)
+        versions |= dict.fromkeys(evaluation.held, evaluation.version)
         return [(member, versions[number]) for member in members for number in member.tickets]
 
     # ---------------------------------------------------------------- inside

@@ -22,9 +22,9 @@ from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rows
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
-SAVED = {"_plan", "_version", "_first", "_seeds", "_undealt", "held", "_played", "_rows"}
+SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "held", "_played", "_rows"}
 """What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies"}
+NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies", "_most_workers", "beside"}
 
 
 class EvaluatingLearner(Learner):

@@ -16,22 +16,24 @@ if TYPE_CHECKING:
 TICKETS = "learner.rollouts.evaluation_dealer"
 
 MUTATIONS = {
-    "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),
+    "an evaluation of the version before": Mutation(TICKETS, "version=self.version,", "version=max(0, self.version - 1),"),
     "a ticket that was put back is lost": Mutation(
         TICKETS, "heapq.heappush(self._undealt, self._end(member, number))", "self._end(member, number)"
     ),
     "tickets for rollouts are dealt during an evaluation": Mutation(
         COORDINATOR,
-        "orders = self.evaluation.deal(self.membership.active())\n        else:\n            orders",
-        "out += self.evaluation.deal(self.membership.active())\n        if True:\n            orders",
+        "if self.evaluation.beside or not self.evaluation.pending:",
+        "if True:",
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
-        "return self.weights.after(out + orders, self.members)",
-        "return out + orders if self.evaluation.pending else self.weights.after(out + orders, self.members)",
+        "return self.weights.after(out, self.members)",
+        "return out if self.evaluation.pending else self.weights.after(out, self.members)",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
-        COORDINATOR, " | self.evaluation.versions(heartbeat.tickets)", ""
+        COORDINATOR,
+        "return self.rollouts.versions(tickets) | self.evaluation.versions(tickets)",
+        "return self.rollouts.versions(tickets)",
     ),
     "a lost order to evaluate is not sent again": Mutation(COORDINATOR, " + self.evaluation.send(member, lost)", ""),
     "the evaluation's tickets of a lost worker are kept": Mutation(
@@ -49,7 +51,7 @@ MUTATIONS = {
     ),
     "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
-    "an evaluation under any weights": Mutation(HELD, "if order.version == newest]", "if True]"),
+    "an evaluation under any weights": Mutation(HELD, "if order.version in versions]", "if True]"),
     "an executed order to evaluate stays": Mutation(
         HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
     ),

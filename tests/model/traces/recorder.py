@@ -27,7 +27,7 @@ COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent
 METHODS = {
     "TicketCoordinator": (
         *COMMON,
-        *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "drain"),
+        *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation", "drain"),
     ),
     "RolloutDealer": ("take", "not_used", "incarnations"),
     "EvaluationDealer": ("end",),

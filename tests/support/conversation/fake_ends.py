@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -121,6 +121,9 @@ class Faults:
     until_s: float = 30.0
 
 
+EVALUATOR = b"e"  # the name of a worker that only evaluates begins so
+
+
 @dataclass
 class FakeWorker:
     """A worker process: dies, freezes, comes back under the same name, and pid."""
@@ -135,7 +138,12 @@ class FakeWorker:
 class World:
     """One learner, some workers, simulated time; checks every rule after every event."""
 
-    def __init__(self, seed: int, faults: Faults, *, workers: int, lanes: int, max_lag: int) -> None:
+    def __init__(
+        self, seed: int, faults: Faults, *, workers: int, lanes: int, max_lag: int, evaluators: int | None = None
+    ) -> None:
+        """`evaluators`: how many more workers only evaluate, beside training; None: all evaluate, and training waits."""
+        self.beside = evaluators is not None
+        self.due = False  # whether the newest version is to be evaluated
         self.random = random.Random(seed)
         self.faults = faults
         self.run = run_spec(lanes)
@@ -155,9 +163,11 @@ class World:
         self.epoch = 0
         self.checkpoint: tuple[Ledger, int, list[int]] = (Ledger(), 0, [0] * lanes)
         self.coordinator = self._learner()
-        for number in range(workers):
-            self.spawn(f"w{number}".encode())
-        self._schedule_faults(workers)
+        names = [f"w{number}".encode() for number in range(workers)]
+        names += [EVALUATOR + b"%d" % number for number in range(evaluators or 0)]
+        for name in names:
+            self.spawn(name)
+        self._schedule_faults(names)
         self.every(0.5, self._tick)
 
     # ------------------------------------------------------------ time
@@ -226,7 +236,8 @@ class World:
     # ------------------------------------------------------------ worker
 
     def spawn(self, name: bytes) -> None:
-        who = WorkerIdentity(name.decode(), "host", 1, next(self.lives), "fake")  # in a container every pid is 1
+        evaluates = name.startswith(EVALUATOR)
+        who = WorkerIdentity(name.decode(), "host", 1, next(self.lives), "fake", evaluates)  # in a container every pid is 1
         worker = FakeWorker(name, Session(who, self.now, join_timeout_s=1e9, rejoin_timeout_s=1e9))
         self.workers[name] = worker
 
@@ -279,7 +290,7 @@ class World:
         ledger.transitions_late += ledger.transitions_waiting
         self.used = {ticket for ticket in self.used if ticket < ledger.issued}
         self.updates = version
-        self.updating = False
+        self.updating = self.due = False
         self.plan = None
         coordinator = TicketCoordinator(
             self.run,
@@ -325,9 +336,9 @@ class World:
                 return
             self.updates += 1
             self.updating = False
-            evaluates = self.random.random() < self.faults.evaluations
+            self.due = self.random.random() < self.faults.evaluations
             coordinator.publish(self.updates, PARAMETERS, BUFFERS)
-            if evaluates:
+            if self.due and self.plan is None:
                 self._begin_evaluation()
             if self.random.random() < 0.3:
                 self.checkpoint = (
@@ -345,27 +356,36 @@ class World:
         self.plan = EvaluationPlan(seeds, draw.randint(1, 3), most_steps=2, send_rows=draw.random() < 0.5)
         self.rows, self.issued_at_barrier = [], coordinator.rollouts.ledger.issued
         on_rows = self._take_rows if self.plan.send_rows else None
-        self.to_workers(coordinator.begin_evaluation(self.plan, on_rows))
+        self.due, self.evaluated = False, coordinator.version
+        self.to_workers(coordinator.begin_evaluation(self.plan, on_rows, beside=self.beside))
 
     def _take_rows(self, episode: int, rows: EpisodeRows) -> None:
         self.rows.append((episode, rows.first_step))
 
     def _evaluating(self) -> bool:
-        """Whether an evaluation is pending. Ends one that is done, and checks its result."""
-        if self.plan is None or not self.coordinator.evaluation.done:
-            return self.plan is not None
+        """Whether the learner waits for an evaluation. Ends one that is done, and checks its result."""
+        evaluation = self.coordinator.evaluation
+        if self.plan is None:
+            return False
+        if not evaluation.done:
+            if evaluation.beside and self.due:
+                self.to_workers(self.coordinator.await_evaluation())
+                self.issued_at_barrier = self.coordinator.rollouts.ledger.issued
+            return self.due or not evaluation.beside
         plan, self.plan = self.plan, None
-        played = self.coordinator.evaluation.end()
-        expected = [seed + self.coordinator.version / 1000 for seed in plan.seeds]
+        played = evaluation.end()
+        expected = [seed + self.evaluated / 1000 for seed in plan.seeds]
         assert [one.episode.reward for one in played] == expected, "the episodes are not those of the seeds"
         if plan.send_rows:
             assert sorted(self.rows) == list(itertools.product(range(len(plan.seeds)), range(2)))
         self.evaluations += 1
+        if self.due:
+            self._begin_evaluation()
         return False
 
     # ------------------------------------------------------------ fate
 
-    def _schedule_faults(self, workers: int) -> None:
+    def _schedule_faults(self, names: Sequence[bytes]) -> None:
         faults = self.faults
 
         def when() -> float:
@@ -381,10 +401,10 @@ class World:
             self.at(when(), lambda number=number: self.spawn(f"late{number}".encode()))  # type: ignore[misc]
         for _ in range(faults.learner_restarts):
             self.at(when(), self.restart_learner)
-        self.at(faults.until_s, lambda: self._revive(workers))
+        self.at(faults.until_s, lambda: self._revive(names))
 
-    def _revive(self, workers: int) -> None:
-        for name in (f"w{number}".encode() for number in range(workers)):
+    def _revive(self, names: Sequence[bytes]) -> None:
+        for name in names:
             if name not in self.workers:
                 self.spawn(name)
 
@@ -407,7 +427,7 @@ class World:
             self.at(self.random.uniform(0.5, 8.0), thaw)
 
     def _leave_one(self) -> None:
-        running = [worker for worker in self.workers.values() if not worker.frozen]
+        running = [worker for name, worker in self.workers.items() if not worker.frozen and not name.startswith(EVALUATOR)]
         if len(running) > 1:
             worker = self.random.choice(sorted(running, key=lambda worker: worker.name))
             self.say(worker, worker.session.stop())
@@ -416,7 +436,9 @@ class World:
 
     def check(self) -> None:
         check_tickets(self.coordinator, self.max_lag)
-        if self.plan is not None:
+        for member in self.coordinator.members.values():
+            assert not (member.lanes and member.hello.evaluates), "a worker that only evaluates has a lane"
+        if self.plan is not None and not self.coordinator.evaluation.beside:
             issued = self.coordinator.rollouts.ledger.issued
             assert issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
         if self.epoch == 0:
