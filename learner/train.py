@@ -22,6 +22,7 @@ from learner.algorithms.algorithm import numbers
 from learner.between_updates.between_updates import BetweenUpdates
 from learner.rollouts.hub import Hub
 from learner.rollouts.lanes import AcceptedRollout
+from learner.run_folder.progress import Row
 from protocol.arrays import Floats
 from protocol.errors import RunError
 from protocol.rollout import stack_rollouts
@@ -53,16 +54,21 @@ def train(
         attributes = audience.env_attributes()
         hub.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
 
+    def tell(evaluated: Row | None) -> bool:
+        """Tell the metrics of an evaluation, if one has ended."""
+        if evaluated is not None:
+            audience.evaluated(evaluated)
+        return evaluated is not None
+
     def evaluate() -> None:
-        if (found := evaluations.evaluate_when_due(audience.show_now)) is not None:
-            audience.evaluated(found)
+        if tell(evaluations.evaluate_when_due(audience.show_now)):
             files.save()
 
     files.save()
     try:
         hub.wait_for(workers)
         audience.start()
-        evaluations.begin_again()
+        tell(evaluations.begin_again(audience.show_now))
         publish(files.weights())
         if tally.evaluation_is_due():  # the run was interrupted before it
             evaluate()
@@ -89,8 +95,7 @@ def train(
                 else:
                     files.save_if_due()
         files.save()
-        if (found := evaluations.end_pending(audience.show_now)) is not None:
-            audience.evaluated(found)
+        tell(evaluations.end_pending(audience.show_now))
         if evaluations.conclude(audience.show_now):
             audience.evaluated()
         files.save_unless_saved()  # the final policy may be the best

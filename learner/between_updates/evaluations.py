@@ -38,11 +38,16 @@ class Evaluations:
         self._tally, self._state = run.tally, run.tally.state
         self.write_best()  # the folder may have that of a later version, which was lost
 
-    def begin_again(self) -> None:
-        """Begin the evaluation again that was beside training when the run was interrupted. Its weights are published."""
-        if (pending := self._state.pending) is not None:
-            self._run.hub.publish(pending.version, *self._state.pending_policy, deal=False)
-            self._begin_beside()
+    def begin_again(self, watch: Callable[[], None]) -> Row | None:
+        """Begin the evaluation again that was beside training when the run was interrupted: its weights are published.
+
+        Without `eval_workers`, as the run may be resumed, it is also ended here. Returns its metrics then.
+        """
+        if (pending := self._state.pending) is None:
+            return None
+        self._run.hub.publish(pending.version, *self._state.pending_policy, deal=False)
+        self._begin_beside()
+        return None if self._config.eval_workers else self.end_pending(watch)
 
     def evaluate_when_due(self, watch: Callable[[], None]) -> Row | None:
         """Make the evaluation that is due, of the newest policy. Returns its metrics.

@@ -18,7 +18,7 @@ from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.run_folder.atomic_write import Writes
 from learner.run_folder.run_folder import RunFolder
-from learner.run_state import RunState
+from learner.run_state import EvaluatedPolicy, RunState
 from millrace.cli.flags import EvaluateFlags
 from protocol.bounds import LARGEST
 from protocol.rollout import Episode
@@ -31,6 +31,8 @@ class Fakes:
     def __init__(self, *returns: float) -> None:
         self.returns: Iterator[float] = iter(returns)
         self.evaluated = 0
+        self.published: list[int] = []
+        """The versions of weights that were published for an evaluation."""
         self.seeds: list[tuple[int, ...]] = []
         """The seeds of each evaluation."""
         self.writes = Writes()
@@ -48,13 +50,13 @@ class Fakes:
         return [PlayedEpisode(Episode(next(self.returns), 1, 0.0), cut=False)] * len(self.seeds[-1])
 
     def publish(self, version: int, *weights: Any, deal: bool) -> None:
-        pass
+        self.published.append(version)
 
     def write_policy(self, policy: Any, env: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
 
-    def evaluations(self, every: int, state: RunState, seed: int = 1) -> tuple[Tally, Evaluations]:
-        config = Config(eval_every=every, eval_episodes=10, seed=seed)
+    def evaluations(self, every: int, state: RunState, seed: int = 1, **settings: Any) -> tuple[Tally, Evaluations]:
+        config = Config(eval_every=every, eval_episodes=10, seed=seed, **settings)
         folder, algorithm, hub = cast(RunFolder, self), cast(Algorithm, self), cast(Hub, self)
         tally = Tally(config, run_spec(), state)
         return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, tally), None)
@@ -97,6 +99,70 @@ def test_the_final_policy_can_be_the_best_after_a_resume_without_evaluations() -
     assert best is not None
     assert (best.chosen_by, best.env_steps, best.evaluation.return_mean) == (7.0, 4_000, 7.5)
     assert fakes.written == [-1.0, 1.0]
+
+
+# ---------------------------------------------------------------- beside training
+
+TARGET = "target return 5 reached"
+
+
+@pytest.mark.parametrize(
+    ("eval_workers", "returns", "evaluated", "reason", "best"),
+    [
+        (0, [3.0, 6.0, 1.0], [100, 200], TARGET, [6.0, 200]),
+        (1, [3.0, 6.0, 1.0], [100, 200], f"{TARGET} by the policy of 200 env steps", [6.0, 200]),
+        (1, [6.0, 1.0], [100], f"{TARGET} by the policy of 100 env steps", [6.0, 100]),
+        (0, [3.0, 1.0, 2.0, 6.0], [100, 200, 300, 400], TARGET, [6.0, 400]),
+        (1, [3.0, 1.0, 2.0, 6.0], [100, 200, 300], "all steps done", [6.0, 400]),
+        (1, [3.0, 3.0, 2.0, 1.0], [100, 200, 300], "all steps done", [3.0, 100]),
+    ],
+)
+def test_when_a_run_stops_and_which_policy_it_keeps(
+    eval_workers: int, returns: list[float], evaluated: list[int], reason: str, best: list[float]
+) -> None:
+    """`evaluated`: env steps of the policies whose results came before the run stopped, at 430 env steps at the latest."""
+    fakes, state = Fakes(*returns, *returns), RunState()
+    tally, evaluations = fakes.evaluations(100, state, eval_workers=eval_workers, target_return=5.0, steps=433, envs=4)
+    found = []
+    for state.version, state.env_steps in enumerate(range(30, 431, 10), 1):
+        if tally.evaluation_is_due() and evaluations.evaluate_when_due(lambda: None) is not None:
+            found.append(state.evaluated_env_steps)
+        if (stop := tally.stop_reason()) is not None:
+            break
+    assert (found, stop) == (evaluated, reason)
+    evaluations.end_pending(lambda: None)
+    assert state.best == best
+    number = best[1] // 100 - 1  # what `Fakes.weights` were when this policy was to be evaluated
+    assert fakes.written[-1] == number + (eval_workers == 0)
+
+
+def test_the_last_policy_is_not_evaluated_twice() -> None:
+    fakes, state = Fakes(3.0, 4.0, 3.5), RunState(version=1, env_steps=100)
+    _, evaluations = fakes.evaluations(100, state, eval_workers=1)
+    assert evaluations.evaluate_when_due(lambda: None) is None
+    assert evaluations.end_pending(lambda: None) is not None
+    assert not evaluations.conclude(lambda: None)
+    assert evaluations.confirmed is not None
+    assert (state.newest_evaluation is not None, fakes.evaluated) == (True, 2), "once, and once as the best"
+
+
+@pytest.mark.parametrize("eval_workers", [0, 1])
+def test_an_evaluation_begins_again_when_the_run_is_resumed(eval_workers: int) -> None:
+    policy = np.array([7], np.float32), np.zeros(0, np.float32)
+    state = RunState(version=5, env_steps=150, next_evaluation=200, pending=EvaluatedPolicy(3, 100), pending_policy=policy)
+    fakes = Fakes(3.0, 4.0)
+    tally, evaluations = fakes.evaluations(100, state, eval_workers=eval_workers)
+    metrics = evaluations.begin_again(lambda: None)
+    assert fakes.published == [3]
+    assert (metrics is None) == bool(eval_workers), "without workers that only evaluate, it is awaited at once"
+    if metrics is None:
+        state.version, state.env_steps = 6, 210
+        assert tally.evaluation_is_due()
+        metrics = evaluations.evaluate_when_due(lambda: None)
+    assert metrics is not None
+    assert (metrics["eval/mean_reward"], metrics["eval/env_steps"]) == (3.0, 100)
+    assert (state.evaluated_version, state.best, fakes.written) == (3, [3.0, 100], [7.0])
+    assert (state.pending is None) == (not eval_workers)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -106,7 +106,7 @@ MUTATIONS = {
         WEIGHTS, "member.versions = held | dict", "member.versions |= dict"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
-        COORDINATOR, "out + self.weights.after(orders, self.members)", "out + orders"
+        COORDINATOR, "out + self.weights.after(orders, self.members, self._named)", "out + orders"
     ),
     "weights are never sent": Mutation(WEIGHTS, " and message.version not in member.versions:", " and False:"),
     "weights are sent with every order": Mutation(WEIGHTS, " and message.version not in member.versions:", ":"),

@@ -27,8 +27,8 @@ MUTATIONS = {
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
-        "return self.weights.after(out, self.members)",
-        "return out if self.evaluation.pending else self.weights.after(out, self.members)",
+        "return self.weights.after(out, self.members, self._named)",
+        "return out if self.evaluation.pending else self.weights.after(out, self.members, self._named)",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
         COORDINATOR,
