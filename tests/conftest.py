@@ -6,6 +6,7 @@ import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # what is compared bit for bit is computed on the CPU, also where there is a GPU
 
 import gc
 import signal
