@@ -16,6 +16,7 @@ Doing = Literal["starting", "waiting", "describing", "making", "resetting", "ste
 
 `making`: an env copy, or the policy with all that it imports.
 """
+SHARED_VERSIONS = 4  # so many of the last weights that came to it, a supervisor keeps for its workers
 NO_SLOT = "no slot is free"  # the beginning of the reason of a worker that leaves, and comes back when there is room
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
@@ -62,6 +63,9 @@ class Alive(Message, frozen=True):
     running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]
     ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
     """those that ended a short while ago; repeated, because a message may be lost"""
+    replies: Natural | None = None
+    """number of the last HeartbeatReply that came to the supervisor, if its workers share the weights that it gets; null if
+    they do not"""
 
 
 @dataclass(frozen=True)

@@ -48,10 +48,11 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
 WORKERS = {  # the same for each folder and file of the workers; the files that are not named stand above all of these
     "activity": set[str](),
     "exit_codes": set[str](),
+    "shared_weights": set[str](),
     "slots": set[str](),
     "watchdog": set[str](),
     "conversation": {"exit_codes"},
-    "supervise": {"activity", "exit_codes", "slots", "watchdog"},
+    "supervise": {"activity", "exit_codes", "shared_weights", "slots", "watchdog"},
     "copy_slots": {"activity", "slots"},
     "envs": {"copy_slots"},
     "copies": {"activity", "copy_slots", "envs"},

@@ -21,6 +21,7 @@ from protocol.keys.key_folder import read_token
 from protocol.keys.keys import Token
 from workers.conversation.connection_rules import checked_token
 from workers.flags import WorkerFlags
+from workers.shared_weights import SUPPORTED, SharedWeights
 from workers.supervise.learner_notice import AliveSender
 from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
@@ -71,14 +72,20 @@ def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> i
         own_flags = [*passed, *core_flags(cores, number)]
         if flags.stay:
             log.info("worker %s: waiting for a learner at %s", name, flags.address)
-        return WorkerProcess(WorkerCommand(flags.address, name, token=token, flags=own_flags))
+        descriptors = () if weights is None else weights.descriptors(name)
+        if descriptors:
+            own_flags += ["--weights", ",".join(map(str, descriptors))]
+        return WorkerProcess(WorkerCommand(flags.address, name, token=token, flags=own_flags, handed=descriptors))
 
-    notice = AliveSender(flags.address, token)
+    weights = SharedWeights() if SUPPORTED and flags.processes > 1 else None
+    notice = AliveSender(flags.address, token, weights)
     try:
         supervisor = Supervisor(start, flags.processes, timeouts=timeouts, stay=flags.stay)
         return supervisor.run(lambda: len(signals), lambda line: log.warning("%s", line), notice)
     finally:
         notice.close()
+        if weights is not None:
+            weights.close()
 
 
 def _count_signals() -> list[int]:

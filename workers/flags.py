@@ -22,7 +22,7 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     address: Annotated[str, Flag(positional=True)]
     """address of the learner: ipc://PATH or tcp://HOST:PORT"""
     processes: Annotated[int, Flag("N"), Meta(ge=1)] = 1
-    """start N workers, one process each; one that fails is restarted"""
+    """start N workers, one process each; one that fails is restarted. Together they get each version of the weights once"""
     name: str = ""
     """name of this worker, unique in the run; if not given, host name and process id"""
     stay: bool = False
@@ -60,6 +60,8 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     """descriptor whose locks the parent holds too"""
     handed: Annotated[str, HIDDEN] = ""
     """descriptors of shared memory"""
+    weights: Annotated[str, HIDDEN] = ""
+    """descriptors of the weights that the parent shares"""
 
     @property
     def called(self) -> str:

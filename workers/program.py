@@ -29,6 +29,7 @@ from workers.conversation.session import NO_LEARNER, Session
 from workers.exit_codes import EXIT_NO_LEARNER
 from workers.flags import WorkerFlags
 from workers.security import allowed_code
+from workers.shared_weights import SharedWeightsReader
 from workers.slots import share_slots
 from workers.supervise.process_group import kill, live_members
 from workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
@@ -70,6 +71,7 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
         stop_requests=lambda: LEAVE_AT_ONCE if parent_is_gone(flags.parent) else len(signals),
         feed_watchdog=watchdog.feed if watchdog else lambda now: None,
         shared_memory=InheritedDescriptors(*map(int, flags.handed.split(","))) if flags.handed else None,
+        shared_weights=SharedWeightsReader(*map(int, flags.weights.split(","))) if flags.weights else None,
         exit_code=_exit_code,
     )
     left = Worker(link, session, options).run()

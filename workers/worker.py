@@ -15,7 +15,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,7 +27,7 @@ from protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, We
 from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.policy import make_policy
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from protocol.wire.codec import encode
+from protocol.wire.codec import decode_to_worker, encode
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.weight_dtypes import to_float32
 from protocol.wire.worker_link import WorkerLink
@@ -52,6 +52,7 @@ from workers.conversation.worker_states import WorkerState
 from workers.described_copy import describing
 from workers.evaluate.evaluator import Evaluator
 from workers.exit_codes import EXIT_UNSUITABLE
+from workers.shared_weights import SharedWeightsReader
 from workers.slots import NoSlot, slots
 from workers.vector_env.stepper import Stepper
 
@@ -99,6 +100,8 @@ class WorkerOptions:
     """Called regularly with the time, unless the environment hangs."""
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
+    shared_weights: SharedWeightsReader | None = None
+    """The weights that the supervisor gets for all its workers."""
     exit_code: Callable[[int, str], int] = _same_exit_code
     """Exit code of the process, from that of the conversation and the reason for leaving."""
     make_actors: MakeActors = make_local_actors
@@ -123,6 +126,8 @@ class Worker:
         self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
         self._packing = link.packing
+        if self._options.shared_weights is not None:
+            link.watch(self._options.shared_weights.wake_fd)
         self._pulse_due_s = 0.0
         self._resident_bytes = 0
         self._left: Leave | None = None
@@ -202,14 +207,21 @@ class Worker:
             self._do(self._session.stop())
         if (problem := self._link.problem) is not None and problem.final:
             self._do(self._session.refused(problem.line))
-        if not arrived:
-            return
-        self._unheard_from_s = self._waited_s
-        for message in self._link.receive():
-            if isinstance(message, BadMessage):
-                log.warning("the learner sent an unreadable message: %s", message)
-            else:
-                self._do(self._session.handle(message, self._clock()))
+        if arrived:
+            self._unheard_from_s = self._waited_s
+            for message in self._link.receive():
+                if isinstance(message, BadMessage):
+                    log.warning("the learner sent an unreadable message: %s", message)
+                else:
+                    self._do(self._session.handle(message, self._clock()))
+        if self._options.shared_weights is not None:
+            self._take_shared_weights(self._options.shared_weights)
+
+    def _take_shared_weights(self, shared: SharedWeightsReader) -> None:
+        """Handle the weights that the supervisor got, as if the learner had sent them to this worker."""
+        for frames in shared.find(self._session.session, self._session.missing_versions()):
+            with suppress(BadMessage):  # the learner will send them here, and be told
+                self._do(self._session.handle(decode_to_worker(frames), self._clock()))
 
     def _connect_again_if_unheard(self) -> None:
         """Something on the way (a proxy, a tunnel) may keep a connection open whose other end is gone.

@@ -38,6 +38,7 @@ from protocol.messages import (
     Failure,
     Goodbye,
     Heartbeat,
+    HeartbeatReply,
     Hello,
     Refuse,
     Rejoin,
@@ -56,10 +57,25 @@ REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer wit
 MAX_MEMBERS = 4_096
 MOST_TAKEOVERS = 3  # of one name, by one live process from another
 MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
-SUPERVISOR_WORD_S = 5.0  # what a supervisor said is shown for this long
+SUPERVISOR_WORD_S = 5.0  # what a supervisor said holds for this long
 
 Outgoing = tuple[bytes, ToWorker]
 """A message and the routing id of the worker that it is sent to."""
+
+
+@dataclass
+class SharingSupervisor:
+    """A supervisor whose workers share the weights that it gets, as the learner sees it. Its workers' members keep it."""
+
+    peer: bytes
+    heard_s: float = 0.0
+    """Time of its last word."""
+    replies: int = 0
+    """Number of heartbeat replies that were sent to it."""
+    received: int = 0
+    """Number of the last one that it has received: what was sent before it has arrived, or is lost."""
+    versions: dict[int, int] = field(default_factory=dict)
+    """Versions of the weights that were sent to it; for each, `replies` when it was sent."""
 
 
 @dataclass
@@ -100,6 +116,14 @@ class Member:
     """Time when the supervisor said that."""
     in_env_code_s: float = -math.inf
     """Time when the supervisor said last that the worker is in environment code: until then the worker was not silent."""
+    supervisor: SharingSupervisor | None = None
+    """Its supervisor, if it shares weights."""
+
+    @property
+    def shared_by(self) -> SharingSupervisor | None:
+        """The supervisor that shares weights with the worker, unless it has fallen silent."""
+        found = self.supervisor
+        return found if found is not None and self.heard_s - found.heard_s < SUPERVISOR_WORD_S else None
 
     @property
     def alive_s(self) -> float:
@@ -209,7 +233,7 @@ class Membership(Generic[M]):
         only evaluates
         """
         self._run, self._member_class, self._on_removed, self.is_spare = run, member_class, on_removed, is_spare
-        self._next_session = first_session
+        self._first_session = self._next_session = first_session
         self._joins = 0
         self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
         self._of_process: dict[tuple[str, int], M] = {}  # by name and process_nonce
@@ -319,17 +343,32 @@ class Membership(Generic[M]):
         Returns the answer, and the exits by which members were removed.
         """
         key = key_of_peer(peer)
-        for activity in alive.running:
-            self.record_activity(activity, now, key)
+        found = [self.record_activity(activity, now, key) for activity in alive.running]
         removed = [worker_exit for worker_exit in alive.ended if self.record_exit(worker_exit, key)]
-        answer: list[Outgoing] = [] if self.draining is None else [(peer, Drain(one_line(self.draining)))]
-        return answer, removed
+        if self.draining is not None:
+            return [(peer, Drain(one_line(self.draining)))], removed
+        members = [member for member in found if member is not None]
+        known = [member.supervisor for member in members if member.supervisor and member.supervisor.peer == peer]
+        supervisor = None if alive.replies is None else (known or [SharingSupervisor(peer)])[0]
+        for member in members:
+            member.supervisor = supervisor
+        if supervisor is None or alive.replies is None or not members:
+            return [], removed
+        supervisor.heard_s, supervisor.received = now, alive.replies
+        supervisor.replies += 1
+        return [(peer, HeartbeatReply(self._first_session, supervisor.replies, ()))], removed
 
-    def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> None:
-        """Record what a member's process does. `key`: that of the supervisor which says so; None: this program is it."""
+    def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> M | None:
+        """Record what a member's process does. Returns the member.
+
+        `key`: that of the supervisor which says so; None: this program is it.
+        """
         member = self._of_process.get((activity.worker, activity.process_nonce))
-        if member is not None and (key is None or key == key_of_peer(member.peer)) and member.record_activity(activity, now):
+        if member is None or (key is not None and key != key_of_peer(member.peer)):
+            return None
+        if member.record_activity(activity, now):
             self.progress[member.hello.evaluates] += 1
+        return member
 
     def record_exit(self, worker_exit: WorkerExit, key: bytes | None = None) -> bool:
         """A member's process has ended: remove the member. True if it was one. `key`: as for `record_activity`."""

@@ -3,15 +3,23 @@
 Rule: weights are kept while they are the newest, act in a round that is open, or are evaluated. They are sent to a worker
 after the first order that names them, and again if its Heartbeat shows that they were lost on the way. Of those that were
 sent, a worker keeps the newest and those that its tickets name.
+
+Where a supervisor shares weights among its workers, it gets them once, in place of the first of its workers that needs
+them. For all of these they are on the way until the supervisor's word shows that they have reached it, or are lost. From
+then on a worker has as long to take them as if they had just been sent to it; what it lacks later is sent to it directly.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 
 from learner.members.membership import Outgoing
 from learner.rollouts.collecting_member import CollectingMember
+from protocol.alive import SHARED_VERSIONS
 from protocol.messages import Collect, Evaluate, Heartbeat, Weights
+
+TO_SUPERVISOR = sys.maxsize  # in place of a number of replies: on the way to the supervisor, as far as is known
 
 Named = Callable[[Collection[int]], set[int]]
 """Returns the versions that these tickets name."""
@@ -36,13 +44,24 @@ class SentWeights:
             out.append((peer, message))
             member = members[peer]
             if isinstance(message, Collect | Evaluate) and message.version not in member.versions:
-                out.append((peer, self.kept[message.version]))
-                member.versions[message.version] = member.replies
+                version, supervisor = message.version, member.shared_by
+                if supervisor is None:
+                    out.append((peer, self.kept[version]))
+                elif version not in supervisor.versions:
+                    out.append((supervisor.peer, self.kept[version]))
+                    last = list(supervisor.versions.items())[1 - SHARED_VERSIONS :]
+                    supervisor.versions = {**dict(last), version: supervisor.replies}
+                member.versions[version] = member.replies if supervisor is None else TO_SUPERVISOR
                 drop_versions(member, named)
         return out
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
         """Those of the `named` versions that were lost on the way to this worker, as its heartbeat shows."""
+        supervisor = member.shared_by
+        for version, sent_at in member.versions.items():
+            on_its_way = supervisor is not None and supervisor.versions.get(version, -1) >= supervisor.received
+            if sent_at == TO_SUPERVISOR and not on_its_way:
+                member.versions[version] = member.replies
         sent = member.versions.items()
         # What it does not list was dropped or lost, unless it may still be on its way.
         held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}

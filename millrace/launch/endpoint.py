@@ -64,7 +64,9 @@ class Endpoint(Bound):
                 return WorkerThread(self.link.address, name, self.context, evaluates=evaluates)
             own, log_file = flags(name)
             own = [*own, "--evaluate"] if evaluates else own
-            return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, own, handed(name)))
+            if (descriptors := handed(name)) is not None:
+                own = [*own, "--handed", ",".join(map(str, descriptors))]
+            return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, own, descriptors or ()))
 
         if self.where.bind:
             count = 0

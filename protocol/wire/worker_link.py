@@ -60,6 +60,7 @@ class WorkerLink:
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
+        self._beside: int | None = None
         if address.startswith("tcp://"):
             self._open_monitor()
         if token is not None:
@@ -72,6 +73,11 @@ class WorkerLink:
         if not resolves(address):
             self._report(ConnectionProblem(f"the host of {address} is not known here; is it spelt right?"))
 
+    def watch(self, fd: int) -> None:
+        """From now on `poll` returns early when this file descriptor can be read."""
+        self._poller.register(fd, zmq.POLLIN)
+        self._beside = fd
+
     def poll(self, timeout_s: float) -> bool:
         """Wait until something arrives, at most `timeout_s`. Returns early if the learner refuses our key."""
         deadline_s = time.monotonic() + timeout_s
@@ -80,7 +86,8 @@ class WorkerLink:
             ready = dict(self._poller.poll(int(left_s * 1000)))
             if self._monitor in ready:
                 self._read_events()
-            if self._socket in ready or left_s == 0.0 or (self.problem is not None and self.problem.final):
+            refused = self.problem is not None and self.problem.final
+            if self._socket in ready or self._beside in ready or left_s == 0.0 or refused:
                 return self._socket in ready
 
     def _open_monitor(self) -> None:

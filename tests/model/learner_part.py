@@ -55,7 +55,7 @@ NOT_SAVED: dict[type, set[str]] = {
     RolloutDealer: {"_absent"},
     SentWeights: set(),
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
-    | {"_removed_for_silence", "_stages_of_left"},
+    | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
         "joined_s",
         "state",
@@ -66,7 +66,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity",
         "activity_s",
     }
-    | {"in_env_code_s", "stepped"},
+    | {"in_env_code_s", "stepped", "supervisor"},
     TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},

@@ -110,10 +110,10 @@ WORDS: Mapping[str, str] = {
 }
 # Where the document says when a message is sent, and what follows.
 STEPS, COLLECTS, REPAIRS = "Environment profile", "Collector profile", "The heartbeat repairs"
-OF_WORKER, OF_LEARNER = "The worker's half", "The learner's half"
+OF_WORKER, OF_LEARNER, SHARED = "The worker's half", "The learner's half", "Weights once for each machine"
 PROSE: Mapping[type, tuple[str, ...]] = {
     Hello: ("Transport", OF_WORKER),
-    messages.Alive: ("What a worker does in a session",),
+    messages.Alive: ("What a worker does in a session", SHARED),
     messages.Described: ("Describe",),
     Rollout: (COLLECTS, "Packed arrays"),
     messages.Heartbeat: (OF_WORKER, REPAIRS),
@@ -126,11 +126,11 @@ PROSE: Mapping[type, tuple[str, ...]] = {
     messages.Welcome: ("What a worker does in a session", OF_LEARNER),
     messages.Refuse: (OF_WORKER,),
     messages.Rejoin: (OF_WORKER, OF_LEARNER),
-    Weights: (COLLECTS, "The ticket law"),
+    Weights: (COLLECTS, "The ticket law", SHARED),
     Collect: (OF_WORKER, "The ticket law"),
     messages.Release: (STEPS, OF_WORKER),
     messages.Evaluate: (COLLECTS,),
-    messages.HeartbeatReply: (OF_WORKER, REPAIRS),
+    messages.HeartbeatReply: (OF_WORKER, REPAIRS, SHARED),
     messages.Drain: (OF_WORKER,),
     messages.Reset: (STEPS,),
     messages.Step: (STEPS,),

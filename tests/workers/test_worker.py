@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -42,6 +43,7 @@ from workers.activity import ActivityReader, activity
 from workers.collect.collector import Collector
 from workers.conversation.session import Leave, Session
 from workers.evaluate.evaluator import Evaluator
+from workers.shared_weights import SharedWeights, SharedWeightsReader
 from workers.slots import Slots
 from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
 
@@ -92,8 +94,9 @@ class Unanswered(FakeLink):
         self.made_at.append(self.now)
 
 
-def work(link: FakeLink) -> Leave:
-    return Worker(cast(WorkerLink, link), Session(replace(identity("w0"), process_nonce=0), 0.0), clock=lambda: 0.0).run()
+def work(link: FakeLink, options: WorkerOptions | None = None) -> Leave:
+    session = Session(replace(identity("w0"), process_nonce=0), 0.0)
+    return Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run()
 
 
 PARAMETERS = np.random.default_rng(0).normal(0, 0.1, acting_size(RUN.policy)).astype(np.float32)
@@ -104,6 +107,39 @@ def said_to_a_worker(run: RunSpec, parameters: Array = PARAMETERS) -> list[ToWor
     """To join, collect one rollout and leave."""
     permits, received = (Permit(0, 0, 0, 0),), (Received(0, 0, 0),)
     return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received), Drain("done")]
+
+
+class Watching(FakeLink):
+    """Weights do not come over it, but into the shared file, and wake the worker."""
+
+    def __init__(self, messages: Sequence[ToWorker], shared: SharedWeights) -> None:
+        super().__init__(messages)
+        self.shared = shared
+
+    def watch(self, fd: int) -> None:
+        self.watched = fd
+
+    def poll(self, timeout_s: float) -> bool:
+        if self.messages and isinstance(weights := self.messages[0], Weights):
+            self.messages.pop(0)
+            self.shared.write(1, weights.version, encode(weights))
+            assert select.select([self.watched], [], [], 0.0)[0]
+            return False
+        return super().poll(timeout_s)
+
+
+def test_a_worker_acts_under_the_weights_that_its_supervisor_got_as_if_they_had_come_over_the_link() -> None:
+    direct, shared = FakeLink(said_to_a_worker(RUN)), SharedWeights()
+    assert work(direct).exit_code == 0
+    welcome, weights, order, drain = said_to_a_worker(RUN)
+    for said in ([welcome, weights, order, drain], [welcome, order, weights, drain]):
+        link = Watching(said, shared)
+        options = WorkerOptions(shared_weights=SharedWeightsReader(*shared.descriptors("w0")))
+        assert work(link, options).exit_code == 0
+        assert [bits(each) for each in link.heard() if isinstance(each, Rollout)] == [
+            bits(each) for each in direct.heard() if isinstance(each, Rollout)
+        ]
+    shared.close()
 
 
 def test_a_worker_compresses_if_the_run_and_its_link_let_it() -> None:

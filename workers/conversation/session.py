@@ -182,6 +182,10 @@ class _SessionState:
         version, assignments = self.rollouts.startable(self.weights)
         return RolloutTask(session, self.weights[version], assignments) if assignments else self.orders.next()
 
+    def missing_versions(self) -> set[int]:
+        """Versions that are asked for and not held."""
+        return (self.rollouts.versions() | self.evaluations.versions()).difference(self.weights)
+
     def drop_weights(self) -> None:
         """Drop the weights that are neither the newest nor asked for."""
         asked = {*self.rollouts.versions(), *self.evaluations.versions(), max(self.weights, default=-1)}
@@ -358,6 +362,10 @@ class Session:
         work = self._current.next_work(self.session)
         self._current.in_progress = work is not None
         return work
+
+    def missing_versions(self) -> set[int]:
+        """Versions of the weights that this worker is asked to act under, and does not hold."""
+        return self._current.missing_versions()
 
     def work_ended(self, answers: Sequence[Rollout | Evaluated | Answer]) -> list[WorkerEffect]:
         """The work in progress has ended with these answers; with none, it was abandoned. A worker that drains leaves."""

@@ -4,12 +4,18 @@ Rule: it says so about every second, and more often while a call of an environme
 while, because a message may be lost: a failed one at once, one that left on purpose a moment later, so that its own last
 messages come first. Nothing is sent before a worker has joined: a wrong address or key is the worker's to report. This file
 imports neither numpy nor gymnasium.
+
+If the workers share weights, the learner sends each version once, over this connection. It answers each word, so that both
+sides know what has arrived; and its answer says whose weights these are, as a Welcome does on a worker's connection.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
+import struct
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -21,6 +27,9 @@ from protocol.bounds import MAX_NAME, MAX_WORKERS
 from protocol.keys.keys import Token
 from protocol.keys.zap import connect_with
 from protocol.wire.socket_options import RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
+from workers.shared_weights import SharedWeights
+
+log = logging.getLogger("millrace.worker")
 
 EVERY_S = 1.0
 EVERY_S_WHILE_SLOW = 0.4
@@ -31,9 +40,10 @@ ENDED_AFTER_S, ENDED_FOR_S = 0.2, 5.0
 class AliveSender:
     """The supervisor's connection to the learner."""
 
-    def __init__(self, address: str, token: Token | None) -> None:
-        """Connects at the first `send` that has something to say."""
-        self._address, self._token = address, token
+    def __init__(self, address: str, token: Token | None, weights: SharedWeights | None = None) -> None:
+        """Connects at the first `send` that has something to say. `weights`: shares those that come among the workers."""
+        self._address, self._token, self._weights = address, token, weights
+        self._first_session = self._replies = 0  # of the learner's last answer
         self._socket: zmq.Socket[bytes] | None = None
         self._due_s = 0.0
         self._ended: list[tuple[float, WorkerExit]] = []
@@ -55,21 +65,45 @@ class AliveSender:
         self._reported = {each.process_nonce for each in reported}
         self._due_s = now + (EVERY_S_WHILE_SLOW if slow else EVERY_S)
         for first in range(0, max(len(joined), 1), MAX_WORKERS):
-            self._say(Alive(tuple(joined[first : first + MAX_WORKERS]), reported[:MAX_WORKERS]))
+            replies = None if self._weights is None else self._replies
+            self._say(Alive(tuple(joined[first : first + MAX_WORKERS]), reported[:MAX_WORKERS], replies))
 
-    def run_is_over(self) -> bool:
-        """Whether the learner has answered, since the last call, that the run is over."""
-        over = False
-        if self._socket is not None:
-            with suppress(zmq.Again):
-                while not over:
-                    over = _is_drain(self._socket.recv_multipart(zmq.NOBLOCK)[0])
+    def listen(self, for_s: float) -> bool:
+        """Take at once what the learner sends, for so long. Whether it has said that the run is over."""
+        if self._socket is None:
+            time.sleep(for_s)
+            return False
+        until_s, over = time.monotonic() + for_s, False
+        while self._socket.poll(max(0, int(1000 * (until_s - time.monotonic())))):
+            over |= self._take(self._socket.recv_multipart(copy=False))
+            if time.monotonic() >= until_s:
+                break
         return over
 
     def close(self) -> None:
         """Close the connection."""
         if self._socket is not None:
             self._socket.close(linger=200)
+
+    def _take(self, frames: Sequence[zmq.Frame]) -> bool:
+        """Take a message. Whether it says that the run is over."""
+        with suppress(msgspec.MsgspecError):
+            match msgspec.msgpack.decode(frames[0].bytes):
+                case ["Drain", *_]:
+                    return True
+                case ["HeartbeatReply", int(first_session), int(number), _]:
+                    self._first_session, self._replies = first_session, number
+                case ["Weights", int(version), *_] if self._weights is not None:
+                    self._share(version, [frame.buffer for frame in frames])
+        return False
+
+    def _share(self, version: int, frames: Sequence[memoryview]) -> None:
+        assert self._weights is not None
+        try:
+            self._weights.write(self._first_session, version, frames)
+        except (OSError, struct.error) as error:
+            log.warning("the workers cannot share weights, and each gets its own from now on: %s", error)
+            self._weights = None
 
     def _say(self, message: Alive) -> None:
         if self._socket is None:
@@ -89,12 +123,3 @@ class AliveSender:
             connect_with(found, self._token)
         found.connect(self._address)
         return found
-
-
-def _is_drain(head: bytes) -> bool:
-    """Whether this is the head of a `Drain`. Everything else is of no interest here."""
-    with suppress(msgspec.MsgspecError):
-        match msgspec.msgpack.decode(head):
-            case ["Drain", *_]:
-                return True
-    return False

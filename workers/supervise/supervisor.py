@@ -82,8 +82,8 @@ class LearnerNotice(Protocol):
         """Say this, if it is time to."""
         ...
 
-    def run_is_over(self) -> bool:
-        """Whether the learner has answered, since the last call, that the run is over."""
+    def listen(self, for_s: float) -> bool:
+        """Take at once what the learner sends, for so long. Whether it has said that the run is over."""
         ...
 
 
@@ -229,7 +229,7 @@ class Supervisor:
         After such a request, or once the run is over, no worker is restarted, and one whose environment hangs is killed.
         With `stay`, one that hangs after the end of a run is killed too.
         """
-        handled, leave_by_s, kill_hanging_from_s = 0, float("inf"), float("inf")
+        handled, leave_by_s, kill_hanging_from_s, over = 0, float("inf"), float("inf"), False
         while True:
             ended = self._ended()
             for each, end in ended:
@@ -245,7 +245,7 @@ class Supervisor:
                 leave_by_s = min(leave_by_s, now + LEAVE_WITHIN_S)
                 kill_hanging_from_s = min(kill_hanging_from_s, now + HANGS_AFTER_S)
                 self.ask_to_leave()
-            if notice is not None and not self._stopping and notice.run_is_over():
+            if over and not self._stopping:
                 self._stopping = not self._stay
                 kill_hanging_from_s = min(kill_hanging_from_s, now + HANGS_AFTER_S)
                 leave_by_s = kill_hanging_from_s if self._stopping else leave_by_s
@@ -255,7 +255,10 @@ class Supervisor:
                     kill_hanging_from_s = float("inf")
             if now > leave_by_s:
                 self.stop(0.0)
-            time.sleep(POLL_S)
+            if notice is not None:
+                over = notice.listen(POLL_S)
+            else:
+                time.sleep(POLL_S)
 
     def _kill_hanging(self, longer_than_s: float, now: float) -> None:
         """Kill the workers that have done one thing for too long."""

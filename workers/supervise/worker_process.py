@@ -54,8 +54,8 @@ class WorkerCommand:
     token: Token | None = None
     flags: Sequence[str] = ()
     """Further flags of `python -m workers`."""
-    shared_memory: tuple[int, int, int] | None = None
-    """`InheritedDescriptors` that the worker gets, to step a vector environment through shared memory."""
+    handed: Sequence[int] = ()
+    """File descriptors that these flags name, which the worker inherits."""
 
 
 class WorkerProcess:
@@ -75,8 +75,6 @@ class WorkerProcess:
         command = [sys.executable, "-P", "-m", "workers", start.address, "--name", start.name]
         command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd)]
         command += ["--slots", str(self._slots), *start.flags]
-        if start.shared_memory is not None:
-            command += ["--handed", ",".join(map(str, start.shared_memory))]
         # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[2])])
         secret = {NONCE_VARIABLE: str(self.process_nonce)}
@@ -91,7 +89,7 @@ class WorkerProcess:
                     stderr=stderr if start.log else None,
                     start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
                     env={**os.environ, **SINGLE_THREADED, **secret, "PYTHONPATH": path},
-                    pass_fds=(self._page.fd, self._slots, *(start.shared_memory or ())),
+                    pass_fds=(self._page.fd, self._slots, *start.handed),
                 )
         except BaseException:
             self._page.close()

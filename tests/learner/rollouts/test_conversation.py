@@ -30,6 +30,7 @@ def case(seed: int) -> World:
         until_s=until_s,
     )
     workers, max_lag, evaluators = draw.randint(1, 4), draw.choice([0, 0, 1, 4]), draw.choice([None, None, 0, 1, 2])
+    faults.places = draw.choice([0, 0, 1, 3])
     return World(seed, faults, workers=workers, lanes=lanes, max_lag=max_lag, evaluators=evaluators)
 
 

@@ -22,6 +22,7 @@ from hypothesis.extra import numpy as hnp
 from protocol.env_spec import PickledCallable
 from protocol.errors import BadMessage
 from protocol.messages import (
+    Alive,
     EpisodeRows,
     Failure,
     Heartbeat,
@@ -201,7 +202,8 @@ def test_a_default_stands_at_the_end_alone() -> None:
     """By position nothing else can be left out."""
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
     assert defaults == {
-        Hello: (False,), Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ()),
+        Hello: (False,), Alive: (None,),
+        Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ()),
     }  # fmt: skip
     assert Rollout.__struct_fields__[-3:] == ("episodes", "mask", "extras")
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket as plain
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -233,6 +235,20 @@ def test_sending_never_waits_for_a_learner_that_is_not_there(ends: Ends) -> None
     for _ in range(3000):  # more than any default high-water mark
         worker.send(encode(HELLO))
     assert not worker.poll(0.0)
+
+
+def test_a_wait_ends_when_a_watched_descriptor_can_be_read(ends: Ends) -> None:
+    readable, writable = os.pipe()
+    try:
+        link = ends.worker(ends.learner())
+        link.watch(readable)
+        os.write(writable, b"x")
+        began_s = time.monotonic()
+        assert not link.poll(DEADLINE_S), "no message has come"
+        assert time.monotonic() - began_s < DEADLINE_S / 2
+    finally:
+        os.close(readable)
+        os.close(writable)
 
 
 def test_nothing_to_receive_is_nothing(ends: Ends) -> None:

@@ -21,8 +21,20 @@ from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import TicketCoordinator
+from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
-from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker, WorkerExit
+from protocol.messages import (
+    Alive,
+    EpisodeRows,
+    Evaluated,
+    HeartbeatReply,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+    WorkerActivity,
+    WorkerExit,
+)
 from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from tests.support.conversation.rules import check_tickets
@@ -35,9 +47,11 @@ from workers.conversation.session import (
     WorkerEffect,
     WorkerIdentity,
 )
+from workers.shared_weights import is_of_learner
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
+SUPERVISOR = b"supervisor"
 
 
 def run_spec(lanes: int = 4, **changes: object) -> RunSpec:
@@ -118,10 +132,20 @@ class Faults:
     leaves: int = 0
     learner_restarts: int = 0
     evaluations: float = 0.0  # how many of the updates are evaluated
+    places: int = 0  # in which a supervisor of all workers shares weights; 0: none does
     until_s: float = 30.0
 
 
 EVALUATOR = b"e"  # the name of a worker that only evaluates begins so
+
+
+@dataclass
+class FakeSupervisor:
+    """What the supervisor of all workers has got of the learner."""
+
+    first_session: int = 0
+    replies: int = 0
+    shared: list[tuple[int, Weights]] = field(default_factory=list)
 
 
 @dataclass
@@ -154,6 +178,8 @@ class World:
         self.queue: list[tuple[float, int, Callable[[], None]]] = []
         self.arrival: dict[tuple[bytes, str], float] = {}  # a stream's last delivery: order is kept within it
         self.workers: dict[bytes, FakeWorker] = {}
+        self.supervisor = FakeSupervisor()
+        self.parameters: dict[int, Array] = {}  # of each learner, by its first session
         self.evaluations = 0
         self.plan: EvaluationPlan | None = None  # of the evaluation that is pending
         self.issued_at_barrier = 0
@@ -169,6 +195,8 @@ class World:
             self.spawn(name)
         self._schedule_faults(names)
         self.every(0.5, self._tick)
+        if faults.places:
+            self.every(1.0, self._speak_for_workers)
 
     # ------------------------------------------------------------ time
 
@@ -210,6 +238,8 @@ class World:
             self.carry((peer, "down"), lambda peer=peer, message=message: self._arrives(peer, message))  # type: ignore[misc]
 
     def _arrives(self, peer: bytes, message: ToWorker) -> None:
+        if peer == SUPERVISOR:
+            self._share(message)
         worker = self.workers.get(peer)
         if worker is None:
             return
@@ -233,6 +263,27 @@ class World:
         self.check()
         self._learn()
 
+    # ------------------------------------------------------------ supervisor
+
+    def _speak_for_workers(self) -> None:
+        running = [
+            WorkerActivity(name.decode(), worker.session.identity.process_nonce, "waiting", 0.0, 0)
+            for name, worker in self.workers.items()
+        ]
+        said = Alive(tuple(running), (), self.supervisor.replies)
+        self.carry((SUPERVISOR, "up"), lambda: self._hears(SUPERVISOR, said))
+
+    def _share(self, message: ToWorker) -> None:
+        supervisor = self.supervisor
+        match message:
+            case HeartbeatReply(first_session, number):
+                supervisor.first_session, supervisor.replies = first_session, number
+            case Weights():
+                shared = [*supervisor.shared, (supervisor.first_session, message)]
+                supervisor.shared = shared[-self.faults.places :]
+                for worker in list(self.workers.values()):
+                    self._serve(worker)
+
     # ------------------------------------------------------------ worker
 
     def spawn(self, name: bytes) -> None:
@@ -255,6 +306,9 @@ class World:
         session = worker.session
         while worker.inbox:
             self.say(worker, session.handle(worker.inbox.pop(0), self.now))
+        for first_session, weights in self.supervisor.shared:
+            if weights.version in session.missing_versions() and is_of_learner(session.session, first_session):
+                self.say(worker, session.handle(weights, self.now))
         if worker.task is not None and session.is_unwanted(worker.task):
             worker.task = None
             self.say(worker, session.work_ended([]))
@@ -271,6 +325,8 @@ class World:
             self.at(0.5, lambda: self._finish(worker, task))
             return
         worker.task = None
+        (own,) = (each for first, each in self.parameters.items() if 0 <= task.session - first < 2**20)
+        assert task.weights.parameters is own, "acted under the weights of another learner"
         if isinstance(task, RolloutTask):
             self.say(worker, worker.session.work_ended(fake_rollouts(task)))
         else:
@@ -301,7 +357,8 @@ class World:
             incarnations=incarnations,
         )
         self.coordinator = coordinator
-        coordinator.publish(version, PARAMETERS, BUFFERS)
+        parameters = self.parameters[coordinator.membership._first_session] = PARAMETERS.copy()
+        coordinator.publish(version, parameters, BUFFERS)
         self.first = version
         self.to_workers(coordinator.begin_update())
         return coordinator
@@ -330,6 +387,7 @@ class World:
             assert rollout.version == max(self.first, self.coordinator.version - self.max_lag)
         self.updating = True
         coordinator = self.coordinator
+        parameters = self.parameters[coordinator.membership._first_session]
 
         def publish() -> None:
             if self.coordinator is not coordinator:
@@ -337,7 +395,7 @@ class World:
             self.updates += 1
             self.updating = False
             self.due = self.random.random() < self.faults.evaluations
-            coordinator.publish(self.updates, PARAMETERS, BUFFERS)
+            coordinator.publish(self.updates, parameters, BUFFERS)
             if self.due and self.plan is None:
                 self._begin_evaluation()
             if self.random.random() < 0.3:

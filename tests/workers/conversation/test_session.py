@@ -998,3 +998,18 @@ def test_weights_are_held_and_not_copied() -> None:
     parameters = np.zeros(3, np.float32)
     session = ready(Weights(1, parameters, BUFFERS), collect((0, 0), version=1))
     assert task_of(session).weights.parameters is parameters
+
+
+def test_what_a_worker_misses_is_what_unfinished_tickets_name_and_it_does_not_hold() -> None:
+    session = ready()
+    assert session.missing_versions() == set()
+    session.handle(collect((1, 0), version=1), 0.1)
+    session.handle(msgspec.structs.replace(EVALUATE, version=2), 0.1)
+    assert session.missing_versions() == {1, 2}
+    session.handle(weights(2), 0.2)
+    assert session.missing_versions() == {1}
+    session.handle(weights(1), 0.4)
+    assert session.missing_versions() == set()
+    session.handle(collect((2, 1), version=5), 0.6)
+    session.handle(Rejoin(session.session), 0.7)
+    assert session.missing_versions() == set()

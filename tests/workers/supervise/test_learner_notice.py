@@ -10,6 +10,7 @@ import pytest
 import zmq
 
 from protocol.alive import Alive, WorkerActivity, WorkerExit
+from workers.shared_weights import SharedWeights, SharedWeightsReader
 from workers.supervise.learner_notice import ENDED_AFTER_S, ENDED_FOR_S, EVERY_S, EVERY_S_WHILE_SLOW, SLOW_S, AliveSender
 
 SOON_MS = 10_000
@@ -21,16 +22,22 @@ CRASHED, LEFT = WorkerExit("w1", 2, "was killed", True), WorkerExit("w2", 3, "ex
 class Notices:
     """A sender, and the learner's end of its connection."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, weights: SharedWeights | None = None) -> None:
         self.learner: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
         self.learner.bind(address)
-        self.sender = AliveSender(address, None)
+        self.sender = AliveSender(address, None, weights)
 
     def said(self) -> Alive:
         """The next message."""
         assert self.learner.poll(SOON_MS)
         self.peer, head, *_ = self.learner.recv_multipart()
         return msgspec.msgpack.decode(head, type=Alive)
+
+    def hears(self, head: object, *frames: bytes) -> None:
+        """The learner says this; it has arrived."""
+        self.learner.send_multipart([self.peer, msgspec.msgpack.encode(head), *frames])
+        assert self.sender._socket is not None
+        assert self.sender._socket.poll(SOON_MS)
 
     def close(self) -> None:
         self.sender.close()
@@ -86,8 +93,40 @@ def test_who_has_ended_is_named_for_a_while(notices: Notices) -> None:
 def test_only_a_drain_says_that_the_run_is_over(notices: Notices, head: object, over: bool) -> None:
     notices.sender.send([WAITING], [], 0.0)
     notices.said()
-    assert not notices.sender.run_is_over()
-    notices.learner.send_multipart([notices.peer, msgspec.msgpack.encode(head)])
-    assert notices.sender._socket is not None
-    assert notices.sender._socket.poll(SOON_MS)
-    assert notices.sender.run_is_over() is over
+    assert not notices.sender.listen(0.0)
+    notices.hears(head)
+    assert notices.sender.listen(0.0) is over
+
+
+def test_weights_that_come_are_shared_at_once_and_the_next_word_says_what_has_come(tmp_path: Path) -> None:
+    shared = SharedWeights()
+    notices = Notices(f"ipc://{tmp_path}/s", shared)
+    try:
+        worker = SharedWeightsReader(*shared.descriptors("w0"))
+        notices.sender.send([WAITING], [], 0.0)
+        assert notices.said().replies == 0
+        for said in (["HeartbeatReply", 70, 9, []], ["Weights", 3, "described"]):
+            notices.hears(said, b"parameters")
+            notices.sender.listen(0.0)
+        (frames,) = worker.find(70, {3})
+        assert frames == [msgspec.msgpack.encode(["Weights", 3, "described"]), b"parameters"]
+        notices.sender.send([WAITING], [], EVERY_S)
+        assert notices.said().replies == 9
+    finally:
+        notices.close()
+        shared.close()
+
+
+def test_a_supervisor_that_cannot_share_says_so_and_goes_on(tmp_path: Path) -> None:
+    shared = SharedWeights()
+    notices = Notices(f"ipc://{tmp_path}/s", shared)
+    try:
+        notices.sender.send([WAITING], [], 0.0)
+        notices.said()
+        notices.hears(["Weights", -1], b"parameters")
+        assert not notices.sender.listen(0.0)
+        notices.sender.send([WAITING], [], EVERY_S)
+        assert notices.said().replies is None
+    finally:
+        notices.close()
+        shared.close()

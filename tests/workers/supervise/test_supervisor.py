@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import pytest
@@ -282,16 +282,18 @@ class Notice:
 
     def __init__(self) -> None:
         self.over = False
+        self.passes: Callable[[float], None]
         self.sent: list[tuple[list[WorkerActivity], list[WorkerExit]]] = []
 
     def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
         self.sent.append((list(running), list(ended)))
 
-    def run_is_over(self) -> bool:
+    def listen(self, for_s: float) -> bool:
+        self.passes(for_s)
         return self.over
 
 
-def test_of_those_that_stay_only_what_hangs_from_before_the_end_of_a_run_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_those_that_stay_only_what_hangs_from_before_the_end_of_a_run_is_killed() -> None:
     """One worker hangs; the other has left, and its successor makes its environment for the next run for long."""
     machine, notice = Machine(workers=2, stay=True), Notice()
     hangs, leaves = machine.started[0][1], machine.started[1][1]
@@ -307,14 +309,14 @@ def test_of_those_that_stay_only_what_hangs_from_before_the_end_of_a_run_is_kill
             if worker.requests and worker.end is None:
                 worker.end = Ending(-9 if worker is hangs else 0, "ended", on_purpose=worker is not hangs)
 
-    monkeypatch.setattr("workers.supervise.supervisor.time.sleep", sleeps)
+    notice.passes = sleeps
     assert machine.host.run(lambda: int(machine.now > stop_at_s), lambda line: None, notice) == 0
     assert hangs.requests == ["kill"]
     assert [(name, worker.requests) for name, worker in machine.started[2:]] == [("w1", ["stop"]), ("w0", ["stop"])]
 
 
 @pytest.mark.parametrize("cause", ["the run is over", "told to leave"])
-def test_a_worker_that_hangs_when_it_should_leave_is_killed_soon(monkeypatch: pytest.MonkeyPatch, cause: str) -> None:
+def test_a_worker_that_hangs_when_it_should_leave_is_killed_soon(cause: str) -> None:
     """One step of its environment does not return."""
     machine, notice = Machine(workers=1), Notice()
     worker = machine.started[0][1]
@@ -326,7 +328,7 @@ def test_a_worker_that_hangs_when_it_should_leave_is_killed_soon(monkeypatch: py
         if worker.requests[-1:] in (["kill"], ["wait"]):
             worker.end = Ending(-9, "was killed")
 
-    monkeypatch.setattr("workers.supervise.supervisor.time.sleep", sleeps)
+    notice.passes = sleeps
     stop_requests = lambda: int(cause == "told to leave" and machine.now > 1)  # noqa: E731
     assert machine.host.run(stop_requests, lambda line: None, notice) == 1
     assert machine.now == pytest.approx(1 + HANGS_AFTER_S, abs=5 * POLL_S)
