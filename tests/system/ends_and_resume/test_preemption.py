@@ -50,6 +50,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "reinforce": {"algo": "reinforce", **NORMAL, "rollout_steps": 31, "steps": 12 * 31 * ENVS, "eval_every": 200},
     "dqn, uniform": {**DQN, "normalize_observations": True},
     "dqn, prioritized": {**DQN, "priority_alpha": 0.6, "n_step": 3, "amsgrad": True, "dueling": True},
+    "ppo, evaluated beside": {**PPO_SETTINGS, **NORMAL, "eval_workers": 1},
 }
 STOP = 6  # the update after which a run is interrupted
 Watch = Callable[[Progress], None]
@@ -125,6 +126,26 @@ def test_a_resumed_run_equals_one_whose_lanes_were_started_anew(tmp_path: Path, 
         plain = run(tmp_path / "plain", **settings)
         policies = [policy_of(one) for one in (plain, folder)]
         assert policies[0] != policies[1], "starting lanes anew changes nothing, so this shows nothing"
+
+
+def test_a_run_that_is_resumed_without_evaluators_evaluates_first_what_was_beside_training(tmp_path: Path) -> None:
+    settings = VARIANTS["ppo, evaluated beside"]
+    reference = restarted(tmp_path, STOP, **{**settings, "eval_workers": 0})
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "resumed", interrupts_at(STOP), **settings)
+    folder = folder_of(tmp_path / "resumed")
+    pending = checkpoint.newest(folder)[0].state["past"]["pending"]
+    assert 0 < pending["version"] < STOP, "it was interrupted when no evaluation was beside training"
+    run(tmp_path / "resumed", resume=folder, **{**settings, "eval_workers": 0})
+    assert evaluated(folder) == evaluated(reference)
+    for file in ("policy.safetensors", "best.safetensors"):
+        assert (folder / file).read_bytes() == (reference / file).read_bytes(), file
+
+
+def evaluated(folder: Path) -> list[tuple[float, float]]:
+    """Env steps and mean return of each evaluated policy."""
+    rows = [row for row in read_rows(folder / "metrics.jsonl") if "eval/mean_reward" in row]
+    return [(row.get("eval/env_steps", row["time/total_timesteps"]), row["eval/mean_reward"]) for row in rows]
 
 
 def test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal(tmp_path: Path) -> None:

@@ -109,6 +109,28 @@ class UnevenPendulum(PendulumEnv):
         return super().step(action)  # type: ignore[no-untyped-call]
 
 
+class _Asleep:
+    """The steps of the environment after it in the order of classes take so many seconds more."""
+
+    def __init__(self, step_s: float = 0.0) -> None:
+        super().__init__()
+        self._step_s = step_s
+
+    def step(self, action: Any) -> Any:
+        """As that of the environment, but later."""
+        if IN_WORKER:
+            time.sleep(self._step_s)
+        return super().step(action)  # type: ignore[misc]
+
+
+class SlowCartPole(_Asleep, CartPoleEnv):
+    """CartPole, in short episodes."""
+
+
+class SlowPendulum(_Asleep, PendulumEnv):
+    """Pendulum, in short episodes."""
+
+
 class Ends(Countdown):
     """Ends its process, in the way of `how`, at step `after` of a process, counted over all copies, and at no later one."""
 
@@ -157,5 +179,7 @@ class LeavesThings(Countdown):
 
 gymnasium.register("SometimesSlow-v0", f"{__name__}:SometimesSlow", max_episode_steps=500)
 gymnasium.register("UnevenPendulum-v0", f"{__name__}:UnevenPendulum", max_episode_steps=200)
+for _short in (SlowCartPole, SlowPendulum):
+    gymnasium.register(f"{_short.__name__}-v0", f"{__name__}:{_short.__name__}", max_episode_steps=30)
 for _kind in (Slow, Ends, LeavesThings):
     gymnasium.register(f"{_kind.__name__}-v0", f"{__name__}:{_kind.__name__}")
