@@ -348,7 +348,7 @@ class Worker:
         self._collector = self._evaluator = self._stepper = None
         why = run.rejection_reason(self._options.code)
         if self._session.identity.evaluates and isinstance(run, StepSpec):
-            why = "a vector environment has no evaluations to play; start this worker without --evaluate"
+            why = "the workers of this learner only step, and play no evaluations; start this worker without --evaluate"
         if why:
             self._do(self._session.decline(why))
             return

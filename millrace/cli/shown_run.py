@@ -51,5 +51,7 @@ def _print_result(run: Path) -> int:
         print(f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s")
         if summary.evaluation is not None:
             print(f"greedy {summary.evaluation}")
+        if (best := summary.best) is not None and best.env_steps != summary.env_steps:
+            print(f"best policy, after {best.env_steps:,} env steps: greedy {best.evaluation}")
     print(f"run folder: {run}")
     return 0

@@ -149,7 +149,8 @@ def in_json(status: Status) -> str:
 def as_table(status: Status) -> str:
     """A line about the run, a table of its workers, how many there are and could be, and what was dropped, by reason."""
     late = any(worker.late_actions for worker in status.workers)
-    here = len(status.workers) + status.workers_left_out
+    evaluating = sum(worker.state == "evaluating" for worker in status.workers)
+    here = len(status.workers) + status.workers_left_out - evaluating
     wanted = f"workers: {here} here, {status.workers_wanted} wanted (one for each lane)\n" if status.workers_wanted else ""
     dropped = [f"{status.ledger[name]:,} {what}" for name, what in DROPS.items() if status.ledger.get(name)]
     return "\n".join(

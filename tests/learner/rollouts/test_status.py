@@ -21,7 +21,7 @@ from learner.run_folder.progress import Progress
 from millrace.cli.status import as_table, ask, in_json, observer_name
 from millrace.terminal import progress_view
 from protocol.errors import RunError
-from protocol.messages import Goodbye, Heartbeat, Inquire, Status
+from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello, Inquire, Status
 from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.worker_link import WorkerLink
@@ -209,6 +209,7 @@ def test_it_shows_how_many_workers_could_have_a_lane(workers: int) -> None:
     learner = Learner(lanes=2)
     for number in range(workers):
         learner.joins(b"w%d" % number)
+    learner.says(b"e", Hello(PROTOCOL_VERSION, "e", "host", 1, 77, "fake", 78, evaluates=True))
     assert f"workers: {workers} here, 2 wanted (one for each lane)" in as_table(told(learner)).splitlines()
 
 

@@ -23,6 +23,7 @@ from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
+from learner.run_folder.results import Best, Evaluation, Summary
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.cli.commands import COMMANDS
 from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
@@ -224,6 +225,26 @@ def test_a_broken_checkpoint_is_not_resumed(tmp_path: Path, capsys: Captured) ->
 
 
 # --------------------------------------------------------------------------------------------------------- good usage
+
+
+@pytest.mark.parametrize("final", [100, 250])
+def test_the_end_of_a_run_names_its_best_policy_unless_it_is_the_final_one(
+    final: int, asked: list[Any], capsys: Captured
+) -> None:
+    found = Evaluation(episodes=2, return_mean=9.5, return_std=0.5, length_mean=9.5)
+    Path("runs/a-run").mkdir(parents=True)
+    RunFolder(Path("runs/a-run")).write_summary(
+        Summary(
+            env="CartPole-v1", algo="ppo", seed=1, env_steps=final, updates=1, wall_s=0.5, env_steps_per_s=20.0,
+            stop_reason="all steps done", return_mean_100=None, evaluation=found,
+            best=Best(env_steps=100, chosen_by=11.0, evaluation=found),
+        )
+    )  # fmt: skip
+    assert main(["train", "CartPole-v1"]) == 0
+    named = ["best policy, after 100 env steps: greedy return 9.5 ± 0.5 over 2 episodes"] if final != 100 else []
+    assert capsys.readouterr().out.splitlines()[-2 - len(named) :] == [
+        "greedy return 9.5 ± 0.5 over 2 episodes", *named, "run folder: runs/a-run",
+    ]  # fmt: skip
 
 
 def test_flags_stand_above_the_file_and_the_preset(asked: list[Any], capsys: Captured) -> None:

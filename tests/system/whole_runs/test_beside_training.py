@@ -162,7 +162,7 @@ def test_a_worker_that_only_evaluates_is_of_no_use_for_a_vector_environment(stag
         env.reset(seed=1)
         assert evaluator.ends() == 2
     (line,) = evaluator.said().splitlines()
-    assert "a vector environment has no evaluations to play; start this worker without --evaluate" in line
+    assert "the workers of this learner only step, and play no evaluations; start this worker without --evaluate" in line
     assert worker.ends() == 0
 
 
