@@ -42,11 +42,6 @@ class Conversation(Protocol):
     """The two ends. Each method raises what the program, or a rule of safety, raises."""
 
     @property
-    def workers(self) -> int:
-        """Number of workers."""
-        ...
-
-    @property
     def faults(self) -> int:
         """Number of faults, at any moments."""
         ...
@@ -79,6 +74,10 @@ class Conversation(Protocol):
         Events: ("handle", …), ("start",), ("finish",), ("time",), ("told",), ("end",), ("shut out",), ("freeze",),
         ("thaw",).
         """
+        ...
+
+    def is_needed(self, worker: Content) -> bool:
+        """Whether the run cannot reach its target without this worker."""
         ...
 
     def without_checkpoints(self, learner: Content) -> Content:

@@ -137,7 +137,7 @@ class Learner:
         learner.checkpoints = self.checkpoints[:version]
         learner.used = {number for number in self.used if number < issued.value}
         learner.accepted = [(-1 if number is None else number.value, None, set()) for number in accepted]
-        out = learner._publish(version)
+        out = learner._resume(version)
         return learner, [*out, *learner._checkpoint(), *learner._gather()]
 
     def named(self) -> list[tuple[CollectingMember, int]]:
@@ -149,9 +149,21 @@ class Learner:
 
     # ---------------------------------------------------------------- inside
 
+    def _resume(self, version: int) -> list[Outgoing]:
+        """A learner that has restarted publishes the weights of its checkpoint."""
+        return self._publish(version)
+
     def _publish(self, version: int) -> list[Outgoing]:
-        self.coordinator.publish(version, PARAMETERS, BUFFERS)
+        self._set_weights(version)
         return self.coordinator.begin_update()
+
+    def _set_weights(self, version: int) -> None:
+        self.coordinator.publish(version, PARAMETERS, BUFFERS)
+        assert self._needed().issuperset(self.coordinator.weights.kept), "the learner keeps weights that nobody needs"
+
+    def _needed(self) -> set[int]:
+        """The versions that workers may need: the newest, and those that act in open rounds."""
+        return {self.coordinator.version, *self.coordinator.rollouts.rounds._versions.values()}
 
     def _gather(self) -> list[Outgoing]:
         """Begin to gather the rollouts of the next update."""
@@ -209,6 +221,7 @@ class Learner:
         """The rules that hold in every state."""
         check_tickets(self.coordinator, self.settings.max_lag)
         self._check_rounds()
+        self._check_versions()
 
     def _check_rounds(self) -> None:
         """Each lane has every open round once: due, with a worker, or waiting. Round u acts under what `rounds.py` says."""
@@ -234,9 +247,15 @@ class Learner:
             in_order = [sequence for _, sequence in sorted(mine)]
             assert in_order == sorted(set(in_order)), "rollouts of a lane are not collected in the order of the rounds"
             assert all(sequence < lane.dealt for sequence in in_order), "a sequence number will be dealt twice"
-        needed = {coordinator.version, *versions.values()}
-        assert needed.issuperset(coordinator.weights.kept) or self.updating, "the learner keeps weights that nobody needs"
-        assert set(coordinator.weights.kept).issuperset(needed - {-1}), "weights that are needed are dropped"
+        assert self._needed().issubset({-1, *coordinator.weights.kept}), "weights that are needed are dropped"
+
+    def _check_versions(self) -> None:
+        """Of the weights that were sent to a worker, it keeps the newest and those that its tickets name. So count these."""
+        for member in self.coordinator.members.values():
+            named = {version for each, version in self.named() if each is member}
+            assert set(member.versions) <= {*named, max(member.versions, default=-1)}, (
+                "weights that a worker drops count as held"
+            )
 
 
 # -------------------------------------------------------------------- to tuples and back

@@ -36,6 +36,7 @@ def _member(member: Member, now: float) -> Content:
         name(Kind.WORKER, worker),
         name(Kind.NONCE, member.hello.process_nonce, worker),
         name(Kind.ATTEMPT, member.hello.attempt, worker),
+        member.hello.evaluates,
         session(member.session),
         max(member.heard_s - now, -TIMEOUT_S - 1.0),
         tuple(sorted(member.lanes)),
@@ -54,8 +55,8 @@ def load(membership: Membership[M], content: Content, kind: type[M]) -> None:
     """Give a new membership this content."""
     members, _, none_silent, refused = content
     for join_number, fields in enumerate(members):
-        worker, nonce, attempt, number, heard, lanes, tickets, replies, takeovers, collecting = fields
-        said = hello(worker.value, nonce.value, attempt.value)
+        worker, nonce, attempt, evaluates, number, heard, lanes, tickets, replies, takeovers, collecting = fields
+        said = hello(worker.value, nonce.value, attempt.value, evaluates=evaluates)
         member = kind(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}

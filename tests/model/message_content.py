@@ -72,7 +72,7 @@ def weights(version: int) -> Weights:
     return Weights(version, PARAMETERS, BUFFERS)
 
 
-def hello(worker: int, nonce: int, attempt: int) -> Hello:
+def hello(worker: int, nonce: int, attempt: int, *, evaluates: bool = False) -> Hello:
     return Hello(
         protocol=PROTOCOL_VERSION,
         worker=f"w{worker}",
@@ -81,6 +81,7 @@ def hello(worker: int, nonce: int, attempt: int) -> Hello:
         process_nonce=nonce,
         software="model",
         attempt=attempt,
+        evaluates=evaluates,
     )
 
 
@@ -89,7 +90,7 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
     match message:
         case Hello():
             attempt = name(Kind.ATTEMPT, message.attempt, worker)
-            return "Hello", name(Kind.NONCE, message.process_nonce, worker), attempt
+            return "Hello", name(Kind.NONCE, message.process_nonce, worker), attempt, message.evaluates
         case Heartbeat(number, replies, versions, tickets):
             held = tuple(ticket(each) for each in sorted(tickets))
             return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), versions, held
@@ -123,8 +124,8 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
 def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
     """The message of this content, from or to this worker."""
     match content:
-        case "Hello", nonce, attempt:
-            return hello(worker, nonce.value, attempt.value)
+        case "Hello", nonce, attempt, evaluates:
+            return hello(worker, nonce.value, attempt.value, evaluates=evaluates)
         case "Heartbeat", number, replies, versions, tickets:
             held = tuple(each.value for each in tickets)
             return Heartbeat(number.value, replies.value, versions, held, 0, {}, 0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from tests.model.conversation import Content
-from tests.model.names import OF_WORKER, Name, name, names_in, renamed
+from tests.model.names import OF_WORKER, Name, names_in, renamed, renaming
 
 
 class Seat(NamedTuple):
@@ -56,10 +56,15 @@ class Parts(list[Any]):
             found = self._renamed[key] = self.number(self._compute_renamed(self[number], new))
         return found
 
-    def of_worker_0(self, seat: int) -> int:
-        """The same seat, if it belonged to worker 0."""
-        own = [each for each in self.names[seat] if each.kind in OF_WORKER]
-        return self.renamed(seat, {each: name(each.kind, each.value, 0) for each in own})
+    def alone(self, seat: int) -> tuple[int, tuple[Name, ...]]:
+        """The same seat of worker 0, under names that do not depend on the other parts of the state; and its old names.
+
+        The old names are without those of the worker, which depend on its number.
+        """
+        names = self.names[seat]
+        own = {each.scope: 0 for each in names if each.kind in OF_WORKER}
+        others = sorted(each for each in names if each.kind not in OF_WORKER)
+        return self.renamed(seat, renaming(names, own)), tuple(others)
 
     def _compute_renamed(self, part: Content | Seat, new: dict[Name, Name | None]) -> Any:
         if not isinstance(part, Seat):

@@ -21,11 +21,6 @@ from workers.conversation.worker_states import WorkerState
 PAUSE_S = 0.5  # between two Hellos: one in every tick
 
 
-def _session(number: int, nonce: int, now: float) -> Session:
-    who = WorkerIdentity(f"w{number}", "host", 1, nonce, "model")
-    return Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
-
-
 @dataclass
 class Process(ABC):
     """One state of a worker, which an event changes."""
@@ -39,6 +34,8 @@ class Process(ABC):
     frozen: bool = False
     shut_out: bool = False
     """whether its key was revoked: the learner hears nothing of it"""
+    evaluates: bool = False
+    """whether it only plays evaluations: so does the next process of this worker"""
 
     def event(self, event: Event, message: ToWorker | None, now: float) -> list[ToLearner]:
         """What the worker says after this event. `message`: what it handles, if anything."""
@@ -50,7 +47,7 @@ class Process(ABC):
             case ("start",):  # a new process, under the same name
                 self.nonce += ATTEMPTS
                 self.shut_out = False
-                self.session = _session(self.number, self.nonce, now)
+                self.session = self.new_session(now)
                 return self.turn([], now)
             case ("finish",):
                 return self.finish(now)
@@ -66,6 +63,11 @@ class Process(ABC):
             case ("freeze",) | ("thaw",):
                 self.frozen = event == ("freeze",)
         return []
+
+    def new_session(self, now: float) -> Session:
+        """A process of this worker has started."""
+        who = WorkerIdentity(f"w{self.number}", "host", 1, self.nonce, "model", self.evaluates)
+        return Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
 
     def handle(self, message: ToWorker, now: float) -> list[ToLearner]:
         """A message has come."""
@@ -90,7 +92,8 @@ class Process(ABC):
 
 def saved(process: Process, now: float, more: Content, work: Content | None) -> Content:
     """The process, its session, what it holds of its work (`more`), and the work in progress."""
-    nonce, flags = name(Kind.NONCE, process.nonce, process.number), (process.frozen, process.shut_out)
+    nonce = name(Kind.NONCE, process.nonce, process.number)
+    flags = process.frozen, process.shut_out, process.evaluates
     current = process.session
     if current is None:
         return nonce, flags, None, None
@@ -112,12 +115,12 @@ P = TypeVar("P", bound=Process)
 
 def loaded(kind: type[P], content: Content, number: int, settings: Any) -> tuple[P, Content]:
     """A process at the time 0 with this content, and what it held of its work."""
-    nonce, (frozen, shut_out), fields, _ = content
-    process = kind(settings, number, nonce.value, frozen=frozen, shut_out=shut_out)
+    nonce, (frozen, shut_out, evaluates), fields, _ = content
+    process = kind(settings, number, nonce.value, frozen=frozen, shut_out=shut_out, evaluates=evaluates)
     if fields is None:
         return process, ()
     state, of_session, attempt, heard, due, in_progress, replies, *more = fields
-    current = process.session = _session(number, nonce.value, 0.0)
+    current = process.session = process.new_session(0.0)
     current.session = MASK  # before its first session: not that of any message
     current.state, current._attempt = WorkerState(state), attempt.value
     current._unanswered_s, current.due_s, current._backoff_s = heard, due, PAUSE_S
@@ -129,7 +132,7 @@ def loaded(kind: type[P], content: Content, number: int, settings: Any) -> tuple
 
 def facts(content: Content) -> Facts:
     """The facts of a worker."""
-    nonce, (frozen, shut_out), fields, work = content
+    nonce, (frozen, shut_out, _), fields, work = content
     return Facts(
         nonce=nonce.value,
         alive=fields is not None,

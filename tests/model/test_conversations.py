@@ -2,8 +2,9 @@
 
 Rule: the program itself is explored, not a description of it. In training every rule of tickets, lanes and weights holds,
 and the run reaches its target; each evaluation is of one version, its episodes count once, and no ticket for a rollout is
-dealt meanwhile; each order of a vector environment is executed once, a lost lane is reported once and reset before it
-steps, and every call returns, or is made again. Mistakes that are made on purpose are found.
+dealt meanwhile, unless workers that have no lanes play it; each order of a vector environment is executed once, a lost lane
+is reported once and reset before it steps, and every call returns, or is made again. Mistakes that are made on purpose are
+found.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_evaluati
 SMALL: list[Conversation] = [
     Evaluating(workers=1, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
+    Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1), evaluators=0),
     Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=1),
 ]
 LARGE: list[Conversation] = [
@@ -45,6 +47,10 @@ LARGE: list[Conversation] = [
     Evaluating(workers=1, lanes=2, updates=2, faults=1, max_lag=1, evaluated=(1, 2)),
     Evaluating(workers=2, lanes=1, updates=2, faults=1, max_lag=1, evaluated=(1,)),
     Evaluating(workers=1, lanes=1, updates=1, faults=2),
+    Evaluating(workers=1, lanes=1, updates=2, faults=2, episodes=1, evaluators=0),
+    Evaluating(workers=2, lanes=1, updates=2, faults=1, episodes=1, evaluated=(0, 1), evaluators=1),
+    Evaluating(workers=2, lanes=1, updates=2, faults=1, episodes=1, max_lag=1, evaluators=1),
+    Evaluating(workers=3, lanes=1, updates=1, faults=1, evaluators=2, only=("kill, reported",)),
     Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=2),
     Stepping(workers=2, lanes=1, calls=("reset", "step"), faults=2),
     Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),

@@ -113,7 +113,8 @@ class Worker(Process):
         most, held = self.settings.lanes * rounds, held_count(current)
         assert held <= most, f"a worker holds {held} rollouts, of at most {most}"
         versions = len(current._current.weights)
-        assert versions <= rounds + 1, f"a worker holds {versions} versions, of at most {rounds + 1}"
+        most = rounds + 1 + len({order.version for order in current._current.evaluations.asked.values()})
+        assert versions <= most, f"a worker holds {versions} versions, of at most {most}"
         sent: list[ToLearner] = []
         for effect in effects:
             if isinstance(effect, SendMessage):
@@ -137,6 +138,11 @@ def saved(worker: Worker, now: float) -> Content:
     if isinstance(task, RolloutTask):
         work = session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments)
     return process_part.saved(worker, now, more, work)
+
+
+def only_evaluates(content: Content) -> bool:
+    """Whether the worker of this content only plays evaluations."""
+    return bool(content[1][2])
 
 
 def _needed(held: _SessionState, before: set[int]) -> set[int]:

@@ -73,7 +73,7 @@ class World:
         self._worker_faults = cache(self._compute_worker_faults)
         self._arrived = cache(self._compute_arrived)
         self._sent = cache(self._compute_sent)
-        self._of_worker_0 = cache(self.parts.of_worker_0)
+        self._alone = cache(self.parts.alone)
         self._without_checkpoints = cache(self._compute_without_checkpoints)
 
     def start(self) -> State:
@@ -160,14 +160,15 @@ class World:
         learner, *seats, faults = state
         if faults > 0:
             return [(Action("calm"), self._at_most(0, learner, *seats))]
-        if faults == FOR_EVER or self.conversation.workers == 1:
+        if faults == FOR_EVER:
             return []
         moves: list[Move] = []
         gone = self.parts.number(GONE)
         for number, seat in enumerate(seats):
             # Until time passes, a worker that is gone does not differ from one whose turn does not come. So it goes when
             # only what it does or has said keeps time from passing. (If what it said did arrive, it goes after that.)
-            if not self.reduced or not self._others_under_way(state, number):
+            needed = self.conversation.is_needed(self.parts[self.parts[seat].worker])
+            if not needed and not (self.reduced and self._others_under_way(state, number)):
                 nothing = self.parts.number(Seat(gone, late_up=self.parts[seat].late_up))
                 moves.append((Action("gone for ever", number), (*_with(state, number, nothing)[:-1], FOR_EVER)))
         return moves
@@ -316,7 +317,7 @@ class World:
         if len(members) == len(seats):
             return members
         others = [number for number in range(len(seats)) if number not in members]
-        return (*members, *sorted(others, key=lambda number: self._of_worker_0(seats[number])))
+        return (*members, *sorted(others, key=lambda number: self._alone(seats[number])))
 
 
 def _with(state: State, number: int, seat: int) -> State:

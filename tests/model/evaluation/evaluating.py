@@ -1,7 +1,8 @@
 """The conversation of a run that evaluates some of its versions, between rollouts.
 
 Rule: as the training loop does, the learner publishes a version that is to be evaluated without tickets for rollouts,
-evaluates it, and only then collects. The target is reached when the last version is published and evaluated.
+evaluates it, and only then collects. Beside training it goes on at once, and waits for the evaluation when the next one is
+due, or at the end. The target is reached when the last version is published and no evaluation is pending.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ class Evaluating(Training):
     """episodes of a ticket: by default there are two tickets, of two episodes and of one"""
     rows: bool = False
     """whether the rows of the episodes are asked for"""
+    evaluators: int | None = None
+    """how many of the workers only evaluate, beside training; None: all evaluate, and training waits"""
 
     @cached_property
     def plan(self) -> EvaluationPlan:
@@ -35,7 +38,8 @@ class Evaluating(Training):
 
     def start(self) -> tuple[Content, list[Content]]:
         learner, _ = first_learner(self, learner_half.EvaluatingLearner)
-        workers = [worker_half.EvaluatingWorker(self, number, 0) for number in range(self.workers)]
+        evaluates = [number < (self.evaluators or 0) for number in range(self.workers)]
+        workers = [worker_half.EvaluatingWorker(self, number, 0, evaluates=each) for number, each in enumerate(evaluates)]
         return learner_half.saved(learner, 0.0), [worker_half.saved(worker, 0.0) for worker in workers]
 
     def learner(self, content: Content, event: Event, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
@@ -48,6 +52,10 @@ class Evaluating(Training):
         worker = worker_half.loaded(content, number, self)
         said = worker.event(event, None if message is None else message_of(message, number, self.run), now)
         return worker_half.saved(worker, now), [content_of(each, number) for each in said]
+
+    def is_needed(self, worker: Content) -> bool:
+        """Whether no other worker can have lanes."""
+        return not worker_half.only_evaluates(worker) and self.workers - (self.evaluators or 0) == 1
 
     def without_checkpoints(self, learner: Content) -> Content:
         both, of_evaluation = learner
@@ -64,5 +72,8 @@ class Evaluating(Training):
 
     def __str__(self) -> str:
         rows = " with rows" if self.rows else ""
+        beside = "" if self.evaluators is None else f", beside training: {self.evaluators} workers only evaluate"
         versions = " and ".join(map(str, self.evaluated))
-        return f"{super().__str__()}, {-(-self.episodes // self.copies)} evaluation tickets{rows} at version {versions}"
+        return (
+            f"{super().__str__()}, {-(-self.episodes // self.copies)} evaluation tickets{rows} at version {versions}{beside}"
+        )

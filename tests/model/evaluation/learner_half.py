@@ -1,6 +1,7 @@
 """The learner of a run with evaluations: that of a training run, and the tickets of the pending evaluation.
 
-Rules: while an evaluation is pending, no ticket for a rollout is dealt and the version stays; each of its tickets is with
+Rules: while an evaluation is pending that all play, no ticket for a rollout is dealt; one beside training is played by the
+workers that only evaluate, and by all once the learner waits for it and none of them is left; each of its tickets is with
 nobody, with one worker, or played; its episodes are those of its seeds under its version, each used once; and the rows of a
 ticket come from the session whose answer counts.
 """
@@ -17,14 +18,14 @@ from tests.model.conversation import Content
 from tests.model.learner_part import Learner
 from tests.model.message_content import EPISODE_STEPS, evaluated, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, name
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rows
+from tests.support.conversation.fake_ends import fake_rows
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
-SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "held", "_played", "_rows"}
+SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "held", "_played", "_rows", "beside"}
 """What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies", "_most_workers", "beside"}
+NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies", "_most_workers"}
 
 
 class EvaluatingLearner(Learner):
@@ -32,9 +33,16 @@ class EvaluatingLearner(Learner):
 
     settings: Evaluating
     barrier = 0
-    """number of tickets for rollouts that were issued before the pending evaluation began"""
+    """number of tickets for rollouts that were issued before all began to play the pending evaluation"""
     rows: list[tuple[int, int]]
     """episode and step of the rows of the pending evaluation, in the order in which they came"""
+
+    @property
+    def awaits(self) -> bool:
+        """Whether the learner waits for the pending evaluation: all play it, or the next one is due, or the run ends."""
+        evaluation, version = self.coordinator.evaluation, self.coordinator.version
+        waits = self.settings.evaluators is None or version >= self.settings.updates or self._is_due()
+        return evaluation.pending and waits
 
     # ---------------------------------------------------------------- events
 
@@ -44,21 +52,41 @@ class EvaluatingLearner(Learner):
 
     def check(self) -> None:
         super().check()
-        if self.coordinator.evaluation.pending:
+        evaluation = self.coordinator.evaluation
+        if evaluation.pending and not evaluation.beside:
             assert self.coordinator.rollouts.ledger.issued == self.barrier, (
                 "a ticket for a rollout was dealt during an evaluation"
             )
 
     # ---------------------------------------------------------------- inside
 
+    def _resume(self, version: int) -> list[Outgoing]:
+        """An evaluation beside training that an earlier version began is begun again."""
+        begun = max((each for each in self.settings.evaluated if each <= version), default=version)
+        if self.settings.evaluators is None or begun == version:
+            return super()._resume(version)
+        self._set_weights(begun)
+        return [*self._begin_evaluation(), *super()._resume(version)]
+
     def _publish(self, version: int) -> list[Outgoing]:
+        self._set_weights(version)
+        out = self._begin_evaluation() if self._is_due() and not self.coordinator.evaluation.pending else []
+        return out if self.awaits else [*out, *self.coordinator.begin_update()]
+
+    def _needed(self) -> set[int]:
+        evaluation = self.coordinator.evaluation
+        return super()._needed() | ({evaluation.version} if evaluation.pending else set())
+
+    def _is_due(self) -> bool:
+        """Whether the newest version is to be evaluated, and that was not begun."""
+        version = self.coordinator.version
+        return version in self.settings.evaluated and version != self.coordinator.evaluation.version
+
+    def _begin_evaluation(self) -> list[Outgoing]:
         coordinator, settings = self.coordinator, self.settings
-        evaluates = version in settings.evaluated
         self.barrier, self.rows = coordinator.rollouts.ledger.issued, []
-        if not evaluates:
-            return super()._publish(version)
-        coordinator.publish(version, PARAMETERS, BUFFERS)
-        return coordinator.begin_evaluation(settings.plan, self._take_rows if settings.rows else None)
+        on_rows = self._take_rows if settings.rows else None
+        return coordinator.begin_evaluation(settings.plan, on_rows, beside=settings.evaluators is not None)
 
     def _take_rows(self, episode: int, rows: EpisodeRows) -> None:
         answer = self._now_received
@@ -67,19 +95,30 @@ class EvaluatingLearner(Learner):
         self.rows.append((episode, rows.first_step))
 
     def _gather(self) -> list[Outgoing]:
-        return [] if self.coordinator.evaluation.pending else super()._gather()
+        return self._await() if self.awaits else super()._gather()
 
     def _learn(self) -> list[Outgoing]:
-        evaluation = self.coordinator.evaluation
-        if not evaluation.pending:
-            return super()._learn()
+        return self._await() if self.awaits else super()._learn()
+
+    def _await(self) -> list[Outgoing]:
+        """The learner waits: let all play, if they must. Go on if the evaluation is done."""
+        coordinator, evaluation = self.coordinator, self.coordinator.evaluation
         if not evaluation.done:
-            return []
+            if not evaluation.beside:
+                return []
+            self.barrier = coordinator.rollouts.ledger.issued
+            out = coordinator.await_evaluation()
+            evaluators = [member for member in coordinator.members.values() if member.hello.evaluates]
+            assert evaluation.beside == bool(evaluators), (
+                "all play an evaluation although a worker is there that only evaluates"
+            )
+            return out
         self._end_evaluation()
-        return self._gather()
+        out = self._begin_evaluation() if self._is_due() else []
+        return [*out, *self._gather()]
 
     def _end_evaluation(self) -> None:
-        plan, version = self.settings.plan, self.coordinator.version
+        plan, version = self.settings.plan, self.coordinator.evaluation.version
         played = [one.episode.reward for one in self.coordinator.evaluation.end()]
         assert played == [seed + version / 1000 for seed in plan.seeds], f"other episodes than those asked for: {played}"
         every = [(episode, step) for episode in range(len(plan.seeds)) for step in range(EPISODE_STEPS)]
@@ -114,9 +153,10 @@ def saved(learner: EvaluatingLearner, now: float) -> Content:
         for episode, come in sorted(of_ticket.items())
         for each in come
     )
-    first = tickets._first - FIRST_TICKET
-    undealt = tuple(sorted(tickets._undealt))
-    return content, (first, len(tickets._seeds), undealt, held, played, rows, ticket(learner.barrier), tuple(learner.rows))
+    first, undealt = tickets._first - FIRST_TICKET, tuple(sorted(tickets._undealt))
+    barrier = None if tickets.beside else ticket(learner.barrier)
+    more = undealt, held, played, rows, tickets.version, barrier, tuple(learner.rows)
+    return content, (first, len(tickets._seeds), *more)
 
 
 def is_pending(of_evaluation: Content) -> bool:
@@ -136,8 +176,9 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     if not of_evaluation:
         tickets._seeds = [()] * number
         return learner
-    undealt, held, played, rows, barrier, of_learner = of_evaluation
-    tickets.begin(settings.plan, learner.coordinator.version, learner._take_rows if settings.rows else None)
+    undealt, held, played, rows, version, barrier, of_learner = of_evaluation
+    on_rows = learner._take_rows if settings.rows else None
+    tickets.begin(settings.plan, version, on_rows, beside=barrier is None)
     tickets._undealt = list(undealt)
     for worker, mine in held:
         member = learner.coordinator.members[peer_of(worker.value)]
@@ -148,5 +189,5 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     for index, episode, of_session, step in rows:
         come = tickets._rows.setdefault(index, {}).setdefault(episode, [])
         come.append(fake_rows(of_session.value, tickets._first + index, episode, step))
-    learner.barrier, learner.rows = barrier.value, list(of_learner)
+    learner.barrier, learner.rows = 0 if barrier is None else barrier.value, list(of_learner)
     return learner

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.model.mutations import COORDINATOR, HELD, SESSION, Mutation, play
+from tests.model.mutations import COORDINATOR, HELD, PLACEMENT, SESSION, WEIGHTS, Mutation, play
 
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
@@ -60,6 +60,45 @@ MUTATIONS = {
     "an evaluation of an earlier session goes on": Mutation(
         SESSION, "return self.state not in goes_on or work.session != self.session", "return False"
     ),
+    "a worker that only evaluates gets a lane": Mutation(
+        PLACEMENT, "(each for each in active if not each.hello.evaluates)", "active"
+    ),
+    "all play an evaluation beside training": Mutation(TICKETS, "members += [] if self.beside else [", "members += ["),
+    "only those that only evaluate ever play": Mutation(
+        TICKETS, "members += [] if self.beside else [", "members += [] and ["
+    ),
+    "rollouts wait for an evaluation beside training": Mutation(
+        COORDINATOR, "if self.evaluation.beside or not self.evaluation.pending:", "if not self.evaluation.pending:"
+    ),
+    "an evaluation waits for a lost worker that only evaluates": Mutation(
+        COORDINATOR, "self.evaluation.all_play()\n", "pass\n"
+    ),
+    "all play an evaluation although a worker is there that only evaluates": Mutation(
+        COORDINATOR, "if any(member.hello.evaluates for member in self.membership.active()):", "if False:"
+    ),
+    "the weights of a pending evaluation are not kept": Mutation(
+        COORDINATOR, "(self.evaluation.pending and version == self.evaluation.version)", "False"
+    ),
+    "what a worker has dropped counts as held": Mutation(
+        WEIGHTS,
+        "for version, sent_at in member.versions.items() if version in kept}",
+        "for version, sent_at in member.versions.items()}",
+    ),
+    "after an evaluation, what a worker has dropped counts as held": Mutation(
+        COORDINATOR,
+        "why = self.evaluation.take_in(member, message)\n                drop_versions(member, self._named)",
+        "why = self.evaluation.take_in(member, message)",
+    ),
+    "weights that a ticket names count as dropped": Mutation(
+        WEIGHTS, "kept = {*named(member.tickets), max(", "kept = {max("
+    ),
+    "a worker drops weights that an evaluation names": Mutation(SESSION, "*self.evaluations.versions(), ", ""),
+    "an evaluation that is over goes on when the next one begins": Mutation(
+        HELD, "if order.version == self.asked[newest].version}", "if True}"
+    ),
+    "a late order of an earlier evaluation ends the next one": Mutation(
+        HELD, "newest = max(self.asked, default=ticket)", "newest = min(self.asked, default=ticket)"
+    ),
 }
 
 
@@ -68,9 +107,12 @@ def runs() -> list[Conversation]:
     from tests.model.evaluation.evaluating import Evaluating
 
     return [
+        Evaluating(workers=2, lanes=1, updates=2, faults=0, episodes=1, evaluators=1),
+        Evaluating(workers=2, lanes=1, updates=2, faults=0, evaluators=0),
         Evaluating(workers=1, lanes=1, updates=1, faults=1),
         Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
         Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1)),
+        Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True, evaluated=(0, 1)),
         Evaluating(workers=1, lanes=1, updates=2, faults=1, max_lag=1, evaluated=(1,)),
         Evaluating(workers=1, lanes=1, updates=1, faults=2, episodes=1, rows=True),
         Evaluating(workers=2, lanes=1, updates=1, faults=1),

@@ -1,7 +1,8 @@
 """A worker of a run with evaluations: that of a training run, and the evaluation that it plays.
 
 Rules: an order is played under its own version and, unless its rows are asked for, once in a session; and a worker does one
-piece of work at a time. The first rows are sent when the work begins, the last ones with the answer.
+piece of work at a time. It holds orders of one evaluation, that of the highest ticket. The first rows are sent when the work
+begins, the last ones with the answer.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protocol.messages import Evaluate, ToLearner
+from protocol.messages import Evaluate, ToLearner, ToWorker
 from tests.model import worker_part
 from tests.model.conversation import Content
 from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
@@ -35,6 +36,15 @@ class EvaluatingWorker(Worker):
         super().end()
         self.played = set()
 
+    def handle(self, message: ToWorker, now: float) -> list[ToLearner]:
+        assert self.session is not None
+        before = set(self.session._current.evaluations.asked) if isinstance(message, Evaluate) else set()
+        out = super().handle(message, now)
+        asked = {} if self.session is None else self.session._current.evaluations.asked
+        assert len({order.version for order in asked.values()}) <= 1, "a worker holds orders of two evaluations"
+        assert not before or max({*before, *asked}) in asked, "an order of an earlier evaluation has ended a later one"
+        return out
+
     def finish(self, now: float) -> list[ToLearner]:
         last_rows = _rows(self.task.order, EPISODE_STEPS - 1) if isinstance(self.task, EvaluationTask) else []
         return [*last_rows, *super().finish(now)]
@@ -58,6 +68,11 @@ def _rows(order: Evaluate, step: int) -> list[ToLearner]:
 
 
 # -------------------------------------------------------------------- to tuples and back
+
+
+def only_evaluates(content: Content) -> bool:
+    """Whether the worker of this content only plays evaluations."""
+    return worker_part.only_evaluates(content[0])
 
 
 def saved(worker: EvaluatingWorker, now: float) -> Content:

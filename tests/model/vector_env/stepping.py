@@ -64,6 +64,9 @@ class Stepping:
         sent = [content_of(said, number) for said in worker.event(event, told, now)]
         return worker_half.saved(worker, now), sent
 
+    def is_needed(self, worker: Content) -> bool:
+        return self.workers == 1
+
     def without_checkpoints(self, learner: Content) -> Content:
         return learner  # it has none
 

@@ -38,6 +38,8 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
     assert held == sorted(number for member in members.values() for number in member.tickets), "a ticket has two holders"
     processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
     assert coordinator.membership._of_process == processes, "the processes are not those of the members"
+    for member in members.values():
+        assert not (member.lanes and member.hello.evaluates), "a worker that only evaluates has a lane"
     check_evaluation(coordinator)
 
 
