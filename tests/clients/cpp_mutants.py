@@ -407,5 +407,11 @@ MUTANTS = [
         "",
         "collector", "evaluates", rules.EVALUATE_ONCE, "another",
     ),
+    Mutant(
+        "goes on with an evaluation that is over", "rollouts.hpp",
+        "orders_.erase(std::remove_if(orders_.begin(), orders_.end(), over), orders_.end());",
+        "(void)over;",
+        "collector", "ends an evaluation", rules.EVALUATE_ENDS, "ticket",
+    ),
 ]
 # fmt: on

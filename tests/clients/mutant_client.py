@@ -50,6 +50,7 @@ from protocol.wire.codec import Buffer, decode_to_learner, encode
 from protocol.wire.plain_values import pack
 from protocol.wire.worker_link import WorkerLink
 from workers.collect import collected_lane
+from workers.conversation.held import Held, HeldEvaluations
 from workers.conversation.session import Session
 from workers.worker import Worker, WorkerOptions, identity
 
@@ -264,6 +265,8 @@ def main(mutant: str, address: str) -> int:
     """Run the mutant until it leaves."""
     if mutant == "one seed for all copies":
         vars(collected_lane)["copy_seeds"] = lambda seed, lane, incarnation, copies: [1] * copies
+    if mutant == "goes on with an evaluation that is over":
+        HeldEvaluations.take = Held.take  # type: ignore[method-assign]
     if mutant == "one random number for all copies":
         Categorical.noise = _one_for_all  # type: ignore[method-assign]
     signals: list[int] = []

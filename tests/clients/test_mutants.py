@@ -80,6 +80,8 @@ MUTANTS = [
     Mutant("one seed for all copies", "collector", "collects two lanes", rules.INDEPENDENT, "copy 0 of lane 0 in copy 1"),
     Mutant("one random number for all copies", "collector", "collects two lanes", rules.INDEPENDENT, "copy 0 of lane 0 in"),
     Mutant("evaluates the newest weights", "collector", "under no other version", rules.GREEDY, "others in"),
+    Mutant("ignores older weights", "collector", "under no other version", rules.EVALUATE_VERSION, "none within"),
+    Mutant("goes on with an evaluation that is over", "collector", "ends an evaluation", rules.EVALUATE_ENDS, "ticket"),
     Mutant("never greedy", "collector", "evaluates with rows", rules.GREEDY, "others in"),
     Mutant("always greedy", "collector", "evaluates with rows", rules.GREEDY, "the most probable one in each of"),
     Mutant("evaluates by other seeds", "collector", "evaluates with rows", rules.EVALUATE_SEEDS, "others"),
