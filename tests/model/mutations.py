@@ -112,12 +112,12 @@ MUTATIONS = {
     "weights are sent with every order": Mutation(WEIGHTS, " and message.version not in member.versions:", ":"),
     "weights are sent before the order that names them": Mutation(
         WEIGHTS,
-        "out.append((peer, self.kept[message.version]))",
-        "out.insert(-1, (peer, self.kept[message.version]))",
+        "out.append((peer, self.kept[version]))",
+        "out.insert(-1, (peer, self.kept[version]))",
     ),
     "the newest weights are sent to whoever holds a ticket": Mutation(
         WEIGHTS,
-        "out.append((peer, self.kept[message.version]))",
+        "out.append((peer, self.kept[version]))",
         "out.append((peer, self.kept[max(self.kept)]))",
     ),
     "the learner keeps only the newest weights": Mutation(WEIGHTS, "if acts(version)}", "if False}"),

@@ -40,7 +40,7 @@ METHODS = {
 }
 NOT_RECORDED = {  # it changes nothing, or nobody calls it
     "DescribeCoordinator": {"drain", "status"},
-    "Session": {"is_unwanted"},
+    "Session": {"is_unwanted", "missing_versions"},
 }
 MADE_BY_THE_COORDINATOR = ("Membership", "RolloutDealer", "EvaluationDealer")
 CHANGE_NOTHING_IF_EMPTY = ("tick", "heartbeat_if_due")

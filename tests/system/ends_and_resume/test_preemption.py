@@ -22,7 +22,7 @@ from learner.algorithm_check.same_bits import first_difference
 from learner.algorithms.ppo import PPO
 from learner.config.layers import resolve
 from learner.interrupts import Interrupts
-from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
+from learner.rollouts.evaluation_dealer import PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
@@ -186,16 +186,17 @@ def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, mon
     settings = {**VARIANTS["ppo"], "target_return": 1.0}
     whole = run(tmp_path / "whole", **settings)
     assert summary(whole)["stop_reason"] == "target return 1 reached"
-    evaluate = Hub.evaluate
+    end_evaluation = Hub.end_evaluation
 
-    def interrupted(hub: Hub, plan: EvaluationPlan, *watch: Any) -> list[PlayedEpisode]:
-        played = evaluate(hub, plan, *watch)
-        if plan.of_best:
+    def interrupted(hub: Hub, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
+        plan = hub.coordinator.evaluation.plan
+        played = end_evaluation(hub, watch)
+        if plan is not None and plan.of_best:
             raise KeyboardInterrupt
         return played
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Hub, "evaluate", interrupted)
+        patch.setattr(Hub, "end_evaluation", interrupted)
         run(tmp_path / "resumed", **settings)
     folder = folder_of(tmp_path / "resumed")
     assert run(tmp_path / "resumed", resume=folder, **settings) == folder
