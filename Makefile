@@ -40,7 +40,7 @@ packages:  ## install Debian's packages for test-clients and test-cluster. Needs
 test-model: .venv/installed-dev  ## every interleaving of messages, faults and time in small runs, and mistakes made on purpose; five minutes on two cores
 	$(BIN)/python -m pytest -m model -rP --numprocesses $(TEST_PROCESSES) tests/model
 
-test-cluster: .venv/installed-ray  ## Docker, Prometheus, Slurm, Ray, MPI and Xvfb, for real. Needs root and `make packages`
+test-cluster: .venv/installed-ray  ## Docker, Prometheus, Slurm, Ray, MPI, Xvfb and Chromium, for real. Needs root and `make packages`
 	$(BIN)/python -m pytest -m cluster -rs -o log_level=INFO --numprocesses $(TEST_PROCESSES) --dist loadfile tests/cluster
 
 test-clients: .venv/installed-dev  ## the clients in C++ and other languages, built and run. Needs `make packages`

@@ -415,6 +415,8 @@ class Status(Message, frozen=True):
     """number of workers that are not in `workers`, because the message would be too long"""
     waiting: str = ""
     """who waits for whom, and for what share of the time, in one line for people; empty if nobody waits long"""
+    phase: str = ""
+    """what the learner of a run does: starting, gathering rollouts, learning, or evaluating"""
 
 
 ToLearner = (

@@ -62,8 +62,9 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"conformance", "import_conflict", "launch", "playing", "terminal"},
+    "cli": {"conformance", "dashboard", "import_conflict", "launch", "playing", "terminal"},
     "conformance": set[str](),
+    "dashboard": {"cli"},
     "integrations": set[str](),
     "launch": {"arguments", "cli", "own_policy", "policies"},
 }

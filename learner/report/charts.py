@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -80,6 +80,30 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     ordered = sorted(all_series, key=lambda series: ("band", "thin", "line", "dots").index(series.kind))
     parts += [_svg(series, x_pixels(series.x), y_pixels(series.y)) for series in ordered if series.x.size]
     return "\n".join([*parts, "</svg>"])
+
+
+class Segment(NamedTuple):
+    """A part of a bar."""
+
+    begin: float
+    """where it begins, as a share of the bar"""
+    share: float
+    css: str
+    """its class in the style sheet, which is its color"""
+    tooltip: str = ""
+    text: str = ""
+
+
+def bar(segments: Iterable[Segment]) -> str:
+    """A bar of colored segments, as wide as the page allows. Its sizes are attributes, not styles, which pages forbid."""
+    parts = []
+    for begin, share, css, tooltip, text in segments:
+        rect = f'<rect class="{css}" x="{100 * begin:.2f}%" width="{100 * share:.2f}%" height="100%">'
+        parts.append(f"{rect}<title>{escape(tooltip)}</title></rect>")
+        if text:
+            of_wait = " on-wait" if css == "wait" else ""
+            parts.append(f'<text class="on-bar{of_wait}" x="{100 * begin:.2f}%" dx="7" y="50%" dy="4">{escape(text)}</text>')
+    return f'<svg class="bar">{"".join(parts)}</svg>'
 
 
 def _svg(series: Series, x: Doubles, y: Doubles) -> str:

@@ -59,20 +59,14 @@ class RunRecord(NamedTuple):
         return Curve(self.env, self.algo, self.seed, *np.asarray(points, np.float64).T) if points else None
 
 
-def algorithm_label(algo: str) -> str:
-    """The name of an algorithm in a legend: PPO, or the class of one of the user's own."""
-    _, own, name = algo.rpartition(":")
-    return name if own else algo.upper()
-
-
-def read_run_files(run: Path) -> RunRecord:
-    """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRecord:
+    """Read a run folder. `rows`: of its metrics, if they are read already. Raises `UsageError`, with a one-line message."""
     RunFolder.open(run)
     elsewhere = check_format(run).workers_elsewhere
     config = read_config(run)
     env = environment_name(config["env"], config.get("env_kwargs", {}), config["algo"])
     try:
-        rows = read_rows(run / METRICS_FILE)
+        rows = read_rows(run / METRICS_FILE) if rows is None else rows
     except OSError as error:
         raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
     return RunRecord(env, config["algo"], config["seed"], config, elsewhere, rows)

@@ -2,10 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 from learner.report.charts import COLORS, MINUS
 from learner.report.reported_runs import RunGroup
+
+
+def document(title: str, head: Sequence[str], main: str) -> str:
+    """A whole page. `head` is HTML: its policy, its style, its script. `main` is HTML too."""
+    return "\n".join(
+        [
+            "<!doctype html>",
+            '<html lang="en">',
+            "<head>",
+            '<meta charset="utf-8">',
+            *head,
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            '<meta name="color-scheme" content="light dark">',
+            f"<title>{escape(title)}</title>",
+            "</head>",
+            "<body>",
+            "<main>",
+            main,
+            "</main>",
+            "</body>",
+            "</html>",
+            "",
+        ]
+    )
 
 
 def section(name: str, about: str, content: str) -> str:
@@ -22,11 +47,3 @@ def color_dot(group: RunGroup) -> str:
 def return_text(value: float) -> str:
     """A return with one decimal and a typographic minus sign."""
     return f"{value:,.1f}".replace("-", MINUS)
-
-
-def time_text(seconds: float) -> str:
-    """A duration in s, min or h."""
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

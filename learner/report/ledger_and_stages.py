@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from html import escape
 
-from learner.report.charts import COLORS, MINUS
-from learner.report.html_parts import color_dot, section, time_text
+from learner.report.charts import COLORS, MINUS, Segment, bar
+from learner.report.html_parts import color_dot, section
 from learner.report.reported_runs import ReportData
+from learner.report.run_lines import duration
 
 TICKETS = ("issued", ("used", "outstanding", "lost"))
 TRANSITIONS = ("received", ("used", "waiting", "duplicate", "late", "invalid"))
@@ -66,15 +67,14 @@ def _bars(report: ReportData, process: str, name: str) -> str:
     for short, (group, _), seconds in zip(report.short_names(), report.runs, spent, strict=True):
         total = sum(seconds.values())
         shares = {kind: seconds[kind] / total for kind in kinds if total and seconds.get(kind)}
-        bar = "".join(
-            f'<span class="{color[kind]}" style="width:{100 * share:.2f}%" '
-            f'title="{escape(kind)}: {seconds[kind]:,.1f} s, {100 * share:.1f} %">'
-            f"{f'{100 * share:.0f} %' if share > 0.06 else ''}</span>"
-            for kind, share in shares.items()
-        )
+        segments, end = list[Segment](), 0.0
+        for kind, share in shares.items():
+            tooltip, text = f"{kind}: {seconds[kind]:,.1f} s, {100 * share:.1f} %", f"{100 * share:.0f} %"
+            segments.append(Segment(end, share, color[kind], tooltip, text if share > 0.06 else ""))
+            end += share
         rows.append(
             f'<span class="who" title="{escape(short)}">{color_dot(group)}{escape(short)}</span>'
-            f'<span class="bar">{bar}</span><span class="total">{time_text(total)}</span>'
+            f'{bar(segments)}<span class="total">{duration(total)}</span>'
         )
     legend = "".join(f'<li><i class="{color[kind]}"></i>{escape(kind)}</li>' for kind in kinds)
     return (

@@ -7,15 +7,16 @@ both. All its data come from the run folders, and text from them is escaped. The
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 from learner.report import ledger_and_stages, sections
+from learner.report.html_parts import document
 from learner.report.reported_runs import group_runs, read_run
 from learner.run_folder.atomic_write import write_file
 from protocol.errors import UsageError
 
 CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
+STYLE = Path(__file__).with_name("style.css")
 
 
 def write_page(runs: Sequence[Path], out: Path) -> Path:
@@ -33,7 +34,6 @@ def write_page(runs: Sequence[Path], out: Path) -> Path:
 def page(runs: Sequence[Path]) -> str:
     """The page as HTML text. Raises `UsageError`, with a one-line message, if a run folder cannot be read."""
     report = group_runs([read_run(run) for run in dict.fromkeys(runs)])
-    style = Path(__file__).with_name("style.css").read_text()
     body = [
         sections.head(report),
         sections.results(report),
@@ -45,24 +45,6 @@ def page(runs: Sequence[Path]) -> str:
         ledger_and_stages.stages(report),
         sections.foot(report),
     ]
-    return "\n".join(
-        [
-            "<!doctype html>",
-            '<html lang="en">',
-            "<head>",
-            '<meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_SECURITY_POLICY}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<meta name="color-scheme" content="light dark">',
-            f"<title>{escape(sections.title(report))}: millrace report</title>",
-            f"<style>\n{style}</style>",
-            "</head>",
-            "<body>",
-            "<main>",
-            *filter(None, body),
-            "</main>",
-            "</body>",
-            "</html>",
-            "",
-        ]
-    )
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_SECURITY_POLICY}">'
+    title = f"{sections.title(report)}: millrace report"
+    return document(title, [policy, f"<style>\n{STYLE.read_text()}</style>"], "\n".join(filter(None, body)))

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from learner.report.curve import Curve, algorithm_label, read_run_files
+from learner.report.curve import Curve, read_run_files
+from learner.report.run_lines import algorithm_label
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
 from learner.run_folder.regular_files import regular_files
@@ -146,9 +147,9 @@ class ReportData:
         return [f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
-def read_run(path: Path) -> ReportedRun:
-    """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
-    files = read_run_files(path)
+def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRun:
+    """Read a run folder. `rows`: of its metrics, if they are read already. Raises `UsageError`, with a one-line message."""
+    files = read_run_files(path, rows)
     of_algorithm = files.config.get(files.algo)
     return ReportedRun(
         path=path,

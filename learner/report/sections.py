@@ -6,7 +6,7 @@ Rule: text from run folders is escaped.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from html import escape
 from pathlib import Path
 
@@ -14,8 +14,9 @@ import numpy as np
 
 from learner.report.charts import Series, chart
 from learner.report.curve import common_grid
-from learner.report.html_parts import color_dot, return_text, section, time_text
+from learner.report.html_parts import color_dot, return_text, section
 from learner.report.reported_runs import ReportData, RunGroup, differing_settings
+from learner.report.run_lines import duration
 from learner.run_folder.episode_window import WINDOW_EPISODES
 from learner.run_folder.regular_files import read
 from learner.run_folder.results import FactMean
@@ -35,7 +36,7 @@ def head(report: ReportData) -> str:
     facts = [
         f"{len(results)} runs" if len(results) > 1 else "1 run",
         f"{sum(result.env_steps for result in results):,} env steps",
-        f"{time_text(sum(result.wall_s for result in results))} of training",
+        f"{duration(sum(result.wall_s for result in results))} of training",
     ]
     return (
         f'<header><p class="kicker">millrace report</p><h1>{escape(title(report))}</h1><p>{" · ".join(facts)}</p></header>'
@@ -82,7 +83,7 @@ def _rows_of_group(group: RunGroup) -> str:
             mean,
             f"{results.env_steps:,}",
             f"{results.env_steps_per_s:,.0f}",
-            time_text(results.wall_s),
+            duration(results.wall_s),
             f"{results.updates:,}",
         ]
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
@@ -141,15 +142,34 @@ def _series(group: RunGroup) -> Iterable[Series]:
             yield Series("line", group.color, grid, returns.mean(0), f"{group.name}: mean of {len(averaged)}")
 
 
-def images(report: ReportData) -> str:
+class Embedded:
+    """Puts films and pictures into the page itself, as long as they are small."""
+
+    def __init__(self) -> None:
+        self._room = MOST_BYTES_OF_ALL
+
+    def __call__(self, path: Path, kind: str) -> str:
+        """The address of a file, which is its content; empty if it is too large. `kind`: its media type."""
+        size = path.stat().st_size
+        if size > min(MOST_BYTES_OF_ONE, self._room):
+            return ""
+        self._room -= size
+        return f"data:{kind};base64,{base64.b64encode(read(path, MOST_BYTES_OF_ONE)).decode()}"
+
+
+AddressOf = Callable[[Path, str], str]
+"""The address of a film or picture, by its path and media type; empty if the page shows none of it."""
+
+
+def images(report: ReportData, address_of: AddressOf | None = None) -> str:
     """What the policy sees: of each environment with images, the picture of its first run that has one."""
-    figures, room = [], [MOST_BYTES_OF_ALL]
+    figures, address_of = [], address_of or Embedded()
     for env in report.envs:
         runs = [run for group, run in report.runs if group.env == env and run.images]
         for path in runs[0].images if runs else ():
             name = path.stem.removeprefix("observation").lstrip("-")
             alt = escape(f"Image observations of {env}")
-            shown = _shown(path, room, f'<img alt="{alt}" src="data:image/png;base64,', '">')
+            shown = _shown(path, address_of(path, "image/png"), f'<img alt="{alt}" src="', '">')
             caption = f"<figcaption>{escape(env)}<span>{escape(name)}</span></figcaption>"
             figures.append(f"<figure>{shown}{caption}</figure>")
     if not figures:
@@ -158,14 +178,14 @@ def images(report: ReportData) -> str:
     return section("What the policy sees", about, f'<div class="seen">{"".join(figures)}</div>')
 
 
-def videos(report: ReportData) -> str:
+def videos(report: ReportData, address_of: AddressOf | None = None) -> str:
     """The newest video of each run. Large ones are named instead of shown."""
-    figures, room = [], [MOST_BYTES_OF_ALL]
+    figures, address_of = [], address_of or Embedded()
     for name, (group, run) in zip(report.short_names(), report.runs, strict=True):
         if not run.videos:
             continue
         newest = max(run.videos, key=lambda path: (path.stat().st_mtime_ns, path.name))
-        shown = _shown(newest, room, '<video controls muted loop playsinline src="data:video/mp4;base64,', '"></video>')
+        shown = _shown(newest, address_of(newest, "video/mp4"), '<video controls muted loop playsinline src="', '"></video>')
         caption = f"<figcaption>{color_dot(group)}{escape(name)}<span>{escape(newest.name)}</span></figcaption>"
         figures.append(f"<figure>{shown}{caption}</figure>")
     if not figures:
@@ -173,13 +193,11 @@ def videos(report: ReportData) -> str:
     return section("Videos", "Greedy episodes.", f'<div class="films">{"".join(figures)}</div>')
 
 
-def _shown(path: Path, room: list[int], before: str, after: str) -> str:
-    """A film or picture as part of the page, or why it is not. `room`: how many bytes the section has left."""
-    size = path.stat().st_size
-    if size > min(MOST_BYTES_OF_ONE, room[0]):
-        return f'<p class="none">{size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(path))}</p>'
-    room[0] -= size
-    return f"{before}{base64.b64encode(read(path, MOST_BYTES_OF_ONE)).decode()}{after}"
+def _shown(path: Path, address: str, before: str, after: str) -> str:
+    """A film or picture as part of the page, or why it is not."""
+    if not address:
+        return f'<p class="none">{path.stat().st_size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(path))}</p>'
+    return f"{before}{escape(address)}{after}"
 
 
 def settings(report: ReportData) -> str:

@@ -355,4 +355,4 @@ class Hub:
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
-        return status(self.coordinator, self._progress, now, self.waiting(now))
+        return status(self.coordinator, self._progress, now, self.waiting(now), self._time.phase)

@@ -7,7 +7,7 @@ from learner.run_folder.progress import Progress
 from protocol.messages import Status
 
 
-def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str) -> Status:
+def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str, phase: str) -> Status:
     """The status message of a run; `progress` is that of the last update, `waiting` says who waits for whom."""
     return Status(
         coordinator.run.env.id,
@@ -22,4 +22,5 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiti
         lag_max=progress.lag_max,
         ledger=coordinator.rollouts.ledger.counts(),
         waiting=waiting,
+        phase=phase,
     )

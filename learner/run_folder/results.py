@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from learner.run_folder.regular_files import read
 from protocol.bounds import Natural, Real, Seconds
 
+SUMMARY_FILE = "summary.json"
 EVALUATION_KEY = "eval/mean_reward"
 EVALUATED_AT_KEY = "eval/env_steps"
 """env steps of the policy that was evaluated beside training: fewer than those of the row with the result"""
@@ -140,3 +143,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """seconds spent in each stage"""
     versions: dict[str, str] = {}
     """versions of millrace and of the packages that decide its results"""
+
+
+def read_summary(run: Path) -> Summary:
+    """The summary.json of a run folder. Raises OSError, also if there is none, or an error of msgspec."""
+    return msgspec.json.decode(read(run / SUMMARY_FILE), type=Summary)

@@ -40,7 +40,7 @@ from safetensors.numpy import load, save
 
 from learner.run_folder.atomic_write import TEMPORARY, Writes, write_file
 from learner.run_folder.regular_files import MOST_BYTES, read, reason
-from learner.run_folder.results import Summary
+from learner.run_folder.results import SUMMARY_FILE, Summary, read_summary
 from learner.run_folder.run_format import (
     CONFIG_FILE,
     END,
@@ -220,7 +220,7 @@ class RunFolder:
 
     def remove_summary(self) -> None:
         """A run that had ended goes on: its summary is no longer true."""
-        (self.path / "summary.json").unlink(missing_ok=True)
+        (self.path / SUMMARY_FILE).unlink(missing_ok=True)
 
     def keep(self) -> None:
         """The run has begun: `remove` does nothing from now on."""
@@ -333,17 +333,17 @@ class RunFolder:
 
     def write_summary(self, summary: Summary) -> None:
         """Write summary.json."""
-        self._write("summary.json", msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+        self._write(SUMMARY_FILE, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
     def summary(self) -> Summary | None:
         """Read summary.json. None if it is missing, or damaged, which is said."""
         try:
-            return msgspec.json.decode(read(self.path / "summary.json"), type=Summary)
+            return read_summary(self.path)
         except FileNotFoundError:
             return None
         except UNREADABLE as error:
             log.warning(
-                "%s cannot be read: %s; the run counts as not finished", self.path / "summary.json", one_line(reason(error))
+                "%s cannot be read: %s; the run counts as not finished", self.path / SUMMARY_FILE, one_line(reason(error))
             )
             return None
 

@@ -290,6 +290,24 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
     return LearnerOfRun(owner.here if here else owner.address, Path(owner.keys) if owner.keys else None, here)
 
 
+def living_owner(folder: Path, now: float) -> Owner | None:
+    """Who seems to train the run in this folder, for people to read; `now` is wall-clock time. None if nobody does.
+
+    A process here is looked for by its number. Another one, perhaps in a container, rewrites the file every few seconds; if
+    the clocks of the two machines differ by much, this is wrong, so nothing is decided by it.
+    """
+    path = folder / LOCK_FILE
+    try:
+        owner, age_s = decoded(read(path)), now - path.lstat().st_mtime
+    except OSError:
+        return None
+    if owner is None:
+        return None
+    if owner.boot == _boot() and not owner.address.startswith("tcp://"):
+        return owner if _is_alive(owner.pid) else None
+    return owner if age_s < PACE.dead_after else None
+
+
 def _is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)

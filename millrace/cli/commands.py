@@ -34,10 +34,12 @@ GROUPS = {
         "launch": Command("launch:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
     },
     "Look at runs": {
+        "list": Command("look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
+        "dashboard": Command("look:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
         "evaluate": Command("play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
         "record": Command("play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
-        "plot": Command("compare:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),
-        "report": Command("compare:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
+        "plot": Command("look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),
+        "report": Command("look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
     },
     "Write a client in another language": {
         "conform": Command("conform:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),

@@ -51,6 +51,24 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
 
 
+class ListFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """List runs: state, return, progress and speed of each, the newest first."""
+
+    folders: Annotated[tuple[Path, ...], Flag("[FOLDER ...]", positional=True)] = ()
+    """folders of runs, or run folders; if none is given, runs"""
+
+
+class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Show runs in a browser: curves that grow while they train, workers, who waits for whom, what went wrong."""
+
+    folders: Annotated[tuple[Path, ...], Flag("[RUNS ...]", positional=True)] = ()
+    """folders of runs, or run folders; if none is given, runs"""
+    bind: str = "127.0.0.1:0"
+    """where the page is served, as HOST:PORT; port 0 is a free one"""
+    insecure: bool = False
+    """serve it also at an address that others reach: who learns the page's address sees all that is in these runs"""
+
+
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Draw learning curves as a PNG: a panel for each environment, a color for each algorithm, a band for several seeds."""
 

@@ -1,5 +1,7 @@
 """`millrace status ADDRESS|RUN`: ask a learner for the state of its run and print it. Needs only a worker's packages.
 
+Of a run that no process trains, the last state in its folder is printed.
+
 Rule: everybody who may connect may ask, and asking changes nothing. If a learner does not answer within the deadline, the
 error is one line. Names that a peer has chosen cannot control the terminal.
 """
@@ -11,7 +13,7 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -19,6 +21,8 @@ import msgspec
 from msgspec import Meta
 
 from learner.members.held_up import in_words
+from learner.report.run_lines import RunLine, in_sentences, read_line
+from learner.run_folder.run_format import is_run_folder
 from learner.run_folder.run_lock import learner_of_run
 from protocol.errors import Refused, RunError, UsageError
 from protocol.flags.fields import Flag
@@ -43,10 +47,10 @@ LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns
 
 
 class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Show the workers of a run (speed, memory, seconds since the last message), and what was dropped."""
+    """Show the workers of a run (speed, memory, seconds since the last message), and what was dropped; or how it ended."""
 
     address: Annotated[str, Flag("ADDRESS|RUN", positional=True)]
-    """where the learner listens, as in tcp://HOST:5555, or the folder of a run that is training"""
+    """where the learner listens, as in tcp://HOST:5555, or a run folder"""
     watch: bool = False
     """ask again every second, until Ctrl-C or the end of the learner"""
     json: bool = False
@@ -68,6 +72,9 @@ def run(argv: list[str]) -> int:
 def status(argv: list[str], out: TextIO) -> None:
     """Run the command. Raises `UsageError`, or `RunError` when the learner does not answer."""
     values = parse_flags(StatusFlags, argv, "status")
+    if "://" not in values.address and (last := last_state(Path(values.address))) is not None:
+        out.write(f"{last_in_json(last) if values.json else in_sentences(last)}\n")
+        return
     address, token = whom_to_ask(values.address, read_token(values.token), insecure=values.insecure)
     link = WorkerLink(address, observer_name(), token=token)
     try:
@@ -85,6 +92,12 @@ def status(argv: list[str], out: TextIO) -> None:
             time.sleep(WATCH_EVERY_S)
     finally:
         link.close(linger_s=0)
+
+
+def last_state(run: Path) -> RunLine | None:
+    """What is known of a run that nobody trains; None if somebody seems to, or it is no run."""
+    line = read_line(run, time.time()) if is_run_folder(run) else None
+    return None if line is None or line.state in ("training", "unreadable") else line
 
 
 def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str, Token | None]:
@@ -146,6 +159,12 @@ def in_json(status: Status) -> str:
     return msgspec.json.encode({"type": Status.__name__, **msgspec.structs.asdict(status)}).decode()
 
 
+def last_in_json(line: RunLine) -> str:
+    """One line of JSON about a run that nobody trains."""
+    known = line._asdict() | {"path": str(line.path), "type": "LastState"}
+    return msgspec.json.encode({name: value for name, value in known.items() if name not in ("owner", "problem")}).decode()
+
+
 def as_table(status: Status) -> str:
     """A line about the run, a table of its workers, how many there are and could be, and what was dropped, by reason."""
     late = any(worker.late_actions for worker in status.workers)
@@ -158,7 +177,7 @@ def as_table(status: Status) -> str:
             _run_line(status),
             *([_printable(status.waiting)] if status.waiting else []),
             "",
-            *_table([_cells(worker, status.version, late) for worker in status.workers]),
+            *table([_cells(worker, status.version, late) for worker in status.workers], LEFT_ALIGNED, "no worker is here"),
             "",
             f"{wanted}dropped: {', '.join(dropped) or 'nothing'}",
         ]
@@ -201,14 +220,14 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
     } | ({"late actions": f"{worker.late_actions:,}"} if late else {})
 
 
-def _table(rows: list[dict[str, str]]) -> list[str]:
-    """Lines: the names of the columns, then each row."""
+def table(rows: Sequence[dict[str, str]], left_aligned: Sequence[str], empty: str) -> list[str]:
+    """Lines: the names of the columns, then each row; `empty` if there is none."""
     if not rows:
-        return ["no worker is here"]
+        return [empty]
     widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}
 
     def line(row: dict[str, str]) -> str:
-        cells = (f"{row[name]:{'<' if name in LEFT_ALIGNED else '>'}{width}}" for name, width in widths.items())
+        cells = (f"{row[name]:{'<' if name in left_aligned else '>'}{width}}" for name, width in widths.items())
         return "  ".join(cells).rstrip()
 
     return [line({name: name for name in widths}), *map(line, rows)]

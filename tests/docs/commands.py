@@ -34,6 +34,8 @@ BEFORE = {"nohup", "exec", "time", "nice", "env", "srun"}
 RECORDS: dict[str, type[Any]] = {
     "evaluate": flags.EvaluateFlags,
     "record": flags.RecordFlags,
+    "list": flags.ListFlags,
+    "dashboard": flags.DashboardFlags,
     "plot": flags.PlotFlags,
     "report": flags.ReportFlags,
     "status": status.StatusFlags,

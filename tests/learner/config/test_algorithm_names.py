@@ -20,7 +20,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.layers import config_from_toml, config_of_run, resolve
 from learner.config.resume_rules import Free, OnResume, declared
-from learner.report.curve import algorithm_label
+from learner.report.run_lines import algorithm_label
 from learner.resume_checks import check_settings
 from learner.run_folder.newest_run import newest_run
 from learner.run_folder.run_folder import RunFolder

@@ -19,9 +19,9 @@ import tomli_w
 from learner.config.layers import resolve
 from learner.report import sections
 from learner.report.charts import MINUS, Series, chart, ticks, with_si_prefix
-from learner.report.html_parts import time_text
 from learner.report.page import page, write_page
 from learner.report.reported_runs import ReportData, group_runs, read_run
+from learner.report.run_lines import duration
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation, Summary
@@ -311,15 +311,16 @@ def test_ticks_are_round_and_within() -> None:
         f"{MINUS}1.2k",
         "1.5M",
     ]
-    assert [time_text(s) for s in (0.04, 99.96, 119.8, 3599.0, 7260.0)] == [
+    assert [duration(s) for s in (0.04, 99.96, 119.8, 3599.0, 7260.0)] == [
         "0.0 s", "100.0 s", "2 min 0 s", "59 min 59 s", "2 h 1 min",
     ]  # fmt: skip
 
 
 def test_stages_are_shares_of_a_bar(tmp_path: Path) -> None:
     text = page([a_run(tmp_path)])
-    assert re.search(r'class="b0" style="width:75.00%" title="update: 3.0 s, 75.0 %">75 %<', text)
-    assert re.search(r'class="wait" style="width:25.00%" title="wait: 1.0 s, 25.0 %">25 %<', text)
+    assert re.search(r'class="b0" x="0.00%" width="75.00%" height="100%"><title>update: 3.0 s, 75.0 %</title>', text)
+    assert re.search(r'class="wait" x="75.00%" width="25.00%" height="100%"><title>wait: 1.0 s, 25.0 %</title>', text)
+    assert re.search(r'class="on-bar on-wait" x="75.00%"[^>]*>25 %<', text)
 
 
 def test_the_newest_film_is_on_the_page_if_it_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

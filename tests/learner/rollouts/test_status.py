@@ -32,7 +32,7 @@ PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, retur
 
 
 def told(learner: Learner, waiting: str = "") -> Status:
-    return status(learner.coordinator, PROGRESS, learner.now, waiting)
+    return status(learner.coordinator, PROGRESS, learner.now, waiting, "gathering")
 
 
 def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
@@ -163,7 +163,7 @@ def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[
     thread.join(10.0)
     asking.close(0)
     link.close(0)
-    assert found == [status(learner.coordinator, PROGRESS, 0.0, "")]
+    assert found == [status(learner.coordinator, PROGRESS, 0.0, "", "starting")]
     assert not learner.coordinator.members
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,10 +14,12 @@ from msgspec.structs import replace
 
 from learner.run_folder.lease import Listens, Owner, decoded
 from learner.run_folder.run_lock import LOCK_FILE, RunLock
-from millrace.cli.status import whom_to_ask
+from millrace.cli.main import main
+from millrace.cli.status import status, whom_to_ask
 from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder, read_token
 from protocol.keys.keys import Key, Token
+from tests.learner.report.test_page import a_run
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 WIDE, HERE = "tcp://box:5555", "tcp://127.0.0.1:5555"
@@ -100,3 +105,25 @@ def test_a_folder_of_another_user_is_one_line(run: Path, keys: KeyFolder) -> Non
             whom_to_ask(str(run), None, insecure=False)
     finally:
         keys.path.chmod(0o700)
+
+
+def test_a_run_that_nobody_trains_shows_how_it_ended(tmp_path: Path) -> None:
+    out, as_json = io.StringIO(), io.StringIO()
+    ended = a_run(tmp_path)
+    status([str(ended)], out)
+    assert out.getvalue().startswith("Finished: all steps done.\nCartPole-v1, PPO, seed 1: 123,456 of ")
+    status([str(ended), "--json"], as_json)
+    found = json.loads(as_json.getvalue())
+    assert (found["type"], found["state"], found["summary"]["updates"]) == ("LastState", "finished", 789)
+
+
+def test_runs_are_listed_in_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = a_run(tmp_path / "runs", finished=False)
+    assert main(["list", str(tmp_path / "runs")]) == 0
+    head, row = capsys.readouterr().out.splitlines()
+    columns = ["run", "state", "environment", "algorithm", "return", "env steps", "done", "steps/s", "started"]
+    assert re.split(r"  +", head) == columns
+    assert row.split()[:7] == [run.name, "dead", "CartPole-v1", "PPO", "101.0", "2,000", "2%"]
+    (tmp_path / "empty").mkdir()
+    assert main(["list", str(tmp_path / "empty")]) == 0
+    assert capsys.readouterr().out == "no run is here\n"

@@ -1,0 +1,121 @@
+"""Reads a metrics.jsonl that may grow: from where it was read last, keeping a bounded number of its rows.
+
+Rule: of a long file, rows at equal distances are kept, every one with an evaluation as long as there are few of these, and
+the newest. The newest row is read again each time, because a run may add to it. A
+file that was replaced, as a resumed run does, is read from its beginning.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from learner.run_folder.metrics_log import METRICS_FILE, decoded_row
+from learner.run_folder.regular_files import MOST_BYTES, open_regular
+from learner.run_folder.results import EVALUATION_KEY
+
+MOST_ROWS = 256  # at least, and twice as many at most: a chart has 500 points
+CHUNK_BYTES = 1 << 24
+MOST_LINE_BYTES = 1 << 20
+NEWLINE = 10
+OF_AN_EVALUATION = b'"%s"' % EVALUATION_KEY.encode()
+
+
+class MetricsTail:
+    """The rows of one run."""
+
+    def __init__(self, run: Path, most: int = MOST_ROWS) -> None:
+        self._path, self._most = run / METRICS_FILE, most
+        self._seen: tuple[int, ...] = ()  # which file it was, its size and time
+        self._newest: bytes | None = None
+        self._begin_anew()
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows that are kept, in their order."""
+        lines = self._all.lines | self._evaluations.lines
+        if self._newest is not None:
+            lines[self._all.count] = self._newest
+        return [row for _, line in sorted(lines.items()) if (row := decoded_row(line)) is not None]
+
+    def read(self) -> bool:
+        """Read on. Returns whether there is anything new. Raises OSError."""
+        with os.fdopen(open_regular(self._path), "rb") as file:
+            found = os.fstat(file.fileno())
+            seen = found.st_ino, found.st_size, found.st_mtime_ns
+            if seen == self._seen:
+                return False
+            if found.st_size > MOST_BYTES:
+                raise OSError(errno.EFBIG, f"expected at most {MOST_BYTES:,} bytes, got {found.st_size:,}", str(self._path))
+            if self._seen[:1] != seen[:1] or found.st_size < self._offset:
+                self._begin_anew()
+            file.seek(self._offset)
+            self._newest, rest = None, b""
+            while chunk := file.read(CHUNK_BYTES):
+                rest = self._add(rest + chunk)
+                if len(rest) - len(self._newest or b"") > MOST_LINE_BYTES:
+                    raise OSError(errno.EFBIG, f"a row has more than {MOST_LINE_BYTES:,} bytes", str(self._path))
+        self._seen = seen
+        return True
+
+    def _begin_anew(self) -> None:
+        self._offset = 0  # where the newest whole row begins
+        self._newest = None
+        self._all, self._evaluations = _Thinned(self._most), _Thinned(self._most)
+
+    def _add(self, text: bytes) -> bytes:
+        """Add the lines of this text. Returns its end, from the newest whole line on, which may change."""
+        ends = np.flatnonzero(np.frombuffer(text, np.uint8) == NEWLINE)
+        if not ends.size:
+            return text
+        begins = np.concatenate([[0], ends[:-1] + 1])
+        self._newest = text[begins[-1] : ends[-1]]
+        first, spans = self._all.count, list(zip(begins[:-1].tolist(), ends[:-1].tolist(), strict=True))
+        lines = dict.fromkeys(bisect_left(ends, place) for place in _places(text, OF_AN_EVALUATION))
+        self._evaluations.add(text, first, spans, [i for i in lines if i < len(spans)])
+        self._all.add(text, first, spans, range(len(spans)))
+        self._offset += int(begins[-1])
+        return text[begins[-1] :]
+
+
+class _Thinned:
+    """At most twice `most` of the lines that are added, at equal distances."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._every = most, 1
+        self.count = 0  # lines that were added
+        self.lines: dict[int, bytes] = {}  # by their numbers in the file
+
+    def add(self, text: bytes, first: int, spans: Sequence[tuple[int, int]], which: Sequence[int]) -> None:
+        """`which` of the lines at these places of the text. `first`: the number of its first line in the file."""
+        before, every = self.count, self._every
+        self.count += len(which)
+        while self.count > 2 * self._most * self._every:
+            self._every *= 2
+        if self._every > every:
+            self.lines = dict([*self.lines.items()][:: self._every // every])
+        for i in which[-before % self._every :: self._every]:
+            begin, end = spans[i]
+            self.lines[first + i] = text[begin:end]
+
+
+def _places(text: bytes, part: bytes) -> Iterator[int]:
+    """Where this part stands in the text."""
+    place = text.find(part)
+    while place >= 0:
+        yield place
+        place = text.find(part, place + 1)
+
+
+def newest_row(run: Path) -> dict[str, Any]:
+    """The last whole row of a metrics.jsonl; empty if there is none. Reads its end only. Raises OSError."""
+    with os.fdopen(open_regular(run / METRICS_FILE), "rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES // 16))
+        lines = file.read(MOST_LINE_BYTES).split(b"\n")[:-1]
+    return next((row for line in reversed(lines) if (row := decoded_row(line)) is not None), {})

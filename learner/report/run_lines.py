@@ -1,0 +1,180 @@
+"""What one line says about a run: its state, how far it is, how well it does. Reads little of a run folder.
+
+Rule: a folder that cannot be read is a line too, which says why. Nobody writes down that a run died, so it is what is left:
+no process trains it, and it has no results.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from learner.config.presets import environment_name
+from learner.report.metrics_tail import newest_row
+from learner.run_folder.lease import Owner
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
+from learner.run_folder.regular_files import reason
+from learner.run_folder.results import Summary, read_summary
+from learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
+from learner.run_folder.run_lock import living_owner
+from protocol.bounds import MAX_NAME, one_line
+from protocol.errors import UsageError
+
+RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
+MOST_RUNS = 1_000  # of a folder
+STARTED = re.compile(r"-(\d{8}-\d{6})(?:-\d{1,9})?")
+
+
+class RunLine(NamedTuple):
+    """One run, in short."""
+
+    path: Path
+    state: RunCondition
+    owner: Owner | None = None
+    """who trains it"""
+    env: str = ""
+    algo: str = ""
+    seed: int = 0
+    return_mean: float | None = None
+    """mean return of the last 100 training episodes"""
+    env_steps: float = 0
+    total_steps: float = 0
+    steps_per_s: float = 0.0
+    updates: float = 0
+    wall_s: float = 0.0
+    started: str = ""
+    summary: Summary | None = None
+    problem: str = ""
+    """why it cannot be read"""
+
+    @property
+    def name(self) -> str:
+        """The name of its folder, safe to show."""
+        return one_line(self.path.resolve().name, MAX_NAME)
+
+    @property
+    def progress(self) -> float:
+        """The share of its env steps that is done."""
+        return min(1.0, self.env_steps / self.total_steps) if self.total_steps > 0 else 0.0
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds of training that are left, at the speed so far; None if that is not known."""
+        if self.state != "training" or self.steps_per_s <= 0:
+            return None
+        return max(0.0, self.total_steps - self.env_steps) / self.steps_per_s
+
+
+def find_runs(folders: Iterable[Path]) -> list[Path]:
+    """The run folders among these and directly in them, the newest first. Raises `UsageError` if one is no folder."""
+    found: dict[Path, None] = {}
+    for folder in folders:
+        try:
+            inside = [] if is_run_folder(folder) else sorted(folder.iterdir())
+        except OSError as error:
+            raise UsageError(f"runs {folder}: {reason(error)}; expected a run folder, or a folder of runs") from error
+        found |= dict.fromkeys([path for path in inside if is_run_folder(path)] or [folder] * is_run_folder(folder))
+    return sorted(found, key=lambda path: (_started(path), path.name), reverse=True)[:MOST_RUNS]
+
+
+def read_line(path: Path, now: float) -> RunLine:
+    """Read a run folder. `now` is wall-clock time."""
+    try:
+        check_format(path)
+        config = read_config(path)
+        name = environment_name(config["env"], config.get("env_kwargs", {}), config["algo"])
+    except UsageError as error:
+        return RunLine(path, "unreadable", problem=str(error))
+    try:
+        summary, owner = None, living_owner(path, now)
+        row: dict[str, Any] = newest_row(path)
+    except OSError:
+        row = {}
+    if owner is None:
+        try:
+            summary = read_summary(path)
+        except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
+            summary = None
+    steps = config.get("steps")
+    line = RunLine(
+        path=path,
+        state="training" if owner else "dead" if summary is None else "interrupted" if summary.cut_short else "finished",
+        owner=owner,
+        env=one_line(name, MAX_NAME),
+        algo=one_line(config["algo"], MAX_NAME),
+        seed=config["seed"],
+        return_mean=row.get(RETURN_KEY),
+        env_steps=row.get(ENV_STEPS_KEY, 0),
+        total_steps=steps if isinstance(steps, int | float) else 0,
+        steps_per_s=row.get("time/fps") or 0.0,
+        updates=row.get(UPDATES_KEY) or 0,
+        wall_s=row.get("time/time_elapsed") or 0.0,
+        started=_started(path),
+    )
+    if summary is None:
+        return line
+    return line._replace(
+        summary=summary,
+        return_mean=summary.return_mean_100,
+        env_steps=summary.env_steps,
+        steps_per_s=summary.env_steps_per_s,
+        updates=summary.updates,
+        wall_s=summary.wall_s,
+    )
+
+
+def headline(line: RunLine) -> str:
+    """One sentence: how the run ended, or that it died, and how to continue it. Of one that trains, how far it is."""
+    resume = f"continue it with: millrace train --resume {one_line(shlex.quote(str(line.path)))}"
+    match line.state:
+        case "training":
+            left = "" if line.left_s is None else f", about {duration(line.left_s)} left"
+            return f"Training: {line.progress:.0%} done, {line.steps_per_s:,.0f} env steps per second{left}."
+        case "unreadable":
+            return f"It cannot be read: {line.problem}."
+        case "dead":
+            return f"Dead: no process trains it, and it has no results. It was killed, or its machine went down; {resume}"
+        case _:
+            assert line.summary is not None
+            why = one_line(line.summary.stop_reason)
+            return f"Interrupted: {why}; {resume}" if line.summary.cut_short else f"Finished: {why}."
+
+
+def in_sentences(line: RunLine) -> str:
+    """The last state of a run that nobody trains, as lines for a terminal."""
+    score = "none yet" if line.return_mean is None else f"{line.return_mean:,.1f}"
+    done = f"{line.env_steps:,.0f} of {line.total_steps:,.0f} env steps in {duration(line.wall_s)}"
+    lines = [headline(line), f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}: {done}, return {score}"]
+    if line.summary is not None and line.summary.evaluation is not None:
+        lines.append(one_line(f"greedy {line.summary.evaluation}"))
+    return "\n".join(lines)
+
+
+def duration(seconds: float) -> str:
+    """A duration in s, min or h."""
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def algorithm_label(algo: str) -> str:
+    """The name of an algorithm in a legend: PPO, or the class of one of the user's own."""
+    _, own, name = algo.rpartition(":")
+    return name if own else algo.upper()
+
+
+def _started(path: Path) -> str:
+    """When it began: as its folder's name says, or else as old as its run.json."""
+    found = STARTED.search(path.name)
+    try:
+        began = time.strptime(found[1], "%Y%m%d-%H%M%S") if found else time.localtime((path / RUN_FILE).lstat().st_mtime)
+    except (OSError, ValueError, OverflowError):
+        return ""
+    return time.strftime("%Y-%m-%d %H:%M", began)

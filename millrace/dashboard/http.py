@@ -1,0 +1,110 @@
+"""HTTP as far as the dashboard needs it: a request in, an answer out. Pure.
+
+Rule: a request is refused unless its method, its Host and the token at the beginning of its path are right. A wrong token
+is answered as a wrong path is, so that nothing tells how near a guess was. Every answer forbids the browser all that its
+page does not need.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+from urllib.parse import parse_qs, unquote, urlsplit
+
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "media-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cache-Control": "no-store",
+    "Connection": "close",
+}
+REASONS = {
+    200: "OK",
+    304: "Not Modified",
+    400: "Bad Request",
+    404: "Not Found",
+    405: "Method Not Allowed",
+    421: "Misdirected Request",
+    500: "Internal Server Error",
+}
+MOST_FIELDS = 100  # of a query
+
+
+class PageRequest(NamedTuple):
+    """What a browser asks for."""
+
+    method: str
+    path: tuple[str, ...]
+    """the parts of the path, the token among them"""
+    query: Mapping[str, list[str]]
+    headers: Mapping[str, str]
+    """by names in small letters"""
+
+
+class PageAnswer(NamedTuple):
+    """What it gets."""
+
+    body: bytes
+    content_type: str = "text/html; charset=utf-8"
+    status: int = 200
+
+
+def refusal(status: int) -> PageAnswer:
+    """An answer that says no more than its status."""
+    return PageAnswer(f"{status} {REASONS[status]}\n".encode(), "text/plain; charset=utf-8", status)
+
+
+def parsed(head: bytes) -> PageRequest | None:
+    """The request of these lines; None if they are none."""
+    first, *lines = head.decode("latin-1").split("\r\n")
+    method, _, rest = first.partition(" ")
+    target, _, version = rest.partition(" ")
+    fields = [line.partition(":") for line in lines if line]
+    if not (
+        method and target.startswith("/") and version in ("HTTP/1.1", "HTTP/1.0") and all(colon for _, colon, _ in fields)
+    ):
+        return None
+    headers = {name.lower(): value.strip() for name, _, value in fields}
+    if len(headers) < len(fields) and sum(name.lower() == "host" for name, _, _ in fields) > 1:
+        return None
+    try:
+        url = urlsplit(f"http://x{target}")
+        query = parse_qs(url.query, max_num_fields=MOST_FIELDS)
+    except ValueError:
+        return None
+    return PageRequest(method, tuple(unquote(part) for part in url.path.split("/")[1:]), query, headers)
+
+
+def why_refused(request: PageRequest | None, token: str, hosts: Collection[str]) -> int:
+    """The status with which a request is refused; 0 if it is not. `hosts`: what Host may be; none given: anything."""
+    if request is None:
+        return 400
+    if hosts and request.headers.get("host", "").lower() not in hosts:
+        return 421  # a page of another site that has its name point here
+    if request.method not in ("GET", "HEAD"):
+        return 405
+    return 0 if hmac.compare_digest(request.path[0].encode(), token.encode()) else 404
+
+
+def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
+    """The answer as it is sent. If the browser has the same already, or asked for the head only, it gets no body."""
+    headers, body, status = dict(HEADERS), answer.body, answer.status
+    if request is not None and status == 200:
+        headers["ETag"] = tag = f'"{hashlib.blake2b(body, digest_size=16).hexdigest()}"'
+        if request.headers.get("if-none-match") == tag:
+            status, body = 304, b""
+    if status == 405:
+        headers["Allow"] = "GET, HEAD"
+    if status != 304:
+        headers |= {"Content-Type": answer.content_type, "Content-Length": str(len(body))}
+    if request is not None and request.method == "HEAD":
+        body = b""
+    lines = [f"HTTP/1.1 {status} {REASONS[status]}", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
+    return "\r\n".join(lines).encode() + body

@@ -1,0 +1,170 @@
+"""Asks the learners of the runs that somebody looks at, once a second, and remembers the answers of the last minutes.
+
+Rule: a learner is asked as `millrace status` asks it, with the same rights, and only while a page of its run is open. What
+is remembered of a run is bounded, and forgotten when nobody looks.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from millrace.cli.status import observer_name, whom_to_ask
+from protocol.bounds import one_line
+from protocol.errors import UserFacingError
+from protocol.keys.keys import Token
+from protocol.messages import Inquire, Status, WorkerStatus
+from protocol.wire.codec import encode
+from protocol.wire.worker_link import WorkerLink
+
+ASK_EVERY_S = 1.0
+LOOKED_AT_S = 10.0  # a page that is open asks each second
+FORGOTTEN_S = 300.0
+SAMPLES = 300
+MOST_LANES = 64  # that are shown
+ANSWER_WITHIN_S = 0.5
+
+LEARNER: dict[str, str] = {
+    "gathering": "waiting",
+    "learning": "updating",
+    "evaluating": "evaluating",
+    "starting": "starting",
+}
+"""What a learner does in each phase, in the words of the picture"""
+WORKER = {
+    "stepping": "collecting",
+    "resetting": "resetting",
+    "making": "resetting",
+    "describing": "resetting",
+    "evaluating": "evaluating",
+    "starting": "starting",
+    "closing": "resetting",
+    "waiting": "waiting",
+}
+"""What a lane does while its worker does this"""
+
+
+class Sample(NamedTuple):
+    """What everybody did at one moment."""
+
+    at_s: float
+    learner: str
+    lanes: dict[int, str]
+
+
+class Seen(NamedTuple):
+    """What is known of a running learner."""
+
+    status: Status | None = None
+    """its newest answer"""
+    samples: tuple[Sample, ...] = ()
+    problem: str = ""
+    """why there is no answer"""
+
+
+@dataclass
+class _Watched:
+    """A run that somebody looks at, or did a short while ago."""
+
+    looked_s: float
+    link: WorkerLink | None = None
+    whom: tuple[str, Token | None] | None = None
+    status: Status | None = None
+    answered_s: float = 0.0
+    problem: str = ""
+    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=SAMPLES))
+
+
+def sample(status: Status, now: float) -> Sample:
+    """What an answer says about the learner and each lane."""
+    lanes = {lane: _doing(worker) for worker in status.workers for lane in worker.lanes}
+    shown = {lane: lanes.get(lane, "no worker") for lane in range(min(status.workers_wanted, MOST_LANES))}
+    return Sample(now, LEARNER.get(status.phase, ""), shown)
+
+
+def _doing(worker: WorkerStatus) -> str:
+    if not worker.doing:  # it has no supervisor
+        return "collecting" if worker.tickets else "waiting"
+    return WORKER.get(worker.doing, "")
+
+
+class Lookout:
+    """Watches runs in a thread, while it is entered."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._watched: dict[Path, _Watched] = {}
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="dashboard-lookout", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def look(self, run: Path) -> Seen:
+        """What is known of the learner of this run. It is asked from now on, as long as somebody looks."""
+        with self._lock:
+            watched = self._watched.setdefault(run, _Watched(self._clock()))
+            watched.looked_s = self._clock()
+            return Seen(watched.status, tuple(watched.samples), watched.problem)
+
+    def _run(self) -> None:
+        while not self._stop.wait(ASK_EVERY_S):
+            now = self._clock()
+            with self._lock:
+                asked = {run: each for run, each in self._watched.items() if now - each.looked_s < LOOKED_AT_S}
+                gone = {run: each for run, each in self._watched.items() if now - each.looked_s >= FORGOTTEN_S}
+                for run in gone:
+                    del self._watched[run]
+            for each in gone.values():
+                _close(each)
+            for run, watched in asked.items():
+                self._ask(run, watched)
+            deadline_s = self._clock() + ANSWER_WITHIN_S
+            for watched in asked.values():
+                self._listen(watched, max(0.0, deadline_s - self._clock()))
+        for watched in self._watched.values():
+            _close(watched)
+
+    def _ask(self, run: Path, watched: _Watched) -> None:
+        try:
+            whom = whom_to_ask(str(run), None, insecure=False)
+            if watched.link is None or whom != watched.whom:
+                _close(watched)
+                watched.whom, watched.link = whom, WorkerLink(whom[0], observer_name(), token=whom[1])
+            watched.link.send(encode(Inquire()))
+        except UserFacingError as error:
+            _close(watched)
+            with self._lock:
+                watched.status, watched.problem = None, one_line(str(error))
+
+    def _listen(self, watched: _Watched, timeout_s: float) -> None:
+        if watched.link is None:
+            return
+        watched.link.poll(timeout_s)
+        answers = [message for message in watched.link.answers() if isinstance(message, Status)]
+        now = self._clock()
+        with self._lock:
+            if answers:
+                watched.status, watched.answered_s, watched.problem = answers[-1], now, ""
+                watched.samples.append(sample(answers[-1], now))
+            elif now - watched.answered_s > LOOKED_AT_S:
+                watched.status = None
+                problem = watched.link.problem
+                watched.problem = one_line(problem.line) if problem else "its learner does not answer"
+
+
+def _close(watched: _Watched) -> None:
+    if watched.link is not None:
+        watched.link.close(linger_s=0)
+    watched.link = watched.whom = None

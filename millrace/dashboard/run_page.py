@@ -1,0 +1,360 @@
+"""The parts of the page of one run that a report does not have: what it does now, its workers, a curve of any metric. Pure.
+
+Rule: text from run folders and from learners is escaped. What stands on the page are words that a person would write; the
+names of fields stand beside them where a reader may look for them elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from learner.members.held_up import in_words
+from learner.metric_names import METRICS, Meaning
+from learner.report.charts import Segment, Series, bar, chart
+from learner.report.html_parts import return_text, section
+from learner.report.run_lines import RunLine, algorithm_label, duration, headline
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
+from millrace.cli.status import DROPS
+from millrace.dashboard.live import Sample, Seen
+from protocol.arrays import Doubles
+from protocol.messages import Status, WorkerStatus
+
+WIDE, NARROW = (1080, 360), (420, 300)
+SHOWN_S = 180.0  # of who waits for whom
+COLORS = {
+    "collecting": "b1",
+    "updating": "b0",
+    "resetting": "b2",
+    "evaluating": "b4",
+    "starting": "b6",
+    "waiting": "wait",
+    "no worker": "gone",
+}
+"""Class in the style sheet of what a lane or the learner does"""
+WORDS = {
+    "rollout/ep_rew_mean": "return",
+    "rollout/ep_len_mean": "episode length",
+    "rollout/exploration_rate": "exploration rate",
+    "eval/mean_reward": "return of evaluations",
+    "eval/mean_ep_length": "episode length of evaluations",
+    "time/fps": "env steps per second",
+    "time/iterations": "updates",
+    "time/time_elapsed": "time of training",
+    "train/n_updates": "gradient steps",
+    "train/approx_kl": "approximate KL divergence",
+    "train/grad_norm": "norm of the gradient",
+}
+"""What a metric is called, where its name does not say it"""
+MEANINGS: dict[str, Meaning] = {name: meaning for group in METRICS.values() for name, meaning in group.items()}
+MOST_HISTORY = 30
+MOST_SMOOTHED = 100
+MIB = 2**20
+
+
+class Choice(NamedTuple):
+    """Which curve the reader has chosen."""
+
+    metric: str = RETURN_KEY
+    over_time: bool = False
+    smooth: int = 1
+    """number of rows over which a moving mean is taken"""
+
+    @staticmethod
+    def of(query: Mapping[str, Sequence[str]]) -> Choice:
+        """What the query of an address chooses; what it does not say, or not rightly, is as by default."""
+
+        def first(name: str, default: str) -> str:
+            return query.get(name, [default])[0]
+
+        smooth = first("smooth", "1")
+        rows = int(smooth) if smooth.isascii() and smooth.isdecimal() and len(smooth) < 4 else 1
+        return Choice(first("metric", RETURN_KEY), first("over", "") == "time", min(max(rows, 1), MOST_SMOOTHED))
+
+
+def head(line: RunLine, seen: Seen, newest: Mapping[str, Any], home: str) -> str:
+    """Which run it is, and in one sentence what it does, or how it ended. `newest`: its newest row."""
+    title = f"{escape(line.env or line.name)} <small>{escape(algorithm_label(line.algo))}, seed {line.seed}</small>"
+    return (
+        f'<header><p class="kicker"><a href="{home}">millrace: all runs</a></p><h1>{title}</h1>'
+        f'<p class="now {line.state}">{escape(now_sentence(line, seen, newest))}</p>'
+        f'<p class="kicker">{escape(line.name)}</p></header>'
+    )
+
+
+def now_sentence(line: RunLine, seen: Seen, newest: Mapping[str, Any]) -> str:
+    """What the run does now, and what holds it up or is wrong with it."""
+    if line.state != "training":
+        return headline(line)
+    text = [headline(line)]
+    if seen.problem:
+        text.append(f"Who waits for whom is not known: {seen.problem}.")
+    elif seen.status is not None and seen.status.waiting:
+        said = seen.status.waiting
+        text.append(f"The learner {said}." if said.startswith("waited") else f"The learner is {said}.")
+    else:
+        text.append(_slowest_part(newest))
+    if lost := newest.get("ledger/lost"):
+        text.append(f"{lost:,.0f} {'rollout was' if lost == 1 else 'rollouts were'} lost and dealt again.")
+    return " ".join(filter(None, text))
+
+
+def _slowest_part(newest: Mapping[str, Any]) -> str:
+    """What takes most of the time of a run in which nobody waits long."""
+    spent = {name: newest.get(f"stage/{name}") or 0.0 for name in ("learner_wait", "learner_update", "worker_wait")}
+    workers_s = sum(value or 0.0 for name, value in newest.items() if name.startswith("stage/worker_"))
+    learner_s = spent["learner_wait"] + spent["learner_update"]
+    if not (workers_s > 0 and learner_s > 0):
+        return ""
+    update, idle = spent["learner_update"] / learner_s, spent["worker_wait"] / workers_s
+    slowest = "Updates are" if update > 2 / 3 else "Collecting is" if update < 1 / 3 else "No part is"
+    return f"{slowest} the slowest part: the learner updates for {update:.0%} of the time, and workers wait for {idle:.0%}."
+
+
+def facts(line: RunLine) -> str:
+    """The most important numbers."""
+    evaluation = line.summary.evaluation if line.summary else None
+    cells = {
+        "Return, last 100 episodes": "none yet" if line.return_mean is None else return_text(line.return_mean),
+        "Env steps": f"{line.env_steps:,.0f} of {line.total_steps:,.0f}",
+        "Env steps per second": f"{line.steps_per_s:,.0f}",
+        "Updates": f"{line.updates:,.0f}",
+        "Time of training": duration(line.wall_s),
+        "Started": line.started,
+    }
+    if evaluation is not None:
+        spread = f"{return_text(evaluation.return_mean)} ± {evaluation.return_std:,.1f}"
+        cells = {f"Final policy, {evaluation.episodes} greedy episodes": spread} | cells
+    items = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in cells.items())
+    return f'<section id="facts"><dl class="facts">{items}</dl></section>'
+
+
+def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
+    """The curve of one metric, and a form to choose another."""
+    names = dict.fromkeys(name for row in rows for name in row if name != ENV_STEPS_KEY)
+    if not names:
+        return _identified("curve", section("Curves", "The first update has not been made yet.", ""))
+    metric = choice.metric if choice.metric in names else RETURN_KEY
+    x, y = _points(rows, metric, choice.over_time)
+    series = [Series("thin" if choice.smooth > 1 else "line", 0, x, y, "")] if x.size else []
+    if choice.smooth > 1 and x.size:
+        series.append(Series("line", 0, x, smoothed(y, choice.smooth), ""))
+    if metric == RETURN_KEY:
+        at, returns = _points(rows, EVALUATION_KEY, choice.over_time)
+        series += [Series("dots", 1, at, returns, "greedy evaluations")] if at.size else []
+    x_label = "minutes of training" if choice.over_time else "env steps"
+    what = f"{label(metric)} over {x_label}"
+    sizes = {"for-wide": WIDE, "for-narrow": NARROW}
+    drawn = "".join(f'<div class="{css}">{chart(series, *size, x_label, what)}</div>' for css, size in sizes.items())
+    drawn = drawn if series else "<p>No value yet.</p>"
+    legend = (
+        '<ul class="legend"><li><i class="ring"></i>greedy evaluations</li></ul>'
+        if len(series) > 1 + (choice.smooth > 1)
+        else ""
+    )
+    meaning = MEANINGS.get(metric)
+    about = f"{meaning.text} Unit: {meaning.unit}." if meaning else f"Logged as {metric}."
+    form = _form(names, metric, choice)
+    figure = f'<div class="panels"><figure>{legend}{drawn}</figure></div>'
+    return _identified("curve", section(label(metric).capitalize(), about, form + figure))
+
+
+def label(metric: str) -> str:
+    """What a metric is called."""
+    group, _, name = metric.partition("/")
+    words = name.replace("_", " ")
+    return WORDS.get(metric) or {"stage": f"time: {words}", "ledger": f"count: {words}", "lag": f"lag, {words}"}.get(
+        group, words
+    )
+
+
+def smoothed(y: Doubles, rows: int) -> Doubles:
+    """The mean of each value and of those before it, of so many rows at most."""
+    sums = np.concatenate([[0.0], np.cumsum(y / rows)])
+    ends = np.arange(1, len(y) + 1)
+    begins = np.maximum(0, ends - rows)
+    return np.asarray((sums[ends] - sums[begins]) * (rows / (ends - begins)))
+
+
+def _points(rows: Sequence[Mapping[str, Any]], metric: str, over_time: bool) -> tuple[Doubles, Doubles]:
+    at = "time/time_elapsed" if over_time else EVALUATED_AT_KEY if metric == EVALUATION_KEY else ENV_STEPS_KEY
+    found = [(row.get(at, row[ENV_STEPS_KEY] if not over_time else None), row.get(metric)) for row in rows]
+    points = np.asarray([point for point in found if None not in point], np.float64).reshape(-1, 2)
+    points = points.clip(-1e300, 1e300)
+    return points[:, 0] / (60.0 if over_time else 1.0), points[:, 1]
+
+
+def _form(names: Mapping[str, None], metric: str, choice: Choice) -> str:
+    groups: dict[str, list[str]] = {}
+    for name in sorted(names, key=label):
+        groups.setdefault(name.partition("/")[0], []).append(name)
+    titles = {"rollout": "training episodes", "eval": "evaluations", "time": "progress and speed",
+              "stage": "seconds by stage", "train": "the algorithm", "ledger": "tickets and transitions",
+              "custom": "of your own"}  # fmt: skip
+    options = "".join(
+        f'<optgroup label="{escape(titles.get(group, group))}">'
+        + "".join(
+            f'<option value="{escape(name)}"{" selected" * (name == metric)}>{escape(label(name))}</option>'
+            for name in members
+        )
+        + "</optgroup>"
+        for group, members in groups.items()
+    )
+
+    def choose(name: str, chosen: str, values: Mapping[str, str]) -> str:
+        inner = "".join(
+            f'<option value="{value}"{" selected" * (value == chosen)}>{text}</option>' for value, text in values.items()
+        )
+        return f'<select name="{name}">{inner}</select>'
+
+    over = choose("over", "time" if choice.over_time else "steps", {"steps": "env steps", "time": "time of training"})
+    kinds = {"1": "not smoothed", "10": "10 rows", "30": "30 rows", "100": "100 rows"}
+    smooth = choose("smooth", str(choice.smooth), kinds)
+    return (
+        f'<form class="choose" method="get"><label>Show <select name="metric">{options}</select></label>'
+        f"<label>over {over}</label><label>mean over {smooth}</label><button>Show</button></form>"
+    )
+
+
+def workers(seen: Seen) -> str:
+    """The workers by machine."""
+    if seen.status is None:
+        return ""
+    hosts: dict[str, list[WorkerStatus]] = {}
+    for worker in seen.status.workers:
+        hosts.setdefault(worker.host, []).append(worker)
+    columns = ("Worker", "Doing", "Lanes", "Steps/s", "Weights", "Heard", "Memory")
+    heads = "".join(f'<th scope="col"{_numeric(name)}>{name}</th>' for name in columns)
+    bodies = []
+    for host, members in hosts.items():
+        speed = sum(worker.steps_per_s for worker in members)
+        count = f"{len(members)} worker{'s' * (len(members) > 1)}"
+        title = f"<b>{escape(host)}</b><span>{count}, {speed:,.0f} env steps per second</span>"
+        rows = "".join(_worker(worker, seen.status) for worker in members)
+        bodies.append(
+            f'<tbody><tr class="line"><th scope="rowgroup" colspan="{len(columns)}">{title}</th></tr>{rows}</tbody>'
+        )
+    here, wanted = len(seen.status.workers) + seen.status.workers_left_out, seen.status.workers_wanted
+    about = f"{here} here; {wanted} can have a lane each." if wanted else f"{here} here."
+    table = f'<table class="runs workers"><thead><tr>{heads}</tr></thead>{"".join(bodies)}</table>'
+    return _identified("workers", section("Workers", about, f'<div class="scroll">{table}</div>'))
+
+
+def _numeric(column: str) -> str:
+    return ' class="number"' if column in ("Steps/s", "Heard", "Memory") else ""
+
+
+def _worker(worker: WorkerStatus, status: Status) -> str:
+    behind = status.version - worker.version
+    strikes = f' <span class="bad">{worker.strikes} bad messages</span>' if worker.strikes else ""
+    name = f'<th scope="row">{escape(worker.worker)}{strikes}</th>'
+    slow = worker.doing_s >= 10 and worker.doing != "waiting"
+    doing = f"<td{' class=bad' * slow}>{escape(in_words(worker.doing, worker.doing_s))}</td>"
+    lanes = ", ".join(map(str, worker.lanes)) or ("spare" if worker.state == "active" else worker.state)
+    weights = "none yet" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind"
+    numbers = (
+        f"{worker.steps_per_s:,.0f}",
+        f"{worker.silent_s:.0f} s ago",
+        f"{worker.resident_bytes / MIB:,.0f} MB" if worker.resident_bytes else "–",
+    )
+    speed, heard, memory = (f'<td class="number">{text}</td>' for text in numbers)
+    return f"<tr>{name}{doing}<td>{escape(lanes)}</td>{speed}<td>{weights}</td>{heard}{memory}</tr>"
+
+
+def who_waits(seen: Seen) -> str:
+    """A row for the learner and for each lane: what each did in the last minutes."""
+    if not seen.samples:
+        return ""
+    end_s = seen.samples[-1].at_s
+    samples = [each for each in seen.samples if end_s - each.at_s <= SHOWN_S]
+    lanes = sorted({lane for each in samples for lane in each.lanes})
+    rows = {"learner": _segments(samples, [each.learner for each in samples])}
+    rows |= {f"lane {lane}": _segments(samples, [each.lanes.get(lane, "") for each in samples]) for lane in lanes}
+    kinds = [kind for kind in COLORS if any(kind in (each.learner, *each.lanes.values()) for each in samples)]
+    legend = "".join(f'<li><i class="{COLORS[kind]}"></i>{kind}</li>' for kind in kinds)
+    bars = "".join(f'<span class="who">{name}</span>{bar(segments)}<span></span>' for name, segments in rows.items())
+    about = f"The last {SHOWN_S / 60:.0f} minutes, looked at once a second; now is at the right."
+    content = f'<div class="stages lanes"><ul class="legend">{legend}</ul><div class="rows">{bars}</div></div>'
+    return _identified("lanes", section("Who waits for whom", about, content))
+
+
+def _segments(samples: Sequence[Sample], kinds: Sequence[str]) -> list[Segment]:
+    """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
+    end_s, found = samples[-1].at_s, list[Segment]()
+    for i, (at_s, kind) in enumerate(zip((each.at_s for each in samples), kinds, strict=True)):
+        until_s = min(samples[i + 1].at_s if i + 1 < len(samples) else end_s + 1.0, at_s + 2.0)
+        begin, share = 1 - (end_s + 1.0 - at_s) / (SHOWN_S + 1.0), (until_s - at_s) / (SHOWN_S + 1.0)
+        if kind not in COLORS:
+            continue
+        if found and found[-1].tooltip == kind and math.isclose(found[-1].begin + found[-1].share, begin, abs_tol=1e-6):
+            found[-1] = found[-1]._replace(share=found[-1].share + share)
+        else:
+            found.append(Segment(begin, share, COLORS[kind], kind))
+    return found
+
+
+def history(rows: Sequence[Mapping[str, Any]]) -> str:
+    """When something was lost or dropped, the newest first."""
+    found, before = list[str](), dict[str, float]()
+    for row in rows:
+        counts = {name: row.get(f"ledger/{name}") or 0 for name in DROPS}
+        lost = (
+            [
+                f"{counts[name] - before[name]:,.0f} {what}"
+                for name, what in DROPS.items()
+                if counts[name] > before.get(name, 0)
+            ]
+            if before
+            else []
+        )
+        lost = lost or (
+            [f"{counts[name]:,.0f} {what}" for name, what in DROPS.items() if counts[name]] if not before else []
+        )
+        if lost:
+            when = f"after {duration(row.get('time/time_elapsed') or 0)}, at {row[ENV_STEPS_KEY]:,} env steps"
+            found.append(f"<li>{escape(', '.join(lost))} <small>{escape(when)}</small></li>")
+        before = counts
+    more = f"<p>And {len(found) - MOST_HISTORY} earlier ones.</p>" if len(found) > MOST_HISTORY else ""
+    items = "".join(reversed(found[-MOST_HISTORY:]))
+    about = "What was lost was collected again; no update used it." if found else "Nothing was lost or dropped."
+    return _identified(
+        "history", section("What went wrong", about, f"<div><ol class=history>{items}</ol>{more}</div>" if found else "")
+    )
+
+
+def logs(newest: Sequence[tuple[str, str]]) -> str:
+    """The last lines of the logs of local workers."""
+    blocks = "".join(f"<details><summary>{escape(name)}</summary>{_typed(text)}</details>" for name, text in newest)
+    return (
+        _identified("logs", section("Logs of the workers", "The last lines of each.", f"<div>{blocks}</div>"))
+        if blocks
+        else ""
+    )
+
+
+def join(line: RunLine) -> str:
+    """The command by which one more worker joins from another machine."""
+    if line.owner is None:
+        return ""
+    if not line.owner.address.startswith("tcp://"):
+        about = "Only its own machine reaches this learner. With --bind tcp://0.0.0.0:5555, workers of others can join."
+        return _identified("join", section("One more worker", about, ""))
+    token = " --token default.token" if line.owner.keys else " --insecure"
+    command = f"millrace worker {line.owner.address}{token}"
+    about = "Type this on another machine."
+    if line.owner.keys:
+        about += f" It needs a join token from {line.owner.keys} of {line.owner.host}."
+    return _identified("join", section("One more worker", about, f"<div>{_typed(command)}</div>"))
+
+
+def _typed(text: str) -> str:
+    return f'<pre class="log" tabindex="0">{escape(text)}</pre>'
+
+
+def _identified(name: str, html: str) -> str:
+    return html.replace("<section>", f'<section id="{name}">', 1)

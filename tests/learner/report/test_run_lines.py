@@ -1,0 +1,87 @@
+"""A line about a run: its state follows from what is in its folder, whatever that is."""
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from learner.report.run_lines import find_runs, headline, in_sentences, read_line
+from learner.run_folder.lease import Listens, decoded
+from learner.run_folder.metrics_log import METRICS_FILE
+from learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
+from protocol.errors import UsageError
+from tests.learner.report.test_page import a_run
+
+GONE = 2**22 + 1  # no process has so high a number
+
+
+def test_a_finished_run_says_why_it_ended(tmp_path: Path) -> None:
+    line = read_line(a_run(tmp_path), time.time())
+    assert line.state == "finished"
+    assert headline(line) == "Finished: all steps done."
+    assert "123,456 of 100,000 env steps" in in_sentences(line)
+    assert "greedy return -1233.6 ± 7.5" in in_sentences(line)
+
+
+def test_a_run_that_failed_says_why_and_how_to_continue(tmp_path: Path) -> None:
+    line = read_line(a_run(tmp_path, failure="no worker came"), time.time())
+    assert line.state == "interrupted"
+    assert headline(line).startswith("Interrupted: no worker came; continue it with: millrace train --resume ")
+
+
+def test_a_run_without_a_process_and_without_results_is_dead(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    line = read_line(run, time.time())
+    assert line.state == "dead"
+    assert (line.env_steps, line.updates, line.return_mean) == (2000, 20, 101.0)
+    (run / METRICS_FILE).unlink()
+    assert (read_line(run, time.time()).env_steps, line.left_s) == (0, None)
+
+
+def test_a_run_trains_as_long_as_its_lock_is_held(tmp_path: Path) -> None:
+    run = a_run(tmp_path)  # its summary is from before a resume
+    with RunLock(run) as lock:
+        line = read_line(run, time.time())
+        assert line.state == "training"
+        assert line.summary is None
+        lock.announce(Listens("tcp://box:5555", "tcp://127.0.0.1:5555"))
+        owner = decoded((run / LOCK_FILE).read_bytes())
+        assert owner is not None
+    path = run / LOCK_FILE
+    path.write_bytes(replace(owner, pid=GONE).encoded())  # over tcp its process may be in a container
+    now = path.stat().st_mtime
+    assert read_line(run, now + PACE.dead_after - 1).state == "training"
+    assert read_line(run, now + PACE.dead_after + 1).state == "finished"
+    path.write_bytes(replace(owner, pid=GONE, address="ipc://here").encoded())
+    assert read_line(run, now).state == "finished"
+
+
+def test_runs_are_found_in_folders_and_the_newest_comes_first(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path / "more", seed=seed) for seed in (1, 2)]
+    older = runs[0].rename(runs[0].with_name("CartPole-v1-ppo-s1-20200101-000000"))
+    (tmp_path / "more" / "notes").mkdir()
+    (tmp_path / "more" / "a-file").touch()
+    assert find_runs([older, tmp_path / "more"]) == [runs[1], older]
+    assert read_line(older, 0.0).started == "2020-01-01 00:00"
+    with pytest.raises(UsageError, match=r"no-such.*expected a run folder, or a folder of runs"):
+        find_runs([tmp_path / "no-such"])
+
+
+def test_a_folder_that_cannot_be_read_is_a_line_too(tmp_path: Path) -> None:
+    run = a_run(tmp_path)
+    (run / "run.json").unlink()
+    os.mkfifo(run / "run.json")
+    assert find_runs([tmp_path]) == [run]
+    line = read_line(run, time.time())
+    assert line.state == "unreadable"
+    assert "got a FIFO" in headline(line)
+
+
+def test_nothing_in_a_folder_can_control_a_terminal(tmp_path: Path) -> None:
+    run = a_run(tmp_path, failure="\x1b[2J\x1b[31mred\nsecond line")
+    named = run.rename(tmp_path / "evil\x1b[2J\n")
+    line = read_line(named, time.time())
+    for text in (line.name, headline(line), *in_sentences(line).split("\n")):
+        assert text.isprintable()

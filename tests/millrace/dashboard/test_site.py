@@ -1,0 +1,273 @@
+"""The pages: what they say of runs, and that nothing in a run folder or of a learner becomes part of their markup."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from learner.metric_names import METRICS
+from learner.run_folder.metrics_log import METRICS_FILE
+from learner.run_folder.run_lock import RunLock
+from millrace.dashboard import run_page, site
+from millrace.dashboard.http import PageAnswer, parsed
+from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
+from millrace.dashboard.live import Sample, Seen, sample
+from millrace.dashboard.run_page import Choice, label, smoothed
+from millrace.dashboard.site import Site
+from protocol.messages import Status, WorkerStatus
+from tests.learner.report.test_page import Reader, a_run
+
+HOSTILE = "</option></svg></title>\"'><script>alert(1)</script><img src=x onerror=alert(1)>"
+
+
+class Pages:
+    """The pages over these folders, without sockets."""
+
+    def __init__(self, *folders: Path, seen: Seen | None = None) -> None:
+        self.looked: list[Path] = []
+        self._seen, self.now = seen or Seen(), os.stat(folders[0]).st_mtime
+        self._site = Site(KnownRuns(folders, lambda: self.now), self._look)
+
+    def _look(self, run: Path) -> Seen:
+        self.looked.append(run)
+        return self._seen
+
+    def answer(self, path: str) -> PageAnswer:
+        request = parsed(f"GET /token/{path} HTTP/1.1".encode())
+        assert request is not None
+        return self._site.answer(request)
+
+    def text(self, path: str = "") -> str:
+        answer = self.answer(path)
+        assert answer.status == 200
+        return answer.body.decode()
+
+    def said(self, path: str = "") -> str:
+        return Safe(self.text(path)).text
+
+
+class Safe(Reader):
+    """A page with no markup but ours: no script in it, no style, no handler, no address elsewhere."""
+
+    VOID = Reader.VOID | {"link", "input", "img"}
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        assert self.tags.count("script") <= 1
+        for name, value in self.attributes:
+            assert not name.startswith("on"), value
+            assert name != "style", value
+            if name in ("src", "href", "action"):
+                assert value.startswith(("/token/", "data:,")), value
+
+
+def worker(
+    name: str = "w0", host: str = "box", lanes: tuple[int, ...] = (0,), doing: str = "stepping", **more: object
+) -> WorkerStatus:
+    known = {"pid": 1, "state": "active", "tickets": 1, "steps": 5, "steps_per_s": 7.0, "version": 3, "silent_s": 0.1,
+             "resident_bytes": 2**20, "strikes": 0, "doing_s": 1.0} | more  # fmt: skip
+    return WorkerStatus(worker=name, host=host, lanes=lanes, doing=doing, **known)  # type: ignore[arg-type]
+
+
+def status(*workers: WorkerStatus, waiting: str = "", phase: str = "gathering", wanted: int = 2) -> Status:
+    return Status("CartPole-v1", workers, wanted, version=3, waiting=waiting, phase=phase)
+
+
+def test_all_runs_are_listed_the_newest_first(tmp_path: Path) -> None:
+    a_run(tmp_path).rename(tmp_path / "CartPole-v1-ppo-s1-20200101-000000")
+    a_run(tmp_path, "Pendulum-v1", finished=False)
+    said = Pages(tmp_path).said()
+    assert "2 runs, 0 training" in said
+    assert (
+        said.index("Pendulum-v1, PPO, seed 1")
+        < said.index("dead")
+        < said.index("CartPole-v1, PPO, seed 1")
+        < said.index("finished")
+    )
+    (tmp_path / "empty").mkdir()
+    assert "No run is here yet" in Pages(tmp_path / "empty").said()
+
+
+def test_a_run_that_begins_later_appears(tmp_path: Path) -> None:
+    pages = Pages(tmp_path, tmp_path / "not-there-yet")
+    assert "No run is here yet" in pages.said()
+    a_run(tmp_path / "not-there-yet")
+    assert "1 run, 0 training" in pages.said()
+
+
+def test_a_finished_run_shows_its_last_state_and_no_learner_is_asked(tmp_path: Path) -> None:
+    run, pages = a_run(tmp_path), Pages(tmp_path)
+    said = pages.said(f"run/{key_of(run)}")
+    assert "Finished: all steps done." in said
+    assert "Final policy, 100 greedy episodes −1,233.6 ± 7.5" in said
+    assert "What went wrong" in said
+    assert pages.looked == []
+
+
+def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    waits = "waiting 12 s for lane 1 (worker w1 on far: in reset for 11 s)"
+    two = status(worker(), worker("w1", "far", (1,), "resetting", doing_s=11.0), waiting=waits)
+    with RunLock(run):
+        pages = Pages(tmp_path, seen=Seen(two, (sample(two, 5.0),)))
+        said = pages.said(f"run/{key_of(run)}")
+        silent = Pages(tmp_path, seen=Seen(problem="its learner does not answer")).said(f"run/{key_of(run)}")
+    assert f"The learner is {waits}." in said
+    assert said.index(waits) < said.index("Env steps")
+    assert "box 1 worker, 7 env steps per second w0 in step" in said
+    assert "far 1 worker, 7 env steps per second w1 in reset for 11 s" in said
+    assert "waiting learner waiting lane 0 collecting lane 1 resetting" in said
+    assert pages.looked == [run]
+    assert "Who waits for whom is not known: its learner does not answer." in silent
+
+
+def test_where_nobody_waits_long_the_slowest_part_is_named(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    with RunLock(run):
+        said = Pages(tmp_path, seen=Seen(status(worker()))).said(f"run/{key_of(run)}")
+    slowest = "Updates are the slowest part: the learner updates for 75% of the time, and workers wait for 50%."
+    assert f"{slowest} 6 rollouts were lost and dealt again." in said
+
+
+def test_any_metric_can_be_chosen(tmp_path: Path) -> None:
+    run, pages = a_run(tmp_path), Pages(tmp_path)
+    page = f"run/{key_of(run)}"
+    assert 'aria-label="return over env steps"' in pages.text(page)
+    assert 'class="dots' in pages.text(page)
+    assert 'aria-label="return over minutes of training"' in pages.text(f"{page}?over=time&smooth=10")
+    assert 'aria-label="time: learner update over env steps"' in pages.text(f"{page}?metric=stage/learner_update")
+    for odd in ("metric=no/such", "smooth=-1", "smooth=%C2%B2", "smooth=99999999999", "over="):
+        assert 'aria-label="return over env steps"' in pages.text(f"{page}?{odd}")
+
+
+def test_a_moving_mean_is_of_the_rows_so_far() -> None:
+    assert smoothed(np.array([1.0, 3.0, 5.0, 7.0]), 2) == pytest.approx([1.0, 2.0, 4.0, 6.0])
+
+
+def test_every_metric_has_a_name_of_words() -> None:
+    for name in (name for group in METRICS.values() for name in group):
+        assert label(name)
+        assert not {"/", "_"} & {*label(name)}, name
+
+
+def test_what_was_lost_is_told_with_its_time(tmp_path: Path) -> None:
+    rows = [
+        {"time/total_timesteps": 10 * i, "time/time_elapsed": float(i), "ledger/lost": lost}
+        for i, lost in enumerate((0, 0, 3, 3, 4))
+    ]
+    said = Safe(run_page.history(rows)).text
+    assert "1 tickets of workers that were lost after 4.0 s, at 40 env steps 3 tickets" in said
+    assert "after 2.0 s, at 20 env steps" in said
+    assert "Nothing was lost" in run_page.history(rows[:2])
+
+
+def test_several_runs_are_compared_as_a_report_does(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, seed=seed) for seed in (1, 2)]
+    pages = Pages(tmp_path)
+    said = pages.said("compare?" + "&".join(f"run={key_of(run)}" for run in runs))
+    assert "PPO, mean of 2 seeds" in said
+    assert "Choose runs in the list" in pages.said("compare?run=no-such")
+
+
+def test_a_row_of_the_picture_is_what_a_lane_did(tmp_path: Path) -> None:
+    seen = status(worker(lanes=(0, 2)), worker("w1", lanes=(1,), doing="waiting"), phase="learning", wanted=4)
+    assert sample(seen, 7.0) == Sample(7.0, "updating", {0: "collecting", 1: "waiting", 2: "collecting", 3: "no worker"})
+    without_supervisor = status(worker(doing=""), worker("w1", lanes=(1,), doing="", tickets=0))
+    assert sample(without_supervisor, 0.0).lanes == {0: "collecting", 1: "waiting"}
+    samples = tuple(Sample(float(at_s), "waiting", {0: "collecting" if at_s < 5 else "resetting"}) for at_s in range(10))
+    picture = run_page.who_waits(Seen(samples=samples))
+    assert picture.count("<title>collecting</title>") == picture.count("<title>resetting</title>") == 1
+    far_apart = (Sample(0.0, "waiting", {}), Sample(100.0, "waiting", {}))
+    assert run_page.who_waits(Seen(samples=far_apart)).count("<title>waiting</title>") == 2, "nobody looked between them"
+
+
+def test_nothing_in_a_run_folder_becomes_markup(tmp_path: Path) -> None:
+    run = a_run(tmp_path, env_kwargs={HOSTILE: HOSTILE}, failure=HOSTILE)
+    with (run / METRICS_FILE).open("a") as file:
+        row = {"time/total_timesteps": 9_000, f"custom/{HOSTILE}": 1.0, HOSTILE: 1e308, "ledger/lost": 10**15}
+        file.write(json.dumps(row) + "\n")
+    (run / "workers").mkdir()
+    (run / "workers" / f"{HOSTILE.replace('/', '')}.log").write_bytes(HOSTILE.encode() + b"\x00\xff\x1b[2J\n")
+    (run / "videos").mkdir()
+    (run / "videos" / f"{HOSTILE.replace('/', '')}.mp4").write_bytes(b"film")
+    run = run.rename(tmp_path / HOSTILE.replace("/", ""))
+    pages = Pages(tmp_path)
+    for path in ("", f"run/{key_of(run)}", f"run/{key_of(run)}?metric=custom/%3C/option%3E", f"compare?run={key_of(run)}"):
+        assert "alert(1)" in pages.said(path)
+    Safe(pages.text(f"run/{key_of(run)}?metric={HOSTILE[:9]}&over=%22%3E"))
+
+
+def test_nothing_of_a_learner_becomes_markup(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    hostile = status(
+        worker(HOSTILE, HOSTILE, (0,), HOSTILE, state=HOSTILE),
+        worker("w1", lanes=(), state=HOSTILE),
+        waiting=HOSTILE,
+        phase=HOSTILE,
+    )
+    with RunLock(run):
+        seen = Seen(hostile, (sample(hostile, 1.0),))
+        assert "alert(1)" in Pages(tmp_path, seen=seen).said(f"run/{key_of(run)}")
+        assert "alert(1)" in Pages(tmp_path, seen=Seen(problem=HOSTILE)).said(f"run/{key_of(run)}")
+
+
+def test_only_films_and_pictures_of_a_run_are_served(tmp_path: Path) -> None:
+    run = a_run(tmp_path)
+    (tmp_path / "secret.mp4").write_bytes(b"secret")
+    (run / "videos").mkdir()
+    (run / "videos" / "a.mp4").write_bytes(b"film")
+    (run / "videos" / "link.mp4").symlink_to(tmp_path / "secret.mp4")
+    os.mkfifo(run / "videos" / "fifo.mp4")
+    pages, of_run = Pages(tmp_path), f"file/{key_of(run)}"
+    assert pages.answer(f"{of_run}/videos/a.mp4") == PageAnswer(b"film", "video/mp4")
+    assert f"/token/{of_run}/videos/a.mp4" in pages.text(f"run/{key_of(run)}")
+    for path in (
+        "videos/link.mp4",
+        "videos/fifo.mp4",
+        "config.toml",
+        "../secret.mp4",
+        "videos/..%2F..%2F..%2Fsecret.mp4",
+        "/etc/passwd",
+        "",
+        "%00",
+    ):
+        assert pages.answer(f"{of_run}/{path}").status == 404, path
+    for path in ("no-such", "run/no-such", "run/..", "run", "style.css/x", "file/no-such/videos/a.mp4"):
+        assert pages.answer(path).status == 404, path
+
+
+def test_files_that_are_no_files_are_left_out(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    (run / "workers").mkdir()
+    os.mkfifo(run / "workers" / "w0.log")
+    (run / "workers" / "w1.log").symlink_to("/etc/passwd")
+    huge = run / "workers" / "w2.log"
+    huge.touch()
+    os.truncate(huge, 1 << 40)
+    with huge.open("ab") as file:
+        file.write(b"\nthe end\n")
+    assert newest_logs(run)[0][1].endswith("the end")
+    assert len(newest_logs(run)) == 1
+    (run / METRICS_FILE).unlink()
+    os.mkfifo(run / METRICS_FILE)
+    assert "Dead" in Pages(tmp_path).said(f"run/{key_of(run)}")
+
+
+def test_the_page_grows_with_its_run(tmp_path: Path) -> None:
+    run, pages = a_run(tmp_path, finished=False), Pages(tmp_path)
+    before = pages.text(f"run/{key_of(run)}?part=main")
+    assert before.startswith("<main>")
+    assert pages.text(f"run/{key_of(run)}?part=main") == before
+    with (run / METRICS_FILE).open("a") as file:
+        file.write('{"time/total_timesteps": 2100, "rollout/ep_rew_mean": 500.0}\n')
+    after = pages.said(f"run/{key_of(run)}?part=main")
+    assert "2,100 of" in after
+    assert "500.0" in after
+
+
+def test_a_choice_of_the_reader_is_bounded() -> None:
+    assert Choice.of({"smooth": ["100000"]}).smooth == 1
+    assert Choice.of({"smooth": ["999"]}).smooth == run_page.MOST_SMOOTHED
+    assert len(site.MEDIA) == 2
