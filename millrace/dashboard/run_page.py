@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from learner.members.held_up import in_words
-from learner.metric_names import METRICS, Meaning
+from learner.metric_names import METRICS, NONE, Meaning
 from learner.report.charts import Segment, Series, bar, chart
 from learner.report.html_parts import return_text, section
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
@@ -26,7 +26,7 @@ from protocol.arrays import Doubles
 from protocol.messages import Status, WorkerStatus
 
 WIDE, NARROW = (1080, 360), (420, 300)
-SHOWN_S = 180.0  # of who waits for whom
+SHOWN_S, LEAST_SHOWN_S = 180.0, 30.0  # of who waits for whom
 COLORS = {
     "collecting": "b1",
     "updating": "b0",
@@ -158,7 +158,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
         else ""
     )
     meaning = MEANINGS.get(metric)
-    about = f"{meaning.text} Unit: {meaning.unit}." if meaning else f"Logged as {metric}."
+    about = meaning.text + f" Unit: {meaning.unit}." * (meaning.unit != NONE) if meaning else f"Logged as {metric}."
     form = _form(names, metric, choice)
     figure = f'<div class="panels"><figure>{legend}{drawn}</figure></div>'
     return _identified("curve", section(label(metric).capitalize(), about, form + figure))
@@ -278,17 +278,18 @@ def who_waits(seen: Seen) -> str:
     kinds = [kind for kind in COLORS if any(kind in (each.learner, *each.lanes.values()) for each in samples)]
     legend = "".join(f'<li><i class="{COLORS[kind]}"></i>{kind}</li>' for kind in kinds)
     bars = "".join(f'<span class="who">{name}</span>{bar(segments)}<span></span>' for name, segments in rows.items())
-    about = f"The last {SHOWN_S / 60:.0f} minutes, looked at once a second; now is at the right."
+    about = "Looked at once a second since you opened this page, for the last three minutes at most. Now is at the right."
     content = f'<div class="stages lanes"><ul class="legend">{legend}</ul><div class="rows">{bars}</div></div>'
     return _identified("lanes", section("Who waits for whom", about, content))
 
 
 def _segments(samples: Sequence[Sample], kinds: Sequence[str]) -> list[Segment]:
     """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
-    end_s, found = samples[-1].at_s, list[Segment]()
+    end_s, found = samples[-1].at_s + 1.0, list[Segment]()
+    span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)
     for i, (at_s, kind) in enumerate(zip((each.at_s for each in samples), kinds, strict=True)):
-        until_s = min(samples[i + 1].at_s if i + 1 < len(samples) else end_s + 1.0, at_s + 2.0)
-        begin, share = 1 - (end_s + 1.0 - at_s) / (SHOWN_S + 1.0), (until_s - at_s) / (SHOWN_S + 1.0)
+        until_s = min(samples[i + 1].at_s if i + 1 < len(samples) else end_s, at_s + 2.0)
+        begin, share = 1 - (end_s - at_s) / span_s, (until_s - at_s) / span_s
         if kind not in COLORS:
             continue
         if found and found[-1].tooltip == kind and math.isclose(found[-1].begin + found[-1].share, begin, abs_tol=1e-6):
