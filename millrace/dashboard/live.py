@@ -50,7 +50,7 @@ WORKER = {
 """What a lane does while its worker does this"""
 
 
-class Sample(NamedTuple):
+class LaneSample(NamedTuple):
     """What everybody did at one moment."""
 
     at_s: float
@@ -63,7 +63,7 @@ class Seen(NamedTuple):
 
     status: Status | None = None
     """its newest answer"""
-    samples: tuple[Sample, ...] = ()
+    samples: tuple[LaneSample, ...] = ()
     problem: str = ""
     """why there is no answer"""
 
@@ -78,14 +78,14 @@ class _Watched:
     status: Status | None = None
     answered_s: float = 0.0
     problem: str = ""
-    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=SAMPLES))
+    samples: deque[LaneSample] = field(default_factory=lambda: deque(maxlen=SAMPLES))
 
 
-def sample(status: Status, now: float) -> Sample:
+def sample(status: Status, now: float) -> LaneSample:
     """What an answer says about the learner and each lane."""
     lanes = {lane: _doing(worker) for worker in status.workers for lane in worker.lanes}
     shown = {lane: lanes.get(lane, "no worker") for lane in range(min(status.workers_wanted, MOST_LANES))}
-    return Sample(now, LEARNER.get(status.phase, ""), shown)
+    return LaneSample(now, LEARNER.get(status.phase, ""), shown)
 
 
 def _doing(worker: WorkerStatus) -> str:

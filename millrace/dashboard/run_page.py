@@ -21,7 +21,7 @@ from learner.report.run_lines import RunLine, algorithm_label, duration, headlin
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
 from millrace.cli.status import DROPS
-from millrace.dashboard.live import Sample, Seen
+from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
 from protocol.messages import Status, WorkerStatus
 
@@ -283,7 +283,7 @@ def who_waits(seen: Seen) -> str:
     return _identified("lanes", section("Who waits for whom", about, content))
 
 
-def _segments(samples: Sequence[Sample], kinds: Sequence[str]) -> list[Segment]:
+def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
     """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
     end_s, found = samples[-1].at_s + 1.0, list[Segment]()
     span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)

@@ -13,7 +13,7 @@ from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
 from millrace.dashboard.http import PageAnswer, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
-from millrace.dashboard.live import Sample, Seen, sample
+from millrace.dashboard.live import LaneSample, Seen, sample
 from millrace.dashboard.run_page import Choice, label, smoothed
 from millrace.dashboard.site import Site
 from protocol.messages import Status, WorkerStatus
@@ -173,13 +173,13 @@ def test_several_runs_are_compared_as_a_report_does(tmp_path: Path) -> None:
 
 def test_a_row_of_the_picture_is_what_a_lane_did(tmp_path: Path) -> None:
     seen = status(worker(lanes=(0, 2)), worker("w1", lanes=(1,), doing="waiting"), phase="learning", wanted=4)
-    assert sample(seen, 7.0) == Sample(7.0, "updating", {0: "collecting", 1: "waiting", 2: "collecting", 3: "no worker"})
+    assert sample(seen, 7.0) == LaneSample(7.0, "updating", {0: "collecting", 1: "waiting", 2: "collecting", 3: "no worker"})
     without_supervisor = status(worker(doing=""), worker("w1", lanes=(1,), doing="", tickets=0))
     assert sample(without_supervisor, 0.0).lanes == {0: "collecting", 1: "waiting"}
-    samples = tuple(Sample(float(at_s), "waiting", {0: "collecting" if at_s < 5 else "resetting"}) for at_s in range(10))
+    samples = tuple(LaneSample(float(at_s), "waiting", {0: "collecting" if at_s < 5 else "resetting"}) for at_s in range(10))
     picture = run_page.who_waits(Seen(samples=samples))
     assert picture.count("<title>collecting</title>") == picture.count("<title>resetting</title>") == 1
-    far_apart = (Sample(0.0, "waiting", {}), Sample(100.0, "waiting", {}))
+    far_apart = (LaneSample(0.0, "waiting", {}), LaneSample(100.0, "waiting", {}))
     assert run_page.who_waits(Seen(samples=far_apart)).count("<title>waiting</title>") == 2, "nobody looked between them"
 
 
