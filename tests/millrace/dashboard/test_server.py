@@ -82,7 +82,8 @@ def test_only_who_knows_the_token_gets_a_page() -> None:
         assert len(urlsplit(another).path) > 32
 
 
-def test_idle_clients_do_no_harm() -> None:
+def test_idle_clients_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dashboard_server, "HEAD_WITHIN_S", 1_000.0)
     with served() as address:
         idle = [connect(address) for _ in range(MOST_CONNECTIONS + 40)]
         for client in idle[::2]:
