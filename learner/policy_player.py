@@ -106,7 +106,8 @@ class PolicyPlayer:
         if self._hub is None:
             self._hub = self._published()
         show = self._watch
-        return self._hub.evaluate(plan, lambda played, steps: show(plan.how_far(played, steps, bound, before)), on_rows)
+        self._hub.begin_evaluation(plan, on_rows)
+        return self._hub.end_evaluation(lambda played, steps: show(plan.how_far(played, steps, bound, before)))
 
     def leave(self, reason: str) -> None:
         """Ask the workers to leave."""

@@ -54,14 +54,10 @@ def train(
         attributes = audience.env_attributes()
         hub.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
 
-    def tell(evaluated: Row | None) -> bool:
-        """Tell the metrics of an evaluation, if one has ended."""
-        if evaluated is not None:
-            audience.evaluated(evaluated)
-        return evaluated is not None
-
-    def evaluate() -> None:
-        if tell(evaluations.evaluate_when_due(audience.show_now)):
+    def tell(metrics: Row | None) -> None:
+        """Tell the metrics of an evaluation, if one has ended, and save its result."""
+        if metrics is not None:
+            audience.evaluated(metrics)
             files.save()
 
     files.save()
@@ -71,7 +67,7 @@ def train(
         tell(evaluations.begin_again(audience.show_now))
         publish(files.weights())
         if tally.evaluation_is_due():  # the run was interrupted before it
-            evaluate()
+            tell(evaluations.evaluate_when_due(audience.show_now))
         while (reason := tally.stop_reason()) is None:
             arrived = hub.gather(audience.show_now)
             began_s = time.monotonic()
@@ -91,7 +87,7 @@ def train(
                 audience.updated(metrics)
                 if tally.evaluation_is_due():
                     files.save()  # an evaluation may take long
-                    evaluate()
+                    tell(evaluations.evaluate_when_due(audience.show_now))
                 else:
                     files.save_if_due()
         files.save()

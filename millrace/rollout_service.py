@@ -285,7 +285,8 @@ class RolloutService:
             check_at_least(f"evaluate: {name}", value, least)
         plan = EvaluationPlan.of(episodes, seed, EVALUATION_COPIES, max_steps)
         with self._lock, self._interrupts:
-            return evaluation_of(self._hub.evaluate(plan, lambda played, env_steps: None), self.run.facts)
+            self._hub.begin_evaluation(plan)
+            return evaluation_of(self._hub.end_evaluation(lambda played, env_steps: None), self.run.facts)
 
     # ---------------------------------------------------------------- saving, and what else there is to know
 

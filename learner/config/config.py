@@ -104,8 +104,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # -------------------------------------------------------------------------------------------------------------- files
 
     checkpoint_every_s: Free[NotNegative] = 60.0
-    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation for which
-    training waits. 0: after each update.
+    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation. 0: after
+    each update.
     """
     keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""

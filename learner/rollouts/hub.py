@@ -224,13 +224,6 @@ class Hub:
         self.weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
         return played
 
-    def evaluate(
-        self, plan: EvaluationPlan, watch: Callable[[int, int], None], on_rows: OnRows | None = None
-    ) -> list[PlayedEpisode]:
-        """`begin_evaluation` and `end_evaluation`: all workers play, and meanwhile none collects."""
-        self.begin_evaluation(plan, on_rows)
-        return self.end_evaluation(watch)
-
     def pulse(self) -> None:
         """Answer the workers, then remove those that have been silent for too long, unless that was just done.
 
@@ -303,7 +296,7 @@ class Hub:
         while (result := done()) is None:
             self._turn(POLL_S)
             now = self._clock()
-            match self._stall_watch.check(now, progress(), evaluating=self._evaluating):
+            match self._stall_watch.check(now, progress(), evaluating=self._time.evaluating):
                 case Standstill(refuse=()):
                     raise Stalled(f"{nothing_came} for {self.settings.stall_timeout_s:.0f} s; {self.waiting(now)}")
                 case Standstill(members, why):
@@ -312,10 +305,6 @@ class Hub:
             watch()
         self._time.turn("learning", self._clock())
         return result
-
-    @property
-    def _evaluating(self) -> bool:
-        return self._time.phase == "evaluating"
 
     def _worker_steps(self) -> int:
         """Env steps of all workers, as of their last heartbeats."""
@@ -329,7 +318,7 @@ class Hub:
         while self._processes.failed:
             self._failures.count(self._processes.failed.pop(0), self._clock())
         self._failures.check()
-        self._server.check_members(self.settings.no_workers_timeout_s, collecting=not self._evaluating)
+        self._server.check_members(self.settings.no_workers_timeout_s, collecting=not self._time.evaluating)
 
     def _listen(self, timeout_s: float, short: bool = False) -> None:
         self._server.listen(timeout_s, short)

@@ -35,6 +35,11 @@ class LearnerTime:
         """seconds of the phases that have ended"""
         self._coordinator, self._no_worker, self._stepping = coordinator, no_worker, stepping
 
+    @property
+    def evaluating(self) -> bool:
+        """Whether the learner waits for an evaluation."""
+        return self.phase == "evaluating"
+
     def turn(self, phase: Phase, now: float) -> None:
         """From now on the learner does this."""
         if self.phase == "gathering":
@@ -56,7 +61,7 @@ class LearnerTime:
     def line(self, now: float) -> str:
         """Who waits for whom; empty if nobody waits long."""
         lasts_s, members, spent_s, text = now - self.since_s, self._coordinator.members, self.until(now), ""
-        if members and self.phase == "evaluating" and (plan := self._coordinator.evaluation.plan) is not None:
+        if members and self.evaluating and (plan := self._coordinator.evaluation.plan) is not None:
             return one_line(f"evaluating{' the best policy' * plan.of_best} for {lasts_s:.0f} s: {self._played(plan, now)}")
         if lasts_s < LONG_S:
             text = self._last

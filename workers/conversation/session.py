@@ -393,7 +393,7 @@ class Session:
     def _welcome(self, message: Welcome, now: float) -> list[WorkerEffect]:
         if message.attempt != self._attempt or (self.state is WorkerState.READY and message.session == self.session):
             return []  # the answer to an earlier Hello, or a repeat
-        self._transition(message)
+        self.state = TABLE[self.state][type(message)]
         self._current = _SessionState()
         self.run, self.session = message.run, message.session
         self._unanswered_s = math.inf
@@ -402,7 +402,7 @@ class Session:
         return [StartSession(message.run)]
 
     def _rejoin(self, event: object, reason: str, now: float) -> list[WorkerEffect]:
-        self._transition(event)
+        self.state = TABLE[self.state][type(event)]
         if self.state is WorkerState.LEFT:
             return [Leave(1, reason)]
         lanes = self._current.lanes()
@@ -410,7 +410,7 @@ class Session:
         return [CloseLanes(lanes), *self.tick(now)]
 
     def _drain(self, event: object, reason: str) -> list[WorkerEffect]:
-        self._transition(event)
+        self.state = TABLE[self.state][type(event)]
         self._reason = reason
         return [Leave(0, reason)] if self.state is WorkerState.LEFT else self._leave_if_drained()
 
@@ -425,8 +425,5 @@ class Session:
         if self.state is WorkerState.LEFT:
             return []
         said = [] if last is None or self.state is WorkerState.JOINING else [SendMessage(last)]
-        self._transition(event)
-        return [*said, Leave(exit_code, reason)]
-
-    def _transition(self, event: object) -> None:
         self.state = TABLE[self.state][type(event)]
+        return [*said, Leave(exit_code, reason)]

@@ -126,7 +126,7 @@ class Marker:
 
         Hub.gather = marked_gather  # type: ignore[assignment,method-assign]
         Hub.publish = marked_publish  # type: ignore[assignment]
-        Hub.evaluate = self.during(Phase.EVALUATING, Hub.evaluate)  # type: ignore[method-assign]
+        Hub.end_evaluation = self.during(Phase.EVALUATING, Hub.end_evaluation)  # type: ignore[method-assign]
         Hub.drain = self.during(Phase.DRAINING, Hub.drain, Phase.LEAVING)  # type: ignore[method-assign]
         checkpoint.save = marked_save  # type: ignore[assignment]
         RunFolder.write_policy = self.during(Phase.CHECKPOINTING, RunFolder.write_policy)  # type: ignore[method-assign]

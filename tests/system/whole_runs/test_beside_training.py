@@ -160,6 +160,12 @@ def test_a_worker_that_only_evaluates_is_of_no_use_for_a_vector_environment(stag
     evaluator, worker = stage.worker(address, "e", "--evaluate"), stage.worker(address, "w")
     with millrace.make_vec("CartPole-v1", 2, workers=None, lanes=1, bind=address, timeout=START_S) as env:
         env.reset(seed=1)
+
+        def steps() -> bool:
+            env.step(env.action_space.sample())  # the learner listens while it steps
+            return not evaluator.alive
+
+        wait_for(steps, START_S, "the end of the evaluator")
         assert evaluator.ends() == 2
     (line,) = evaluator.said().splitlines()
     assert "the workers of this learner only step, and play no evaluations; start this worker without --evaluate" in line
