@@ -163,7 +163,7 @@ def test_a_worker_that_only_evaluates_is_of_no_use_for_a_vector_environment(stag
 
         def steps() -> bool:
             env.step(env.action_space.sample())  # the learner listens while it steps
-            return not evaluator.alive
+            return not evaluator.alive()
 
         wait_for(steps, START_S, "the end of the evaluator")
         assert evaluator.ends() == 2
