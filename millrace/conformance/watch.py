@@ -164,9 +164,9 @@ class WatchedSession:
     # --------------------------------------------------------------------------------------------- what the client says
 
     def late(self, now: float) -> None:
-        """Raise `Broken` if a Heartbeat is overdue. After Drain, the check of draining asks for one instead."""
+        """Raise `Broken` if a Heartbeat is overdue."""
         silent_s = now - self.heard_heartbeat_s
-        if not self._drains and silent_s > HEARTBEATS_LATE * self.run.heartbeat_s + LATE_S:
+        if silent_s > HEARTBEATS_LATE * self.run.heartbeat_s + LATE_S:
             raise Broken(
                 rules.HEARTBEAT,
                 f"a Heartbeat every {self.run.heartbeat_s:g} s (heartbeat_s of this session)",

@@ -71,7 +71,7 @@ MUTANTS = [
     Mutant("any session", "environment", "an order of another session", rules.OTHER_SESSION, "Stepped("),
     Mutant("any session", "collector", "ignores what it cannot read", rules.OTHER_SESSION, "Rollout("),
     Mutant("lists no tickets", "collector", "lists the versions and tickets", rules.HEARTBEAT_TICKETS, "[]"),
-    Mutant("no heartbeat while it drains", "collector", "drains while it collects", rules.HEARTBEAT, "between Drain and"),
+    Mutant("no heartbeat while it drains", "collector", "drains while it collects", rules.HEARTBEAT, "none "),
     Mutant("episodes in another order", "collector", "collects two lanes", rules.EPISODE_ORDER, "["),
     Mutant("one activation", "collector", "acts by relu", rules.LOG_PROB, "-"),
     Mutant("does not normalize", "collector", "acts by relu", rules.NORMALIZED, "-"),

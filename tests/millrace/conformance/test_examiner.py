@@ -171,12 +171,6 @@ def test_a_heartbeat_that_is_missing_breaks_a_rule() -> None:
     assert test.results[0].rule == rules.HEARTBEAT
 
 
-def test_after_drain_none_is_overdue_for_the_check_of_draining_asks_for_one() -> None:
-    watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0)
-    watch.sent(Drain("the run is over"))
-    watch.late(1e6)
-
-
 @pytest.mark.parametrize(
     ("event", "rule"),
     [
