@@ -47,9 +47,7 @@ class RunFiles:
         self.on_saved: Callable[[], None] = lambda: None
         """Called after a checkpoint was written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps)
-        self._saved: tuple[int, int, int, list[float] | None, int] | None = (
-            None  # what `_position` was in the newest checkpoint
-        )
+        self._saved: tuple[object, ...] | None = None  # what `_position` was in the newest checkpoint
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
 
     def weights(self) -> tuple[Floats, Floats]:
@@ -189,7 +187,7 @@ class RunFiles:
         if self._folder.lock is not None:
             self._folder.lock.confirm()
 
-    def _position(self) -> tuple[int, int, int, list[float] | None, int]:
+    def _position(self) -> tuple[object, ...]:
         """What of the state changes when the run goes on: version, evaluations, best policy, set attributes."""
         state = self._state
         return state.version, state.next_evaluation, state.evaluated_version, state.best, self._attributes.changes

@@ -348,15 +348,16 @@ class Membership(Generic[M]):
         if self.draining is not None:
             return [(peer, Drain(one_line(self.draining)))], removed
         members = [member for member in found if member is not None]
-        known = [member.supervisor for member in members if member.supervisor and member.supervisor.peer == peer]
-        supervisor = None if alive.replies is None else (known or [SharingSupervisor(peer)])[0]
+        answer, supervisor = list[Outgoing](), None
+        if alive.replies is not None and members:
+            known = (each.supervisor for each in members if each.supervisor and each.supervisor.peer == peer)
+            supervisor = next(known, None) or SharingSupervisor(peer)
+            supervisor.heard_s, supervisor.received = now, alive.replies
+            supervisor.replies += 1
+            answer.append((peer, HeartbeatReply(self._first_session, supervisor.replies, ())))
         for member in members:
             member.supervisor = supervisor
-        if supervisor is None or alive.replies is None or not members:
-            return [], removed
-        supervisor.heard_s, supervisor.received = now, alive.replies
-        supervisor.replies += 1
-        return [(peer, HeartbeatReply(self._first_session, supervisor.replies, ()))], removed
+        return answer, removed
 
     def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> M | None:
         """Record what a member's process does. Returns the member.

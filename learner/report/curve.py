@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,8 @@ from protocol.arrays import Doubles
 from protocol.errors import UsageError
 
 GRID_POINTS = 400
-LARGEST_DRAWN = 1e300
+DRAWN = -1e300, 1e300
+SECONDS_KEY = "time/time_elapsed"
 
 
 class Curve(NamedTuple):
@@ -44,19 +45,25 @@ class RunRecord(NamedTuple):
     """Whether its workers were started elsewhere: then the setting `workers` means nothing."""
     rows: list[dict[str, Any]]
 
-    def points(self, key: str) -> list[tuple[float, float]]:
-        """Env steps and value of this metric, for each row that has it. Values are cut to ±1e300: axes are longer.
-
-        The env steps of an evaluation are those of the policy that was evaluated.
-        """
-        at = EVALUATED_AT_KEY if key == EVALUATION_KEY else ENV_STEPS_KEY
-        found = ((row.get(at, row[ENV_STEPS_KEY]), row.get(key)) for row in self.rows)
-        return [(steps, min(max(value, -LARGEST_DRAWN), LARGEST_DRAWN)) for steps, value in found if value is not None]
-
     def curve(self) -> Curve | None:
         """The learning curve, or None before the first episode has ended."""
-        points = self.points(RETURN_KEY)
-        return Curve(self.env, self.algo, self.seed, *np.asarray(points, np.float64).T) if points else None
+        found = points(self.rows, RETURN_KEY)
+        return Curve(self.env, self.algo, self.seed, *found.T) if len(found) else None
+
+
+def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:
+    """Env steps, or seconds of training, and value of this metric: [K, 2], for the K rows that have both.
+
+    Numbers are cut to ±1e300: axes are longer. The env steps of an evaluation are those of the policy that was evaluated.
+    """
+
+    def at(row: Mapping[str, Any]) -> Any:
+        if over_time:
+            return row.get(SECONDS_KEY)
+        return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY]) if key == EVALUATION_KEY else row[ENV_STEPS_KEY]
+
+    found = [(at(row), row[key]) for row in rows if row.get(key) is not None]
+    return np.asarray([point for point in found if point[0] is not None], np.float64).reshape(-1, 2).clip(*DRAWN)
 
 
 def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRecord:

@@ -33,10 +33,11 @@ def document(title: str, head: Sequence[str], main: str) -> str:
     )
 
 
-def section(name: str, about: str, content: str) -> str:
-    """A section of the page with a heading. `content` is HTML; `name` and `about` are text."""
+def section(name: str, about: str, content: str, key: str = "") -> str:
+    """A section of the page with a heading. `content` is HTML; `name` and `about` are text; `key` is its id."""
     introduction = f"<p>{escape(about)}</p>" if about else ""
-    return f"<section><h2>{escape(name)}</h2>{introduction}{content}</section>"
+    named = f' id="{key}"' if key else ""
+    return f"<section{named}><h2>{escape(name)}</h2>{introduction}{content}</section>"
 
 
 def color_dot(group: RunGroup) -> str:

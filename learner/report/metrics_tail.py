@@ -1,8 +1,8 @@
 """Reads a metrics.jsonl that may grow: from where it was read last, keeping a bounded number of its rows.
 
 Rule: of a long file, rows at equal distances are kept, every one with an evaluation as long as there are few of these, and
-the newest. The newest row is read again each time, because a run may add to it. A
-file that was replaced, as a resumed run does, is read from its beginning.
+the newest. The newest row is read again each time, because a run may add to it. A file that was replaced, as a resumed run
+does, is read from its beginning.
 """
 
 from __future__ import annotations

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
-from learner.report.curve import Curve, read_run_files
+from learner.report.curve import Curve, points, read_run_files
 from learner.report.run_lines import algorithm_label
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
@@ -160,7 +159,7 @@ def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRu
         algorithm_settings=frozenset(of_algorithm if isinstance(of_algorithm, dict) else ()),
         results=_results(path, files.rows),
         curve=files.curve(),
-        evaluations=np.asarray(files.points(EVALUATION_KEY), np.float64).reshape(-1, 2),
+        evaluations=points(files.rows, EVALUATION_KEY),
         videos=tuple(regular_files(path, "videos/*.mp4")),
         images=tuple(regular_files(path, "observation*.png")),
     )

@@ -174,8 +174,8 @@ class EvaluationDealer:
         """
         plan, out = self._plan, list[Outgoing]()
         assert plan is not None
-        members = [member for member in active if member.hello.evaluates]
-        members += [] if self.beside else [member for member in active if not member.hello.evaluates]
+        players = (member for member in active if member.hello.evaluates or not self.beside)
+        members = sorted(players, key=lambda member: not member.hello.evaluates)
         if self.most_copies is not None:
             members = members[: self._most_workers or max(1, self.most_copies // plan.copies)]
         holds = Counter(member.peer for member in self.held.values())

@@ -1,11 +1,10 @@
 """Judges whether a run stands still, and through which workers. Pure.
 
 Rule: env steps, constructions and resets are progress, as are rollouts. Those of workers that only evaluate do not count
-while rollouts are awaited. While a call of the environment is under way within
-its timeout, the run does not stand still: the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`,
-the workers that hold tickets are refused, and others get the tickets. The run ends only if no worker would remain. A worker
-that holds its tickets, of rollouts or of an evaluation, for longer than all calls of the environment may take together is
-refused, whatever it claims.
+while rollouts are awaited. While a call of the environment is under way within its timeout, the run does not stand still:
+the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused,
+and others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, of rollouts or of
+an evaluation, for longer than all calls of the environment may take together is refused, whatever it claims.
 """
 
 from __future__ import annotations
@@ -59,7 +58,8 @@ class StallWatch:
                 return Standstill(over, "it holds tickets for longer than they can take")
         if now - self._progress_s <= self._stall_timeout_s:
             return None
-        members = [each for each in self._coordinator.members.values() if evaluating or not each.hello.evaluates]
+        coordinator = self._coordinator
+        members = list(coordinator.members.values()) if evaluating else coordinator.membership.collectors()
         if any(self._in_call(member, now) for member in members):
             return None
         self._progress_s = now

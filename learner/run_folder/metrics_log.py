@@ -206,7 +206,7 @@ def decoded_row(line: bytes) -> dict[str, Any] | None:
     try:
         row = msgspec.json.decode(line, type=dict[str, int | float | None])
         msgspec.convert(row[ENV_STEPS_KEY], Natural)
-        if not math.isfinite(max(map(abs, filter(None, row.values())), default=0)):
+        if not all(number is None or math.isfinite(number) for number in row.values()):
             return None
     except (msgspec.MsgspecError, UnicodeError, KeyError, OverflowError, RecursionError):
         return None

@@ -35,7 +35,7 @@ GROUPS = {
     },
     "Look at runs": {
         "list": Command("look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
-        "dashboard": Command("look:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
+        "dashboard": Command("dashboard:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
         "evaluate": Command("play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
         "record": Command("play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
         "plot": Command("look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),

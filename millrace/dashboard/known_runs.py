@@ -19,6 +19,7 @@ from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.regular_files import open_regular, reason, regular_files
 from learner.run_folder.results import SUMMARY_FILE
 from learner.run_folder.run_format import CONFIG_FILE, RUN_FILE
+from learner.run_folder.run_lock import LOCK_FILE
 from protocol.bounds import escaped
 from protocol.errors import UsageError
 
@@ -58,7 +59,7 @@ class KnownRuns:
         """What one line says about it."""
         now, changed = self._clock(), _changes(run)
         before, line = self._lines.get(run, (None, None))
-        if line is None or before != changed or line.owner is not None or (run / "run.lock").exists():
+        if line is None or before != changed or line.owner is not None or (run / LOCK_FILE).exists():
             line = read_line(run, now)
             self._lines[run] = changed, line
         return line

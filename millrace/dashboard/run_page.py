@@ -16,10 +16,11 @@ import numpy as np
 from learner.members.held_up import in_words
 from learner.metric_names import METRICS, NONE, Meaning
 from learner.report.charts import Segment, Series, bar, chart
+from learner.report.curve import points
 from learner.report.html_parts import return_text, section
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
+from learner.run_folder.results import EVALUATION_KEY
 from millrace.cli.status import DROPS
 from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
@@ -138,7 +139,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
     """The curve of one metric, and a form to choose another."""
     names = dict.fromkeys(name for row in rows for name in row if name != ENV_STEPS_KEY)
     if not names:
-        return _identified("curve", section("Curves", "The first update has not been made yet.", ""))
+        return section("Curves", "The first update has not been made yet.", "", "curve")
     metric = choice.metric if choice.metric in names else RETURN_KEY
     x, y = _points(rows, metric, choice.over_time)
     series = [Series("thin" if choice.smooth > 1 else "line", 0, x, y, "")] if x.size else []
@@ -161,7 +162,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
     about = meaning.text + f" Unit: {meaning.unit}." * (meaning.unit != NONE) if meaning else f"Logged as {metric}."
     form = _form(names, metric, choice)
     figure = f'<div class="panels"><figure>{legend}{drawn}</figure></div>'
-    return _identified("curve", section(label(metric).capitalize(), about, form + figure))
+    return section(label(metric).capitalize(), about, form + figure, "curve")
 
 
 def label(metric: str) -> str:
@@ -182,11 +183,8 @@ def smoothed(y: Doubles, rows: int) -> Doubles:
 
 
 def _points(rows: Sequence[Mapping[str, Any]], metric: str, over_time: bool) -> tuple[Doubles, Doubles]:
-    at = "time/time_elapsed" if over_time else EVALUATED_AT_KEY if metric == EVALUATION_KEY else ENV_STEPS_KEY
-    found = [(row.get(at, row[ENV_STEPS_KEY] if not over_time else None), row.get(metric)) for row in rows]
-    points = np.asarray([point for point in found if None not in point], np.float64).reshape(-1, 2)
-    points = points.clip(-1e300, 1e300)
-    return points[:, 0] / (60.0 if over_time else 1.0), points[:, 1]
+    x, y = points(rows, metric, over_time=over_time).T
+    return x / (60.0 if over_time else 1.0), y
 
 
 def _form(names: Mapping[str, None], metric: str, choice: Choice) -> str:
@@ -242,7 +240,7 @@ def workers(seen: Seen) -> str:
     here, wanted = len(seen.status.workers) + seen.status.workers_left_out, seen.status.workers_wanted
     about = f"{here} here; {wanted} can have a lane each." if wanted else f"{here} here."
     table = f'<table class="runs workers"><thead><tr>{heads}</tr></thead>{"".join(bodies)}</table>'
-    return _identified("workers", section("Workers", about, f'<div class="scroll">{table}</div>'))
+    return section("Workers", about, f'<div class="scroll">{table}</div>', "workers")
 
 
 def _numeric(column: str) -> str:
@@ -280,7 +278,7 @@ def who_waits(seen: Seen) -> str:
     bars = "".join(f'<span class="who">{name}</span>{bar(segments)}<span></span>' for name, segments in rows.items())
     about = "Looked at once a second since you opened this page, for the last three minutes at most. Now is at the right."
     content = f'<div class="stages lanes"><ul class="legend">{legend}</ul><div class="rows">{bars}</div></div>'
-    return _identified("lanes", section("Who waits for whom", about, content))
+    return section("Who waits for whom", about, content, "lanes")
 
 
 def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
@@ -304,38 +302,23 @@ def history(rows: Sequence[Mapping[str, Any]]) -> str:
     found, before = list[str](), dict[str, float]()
     for row in rows:
         counts = {name: row.get(f"ledger/{name}") or 0 for name in DROPS}
-        lost = (
-            [
-                f"{counts[name] - before[name]:,.0f} {what}"
-                for name, what in DROPS.items()
-                if counts[name] > before.get(name, 0)
-            ]
-            if before
-            else []
-        )
-        lost = lost or (
-            [f"{counts[name]:,.0f} {what}" for name, what in DROPS.items() if counts[name]] if not before else []
-        )
+        more = {name: counts[name] - before.get(name, 0) for name in DROPS}
+        lost = [f"{more[name]:,.0f} {what}" for name, what in DROPS.items() if more[name] > 0]
         if lost:
             when = f"after {duration(row.get('time/time_elapsed') or 0)}, at {row[ENV_STEPS_KEY]:,} env steps"
             found.append(f"<li>{escape(', '.join(lost))} <small>{escape(when)}</small></li>")
         before = counts
-    more = f"<p>And {len(found) - MOST_HISTORY} earlier ones.</p>" if len(found) > MOST_HISTORY else ""
+    left_out = f"<p>And {len(found) - MOST_HISTORY} earlier ones.</p>" if len(found) > MOST_HISTORY else ""
     items = "".join(reversed(found[-MOST_HISTORY:]))
     about = "What was lost was collected again; no update used it." if found else "Nothing was lost or dropped."
-    return _identified(
-        "history", section("What went wrong", about, f"<div><ol class=history>{items}</ol>{more}</div>" if found else "")
-    )
+    content = f"<div><ol class=history>{items}</ol>{left_out}</div>" if found else ""
+    return section("What went wrong", about, content, "history")
 
 
 def logs(newest: Sequence[tuple[str, str]]) -> str:
     """The last lines of the logs of local workers."""
     blocks = "".join(f"<details><summary>{escape(name)}</summary>{_typed(text)}</details>" for name, text in newest)
-    return (
-        _identified("logs", section("Logs of the workers", "The last lines of each.", f"<div>{blocks}</div>"))
-        if blocks
-        else ""
-    )
+    return section("Logs of the workers", "The last lines of each.", f"<div>{blocks}</div>", "logs") if blocks else ""
 
 
 def join(line: RunLine) -> str:
@@ -344,18 +327,14 @@ def join(line: RunLine) -> str:
         return ""
     if not line.owner.address.startswith("tcp://"):
         about = "Only its own machine reaches this learner. With --bind tcp://0.0.0.0:5555, workers of others can join."
-        return _identified("join", section("One more worker", about, ""))
+        return section("One more worker", about, "", "join")
     token = " --token default.token" if line.owner.keys else " --insecure"
     command = f"millrace worker {line.owner.address}{token}"
     about = "Type this on another machine."
     if line.owner.keys:
         about += f" It needs a join token from {line.owner.keys} of {line.owner.host}."
-    return _identified("join", section("One more worker", about, f"<div>{_typed(command)}</div>"))
+    return section("One more worker", about, f"<div>{_typed(command)}</div>", "join")
 
 
 def _typed(text: str) -> str:
     return f'<pre class="log" tabindex="0">{escape(text)}</pre>'
-
-
-def _identified(name: str, html: str) -> str:
-    return html.replace("<section>", f'<section id="{name}">', 1)

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from millrace.cli.look import where_to_listen
+from millrace.cli.dashboard import where_to_listen
 from millrace.dashboard import server as dashboard_server
 from millrace.dashboard.http import PageAnswer, PageRequest
 from millrace.dashboard.server import MOST_CONNECTIONS, MOST_HEAD_BYTES, DashboardServer

@@ -63,9 +63,9 @@ MUTATIONS = {
     "a worker that only evaluates gets a lane": Mutation(
         PLACEMENT, "(each for each in active if not each.hello.evaluates)", "active"
     ),
-    "all play an evaluation beside training": Mutation(TICKETS, "members += [] if self.beside else [", "members += ["),
+    "all play an evaluation beside training": Mutation(TICKETS, "if member.hello.evaluates or not self.beside)", "if True)"),
     "only those that only evaluate ever play": Mutation(
-        TICKETS, "members += [] if self.beside else [", "members += [] and ["
+        TICKETS, "if member.hello.evaluates or not self.beside)", "if member.hello.evaluates)"
     ),
     "rollouts wait for an evaluation beside training": Mutation(
         COORDINATOR, "if self.evaluation.beside or not self.evaluation.pending:", "if not self.evaluation.pending:"

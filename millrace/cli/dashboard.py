@@ -1,0 +1,47 @@
+"""`millrace dashboard`: runs in a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+
+from learner.report.run_lines import find_runs
+from millrace.cli.flags import DashboardFlags
+from millrace.dashboard.known_runs import KnownRuns
+from millrace.dashboard.live import Lookout
+from millrace.dashboard.server import DashboardServer
+from millrace.dashboard.site import Site
+from protocol.address import is_local
+from protocol.errors import UsageError
+from protocol.flags.parse import parse_flags
+
+
+def dashboard(argv: list[str]) -> int:
+    """Serve the dashboard until Ctrl-C. Its address is printed first."""
+    flags = parse_flags(DashboardFlags, argv, "dashboard")
+    folders = flags.folders or (Path("runs"),)
+    host, port = where_to_listen(flags.bind, insecure=flags.insecure)
+    for folder in flags.folders:
+        find_runs([folder])  # a name that is misspelt is an error; the folder `runs` may not be there yet
+
+    def listening(address: str) -> None:
+        print(f"dashboard of {', '.join(map(str, folders))}: {address}", flush=True)
+
+    with Lookout() as lookout:
+        site = Site(KnownRuns(folders, time.time), lookout.look)
+        asyncio.run(DashboardServer(site.answer).serve(host, port, listening))
+    return 0
+
+
+def where_to_listen(bind: str, *, insecure: bool) -> tuple[str, int]:
+    """Host and port. Raises `UsageError` for an address that others reach, unless that is asked for."""
+    host, _, port = bind.rpartition(":")
+    if not (host and port.isascii() and port.isdecimal() and int(port) < 65_536):
+        raise UsageError(f"dashboard: bind {bind}: expected HOST:PORT, as in 127.0.0.1:8080")
+    if not (insecure or is_local(f"tcp://{bind}")):
+        raise UsageError(
+            f"dashboard: bind {bind}: others reach this address, and who learns the page's address sees settings, logs and "
+            "films of these runs, unencrypted; use an ssh tunnel (ssh -L), or add --insecure"
+        )
+    return host, int(port)
