@@ -1,4 +1,6 @@
-"""Every number that metrics.jsonl and TensorBoard show: its unit and its meaning. reference/metrics.md is made of it.
+"""Every number that metrics.jsonl and TensorBoard show: what it is called, its unit and its meaning. Pure.
+
+The dashboard and reference/metrics.md are made of it.
 
 Rule: a number that millrace itself logs has an entry here. In a name, `NAME` stands for a name that the user chose.
 """
@@ -13,44 +15,48 @@ class Meaning(NamedTuple):
 
     unit: str
     text: str
+    label: str = ""
+    """what it is called, where its name does not say it"""
 
 
 STEPS, EPISODES, SECONDS, VERSIONS, TICKETS, TRANSITIONS = "env steps", "episodes", "s", "versions", "tickets", "env steps"
-REWARD, NONE = "reward", "–"
+REWARD, NONE, OWN = "reward", "–", "Your own"
 
 METRICS: dict[str, dict[str, Meaning]] = {
     "Training episodes": {
-        "rollout/ep_rew_mean": Meaning(REWARD, "Mean return of the last 100 training episodes, in raw rewards."),
-        "rollout/ep_len_mean": Meaning(STEPS, "Mean length of the same episodes."),
+        "rollout/ep_rew_mean": Meaning(REWARD, "Mean return of the last 100 training episodes, in raw rewards.", "return"),
+        "rollout/ep_len_mean": Meaning(STEPS, "Mean length of the same episodes.", "episode length"),
         "rollout/NAME": Meaning("its own", "Mean over the same episodes of a number of `--info-keys`."),
         "rollout/NAME_missing": Meaning(EPISODES, "How many of these episodes did not report the number."),
         "rollout/exploration_rate": Meaning(NONE, "DQN: probability ε of a random action."),
     },
     "Evaluations": {
-        "eval/mean_reward": Meaning(REWARD, "Mean return of the greedy episodes of an evaluation, in raw rewards."),
-        "eval/env_steps": Meaning(STEPS, "With `--eval-workers`: those of the policy that was evaluated."),
-        "eval/mean_ep_length": Meaning(STEPS, "Mean length of these episodes."),
+        "eval/mean_reward": Meaning(REWARD, "Mean return of the greedy episodes, in raw rewards.", "return of evaluations"),
+        "eval/env_steps": Meaning(STEPS, "With `--eval-workers`: those of the evaluated policy.", "env steps evaluated"),
+        "eval/mean_ep_length": Meaning(STEPS, "Mean length of these episodes.", "episode length of evaluations"),
         "eval/NAME": Meaning("its own", "Mean over these episodes of a number of `--info-keys`."),
         "eval/NAME_missing": Meaning(EPISODES, "How many of these episodes did not report the number."),
     },
     "Progress and speed": {
-        "time/total_timesteps": Meaning(STEPS, "Env steps that updates have used. It is the x axis of the curves."),
-        "time/iterations": Meaning("updates", "Updates so far."),
+        "time/total_timesteps": Meaning(STEPS, "Env steps that updates have used: the x axis of the curves.", "env steps"),
+        "time/iterations": Meaning("updates", "Updates so far.", "updates"),
         "time/time_elapsed": Meaning(
-            SECONDS, "Seconds of training, those before a resume included. Evaluations do not count."
+            SECONDS, "Seconds of training, those before a resume included. Evaluations do not count.", "time of training"
         ),
-        "time/fps": Meaning("env steps/s", "Env steps for each second of training, since this process started."),
+        "time/fps": Meaning(
+            "env steps/s", "Env steps for each second of training, since this process started.", "env steps per second"
+        ),
     },
     "Lag": {
-        "lag/mean": Meaning(VERSIONS, "Mean lag of the rollouts of the last update."),
-        "lag/max": Meaning(VERSIONS, "Largest lag of these rollouts."),
+        "lag/mean": Meaning(VERSIONS, "Mean lag of the rollouts of the last update.", "mean lag"),
+        "lag/max": Meaning(VERSIONS, "Largest lag of these rollouts.", "largest lag"),
     },
     "Tickets and transitions": {
-        "ledger/issued": Meaning(TICKETS, "Tickets that were given to workers."),
-        "ledger/used": Meaning(TICKETS, "Tickets whose rollout an update used."),
-        "ledger/outstanding": Meaning(TICKETS, "Tickets that are neither used nor given up."),
+        "ledger/issued": Meaning(TICKETS, "Tickets that were given to workers.", "tickets issued"),
+        "ledger/used": Meaning(TICKETS, "Tickets whose rollout an update used.", "tickets used"),
+        "ledger/outstanding": Meaning(TICKETS, "Tickets that are neither used nor given up.", "tickets outstanding"),
         "ledger/lost": Meaning(
-            TICKETS, "Tickets whose worker was lost or left or sent an unusable rollout, or whose update failed."
+            TICKETS, "Those whose worker was lost, left or sent an unusable rollout, or whose update failed.", "tickets lost"
         ),
         "ledger/transitions_received": Meaning(TRANSITIONS, "Env steps that reached the learner."),
         "ledger/transitions_used": Meaning(TRANSITIONS, "Env steps that updates used."),
@@ -62,7 +68,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "ledger/transitions_invalid": Meaning(
             TRANSITIONS, "Env steps of rollouts that broke the row format or did not fit the run. They were dropped."
         ),
-        "ledger/messages_bad": Meaning("messages", "Messages that could not be read."),
+        "ledger/messages_bad": Meaning("messages", "Messages that could not be read.", "messages that could not be read"),
         "ledger/late_actions": Meaning("actions", "Actions that came too late for a program that owns its loop."),
     },
     "Where the time goes (worker stages: all workers together)": {
@@ -77,14 +83,14 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "stage/worker_evaluate": Meaning(SECONDS, "Time in which workers played evaluations."),
     },
     "Cloning, in a row of its own before the first update": {
-        "clone/loss": Meaning(NONE, "Loss of the cloned policy, and of its critic if it has one, on the whole dataset."),
+        "clone/loss": Meaning(NONE, "Loss of the cloned policy and its critic, on the whole dataset.", "loss of cloning"),
         "clone/accuracy": Meaning(NONE, "Discrete actions: fraction of the steps whose action is the most probable one."),
         "clone/mean_absolute_error": Meaning(NONE, "Box actions: error of the greedy ones; SAC, TD3: in [-1, 1]."),
     },
     "Updates: all algorithms": {
         "train/learning_rate": Meaning(NONE, "Learning rate of this update."),
-        "train/n_updates": Meaning("–", "PPO: epochs so far. DQN, SAC, TD3: gradient steps so far. Others: updates so far."),
-        "train/grad_norm": Meaning(NONE, "Norm of the gradient before it is clipped, mean over the update."),
+        "train/n_updates": Meaning(NONE, "PPO: epochs. DQN, SAC, TD3: gradient steps. Others: updates.", "gradient steps"),
+        "train/grad_norm": Meaning(NONE, "Its norm before it is clipped, mean over the update.", "norm of the gradient"),
     },
     "Updates: actor-critic algorithms": {
         "train/policy_gradient_loss": Meaning(NONE, "Loss of the policy. Mean over the gradient steps of the update."),
@@ -93,29 +99,45 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "train/explained_variance": Meaning(
             NONE, "Share of the variance of the targets that the critic predicted. 1: all of it."
         ),
-        "train/std": Meaning(NONE, "Box actions: standard deviation of the Gaussian, mean over the action's elements."),
-        "train/approx_kl": Meaning("nats", "PPO: estimated KL divergence from the policy that acted, in the last epoch."),
+        "train/std": Meaning(NONE, "Box actions: of the Gaussian, mean over the action's elements.", "standard deviation"),
+        "train/approx_kl": Meaning("nats", "PPO: from the policy that acted, in the last epoch.", "estimated KL divergence"),
         "train/clip_fraction": Meaning(NONE, "PPO: fraction of rows whose probability ratio was outside 1 ± `clip_range`."),
         "train/clip_range": Meaning(NONE, "PPO: ε of the clipped objective in this update."),
         "train/loss": Meaning(NONE, "PPO: whole loss of the last gradient step. DQN: mean TD loss of the update."),
-        "train/rho": Meaning(NONE, "IMPALA: mean importance weight ρ of V-trace, clipped at 1."),
+        "train/rho": Meaning(NONE, "IMPALA: mean importance weight ρ of V-trace, clipped at 1.", "importance weight"),
         "train/rows_used": Meaning("rows", "REINFORCE: rows of whole episodes, from which the update learned."),
         "train/rows_dropped": Meaning("rows", "REINFORCE: rows of unfinished episodes. They were dropped."),
     },
     "Updates: DQN, SAC, TD3": {
-        "train/q_mean": Meaning(NONE, "Mean value of the actions that were taken."),
+        "train/q_mean": Meaning(NONE, "Mean value of the actions that were taken.", "mean value"),
         "train/critic_loss": Meaning(NONE, "SAC, TD3: mean loss of both critics."),
         "train/actor_loss": Meaning(NONE, "SAC, TD3: mean loss of the actor."),
-        "train/ent_coef": Meaning(NONE, "SAC: mean temperature α, the weight of the entropy."),
-        "train/ent_coef_loss": Meaning(NONE, "SAC: mean loss of a learned temperature."),
+        "train/ent_coef": Meaning(NONE, "SAC: mean temperature α, the weight of the entropy.", "entropy coefficient"),
+        "train/ent_coef_loss": Meaning(NONE, "SAC: mean loss of a learned temperature.", "loss of the entropy coefficient"),
         "train/entropy": Meaning("nats", "SAC: mean entropy of the actions in [-1, 1], estimated from samples."),
-        "replay/size": Meaning("transitions", "Transitions in the replay buffer."),
-        "replay/bytes": Meaning("bytes", "Memory of the replay buffer."),
+        "replay/size": Meaning("transitions", "Transitions in the replay buffer.", "transitions in the replay buffer"),
+        "replay/bytes": Meaning("bytes", "Memory of the replay buffer.", "memory of the replay buffer"),
         "replay/env_steps_per_gradient_step": Meaning(STEPS, "New env steps for each gradient step of this update."),
     },
-    "Your own": {
+    OWN: {
         "train/NAME": Meaning("its own", "A number that your own algorithm returns from `loss` or `update`."),
         "custom/NAME": Meaning("its own", "A number that a callback logs with `progress.log(\"NAME\", value)`."),
     },
 }  # fmt: skip
 """The numbers in groups, each by the name under which it is logged"""
+
+ENTRIES = {name: (title, meaning) for title, group in METRICS.items() for name, meaning in group.items()}
+
+
+def described(metric: str) -> tuple[str, Meaning]:
+    """Group and meaning of a number by the name under which it is logged, which may be any text. Its label is not empty."""
+    group, _, name = metric.partition("/")
+    of_user = f"{group}/NAME_missing" if name.endswith("_missing") else f"{group}/NAME"
+    of_anybody = OWN, Meaning(NONE, f"Logged as {metric}.")
+    title, found = ENTRIES.get(metric) or ENTRIES.get(of_user) or of_anybody
+    return title, found._replace(label=found.label or (name or group).replace("_", " "))
+
+
+def label(metric: str) -> str:
+    """What a number is called."""
+    return described(metric)[1].label

@@ -8,7 +8,7 @@ from prometheus_client.metrics_core import Metric
 
 from benchmarks.markdown_tables import table
 from learner.config.config import Config
-from learner.metric_names import METRICS
+from learner.metric_names import METRICS, label
 from learner.prometheus import MetricsCollector, MetricsSnapshot
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
@@ -43,8 +43,8 @@ def page() -> str:
     """The page."""
     parts = [HEAD]
     for title, names in METRICS.items():
-        rows = ((anchored(name, f"`{name}`"), meaning.unit, meaning.text) for name, meaning in names.items())
-        parts.append(f"## {title}\n\n{table(('name', 'unit', 'meaning'), rows)}\n")
+        rows = ((anchored(name, f"`{name}`"), label(name), each.unit, each.text) for name, each in names.items())
+        parts.append(f"## {title}\n\n{table(('name', 'in the dashboard', 'unit', 'meaning'), rows)}\n")
     shown = ((anchored(name, f"`{name}`"), kind, labels, text) for name, kind, labels, text in prometheus())
     return "".join([*parts, PROMETHEUS, table(("name", "type", "labels", "meaning"), shown)])
 

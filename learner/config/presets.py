@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import tomllib
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,7 +29,7 @@ class Preset(NamedTuple):
 def named_presets() -> dict[str, Preset]:
     """The whole runs that `--preset NAME` takes, by name."""
     tables: dict[str, dict[str, Any]] = _tables().get(NAMED, {})
-    return {name: Preset(table.pop("about"), table) for name, table in tables.items()}
+    return {name: Preset(table["about"], {k: v for k, v in table.items() if k != "about"}) for name, table in tables.items()}
 
 
 def environment_presets(algo: str) -> dict[str, dict[str, Any]]:
@@ -84,5 +85,6 @@ def _settings(config: Config) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in (found | algorithm).items()}
 
 
+@cache
 def _tables() -> dict[str, Any]:
     return tomllib.loads(PRESETS.read_text())

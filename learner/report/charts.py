@@ -1,4 +1,7 @@
-"""Charts as SVG text: axes, lines, bands, dots. Pure. The style sheet sets the colors, by class, so that dark mode works."""
+"""Charts as SVG text: axes, lines, bands, dots. Pure. The style sheet sets the colors, by class, so that dark mode works.
+
+Rule: a line looks like no other up to 56 of them. After the seven colors of the style sheet, each comes again with dashes.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,19 @@ import numpy as np
 from protocol.arrays import Doubles
 
 COLORS = 7  # number of colors in the style sheet
+DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14 5 4 5")  # with round ends
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 10, 40
 MOST_POINTS = 500
 MINUS = "\N{MINUS SIGN}"
 
 
 class Series(NamedTuple):
-    """Data that are drawn over env steps in one color."""
+    """Data that are drawn over env steps in one color and one kind of dashes."""
 
     kind: str
     """line (bold), thin, band or dots; also its class in the style sheet"""
     color: int
+    """its number; it says the dashes too"""
     x: Doubles  # [K]
     y: Doubles  # [K], or [K, 2] of a band
     tooltip: str = ""
@@ -65,7 +70,8 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     def y_pixels(y: Doubles | float) -> Doubles:
         return np.asarray(TOP + (high - np.asarray(y)) / (high - low) * plot_h)
 
-    parts = [f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(describe)}">']
+    size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
+    parts = [f'<svg class="chart" {size} role="img" aria-label="{escape(describe)}">']
     for y in ticks(low, high, 5):
         at = float(y_pixels(y))
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{width - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
@@ -80,6 +86,16 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     ordered = sorted(all_series, key=lambda series: ("band", "thin", "line", "dots").index(series.kind))
     parts += [_svg(series, x_pixels(series.x), y_pixels(series.y)) for series in ordered if series.x.size]
     return "\n".join([*parts, "</svg>"])
+
+
+def key(color: int) -> str:
+    """A piece of the line of this color, for legends."""
+    x, y = np.array([2.0, 32.0]), np.array([5.0, 5.0])
+    return f'<svg class="key" width="34" height="10">{_svg(Series("line", color, x, y), x, y)}</svg>'
+
+
+DOT_KEY = '<svg class="key" width="34" height="10"><g class="dots"><circle cx="17" cy="5" r="3.2"/></g></svg>'
+"""A dot of no group, for legends"""
 
 
 class Segment(NamedTuple):
@@ -109,16 +125,17 @@ def bar(segments: Iterable[Segment]) -> str:
 def _svg(series: Series, x: Doubles, y: Doubles) -> str:
     tooltip = f"<title>{escape(series.tooltip)}</title>" if series.tooltip else ""
     css = f'class="{series.kind} c{series.color % COLORS}"'
-    match series.kind:
-        case "dots":
-            dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.2"/>' for a, b in zip(x, y, strict=True))
-            return f"<g {css}>{tooltip}{dots}</g>"
-        case "band":
-            x, y = _subsampled(x, y)
-            outline = np.concatenate([np.column_stack([x, y[:, 0]]), np.column_stack([x, y[:, 1]])[::-1]])
-            return f'<path {css} d="{_path(outline)}Z">{tooltip}</path>'
-        case _:
-            return f'<path {css} d="{_path(np.column_stack(_subsampled(x, y)))}">{tooltip}</path>'
+    if series.kind == "dots":
+        dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.2"/>' for a, b in zip(x, y, strict=True))
+        return f"<g {css}>{tooltip}{dots}</g>"
+    x, y = _subsampled(x, y)
+    if series.kind == "band":
+        path = _path(np.concatenate([np.column_stack([x, y[:, 0]]), np.column_stack([x, y[:, 1]])[::-1]])) + "Z"
+    else:
+        path = _path(np.column_stack([x, y]))
+    dashes = DASHES[series.color // COLORS % len(DASHES)]
+    dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
+    return f'<path {css}{dashed} d="{path}">{tooltip}</path>'
 
 
 def _subsampled(x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
@@ -130,4 +147,4 @@ def _subsampled(x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
 
 def _path(points: Doubles) -> str:
     """Points [K, 2] as SVG path commands."""
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points.tolist())

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from learner.report.charts import COLORS, MINUS
-from learner.report.reported_runs import RunGroup
+from learner.report.charts import MINUS
 
 
 def document(title: str, head: Sequence[str], main: str) -> str:
@@ -38,11 +37,6 @@ def section(name: str, about: str, content: str, key: str = "") -> str:
     introduction = f"<p>{escape(about)}</p>" if about else ""
     named = f' id="{key}"' if key else ""
     return f"<section{named}><h2>{escape(name)}</h2>{introduction}{content}</section>"
-
-
-def color_dot(group: RunGroup) -> str:
-    """A dot in the color of a group."""
-    return f'<i class="dot c{group.color % COLORS}"></i>'
 
 
 def return_text(value: float) -> str:

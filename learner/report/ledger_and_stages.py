@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from html import escape
 
-from learner.report.charts import COLORS, MINUS, Segment, bar
-from learner.report.html_parts import color_dot, section
+from learner.report.charts import COLORS, MINUS, Segment, bar, key
+from learner.report.html_parts import section
 from learner.report.reported_runs import ReportData
 from learner.report.run_lines import duration
 
@@ -31,7 +31,7 @@ def _balance(report: ReportData, name: str, prefix: str, terms: tuple[str, tuple
     rows = []
     for short, (group, run) in zip(report.short_names(), report.runs, strict=True):
         counts = run.results.ledger
-        row = f'<th scope="row">{color_dot(group)}{escape(short)}</th>'
+        row = f'<th scope="row">{key(group.color)}{escape(short)}</th>'
         if prefix + total not in counts:
             rows.append(f'<tr>{row}<td class="none" colspan="{2 * len(parts) + 1}">not known</td><td></td></tr>')
             continue
@@ -73,7 +73,7 @@ def _bars(report: ReportData, process: str, name: str) -> str:
             segments.append(Segment(end, share, color[kind], tooltip, text if share > 0.06 else ""))
             end += share
         rows.append(
-            f'<span class="who" title="{escape(short)}">{color_dot(group)}{escape(short)}</span>'
+            f'<span class="who" title="{escape(short)}">{key(group.color)}{escape(short)}</span>'
             f'{bar(segments)}<span class="total">{duration(total)}</span>'
         )
     legend = "".join(f'<li><i class="{color[kind]}"></i>{escape(kind)}</li>' for kind in kinds)

@@ -1,14 +1,14 @@
 """The data of the page: the runs, read from their folders, and the groups of runs.
 
 Rule: of a run that has not finished, the page shows what its metrics contain. Runs with other keyword arguments of the
-environment are runs of another environment. Runs form a group if all their settings except the seed and the folder are the
-same. A run that an error or an interrupt ended is in its group, and in no mean.
+environment are runs of another environment. Runs form a group if they differ only in their seeds and in settings on which it
+does not depend what is learned from an env step. A run that an error or an interrupt ended is in its group, and in no mean.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,21 @@ from protocol.arrays import Doubles
 from protocol.bounds import Natural, Real, Seconds
 from protocol.errors import UsageError
 
-MAY_DIFFER_IN_A_GROUP = ("seed", "run_dir")
+MAY_DIFFER_IN_A_GROUP = frozenset({
+    # what a group is for
+    "seed",
+    # when training ends, and how often and how long it is evaluated; what is evaluated (eval_env_kwargs) may not differ
+    "steps", "target_return", "target_mean_return",
+    "eval_episodes", "eval_every", "eval_workers", "eval_copies", "eval_max_steps",
+    # who collects and computes, and where: the same rollouts and updates, but for rounding
+    "workers", "min_workers", "launched_workers", "max_env_copies", "inference", "device", "torch_threads",
+    "transport", "bind", "advertise", "keys", "insecure",
+    # what is done about failures
+    "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
+    # what is written, and where
+    "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind",
+})  # fmt: skip
+"""Settings on which it does not depend what is learned from an env step"""
 MOST_DIFFERENCES = 3  # settings that are listed after the name of a group, if no more are needed to tell groups apart
 ELSEWHERE = "started elsewhere"
 """What is shown as the number of workers if the learner started none."""
@@ -72,10 +86,18 @@ class ReportedRun:
     images: tuple[Path, ...]
     """pictures of what the policy sees, one for each image of an observation"""
 
+    @property
+    def of_group(self) -> dict[str, str]:
+        """The settings that all runs of its group share: `steps` too, if something falls or grows until they are done."""
+        schedules = [self.settings.get(name) for name in ("learning_rate_schedule", "clip_range_schedule")]
+        until_done = "linear" in schedules or self.settings.get("priority_alpha", "0") != "0" or ":" in self.algo
+        may_differ = MAY_DIFFER_IN_A_GROUP - {"steps"} if until_done else MAY_DIFFER_IN_A_GROUP
+        return {name: value for name, value in self.settings.items() if name not in may_differ}
+
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Runs of one environment that differ only in their seeds. One color on the page."""
+    """Runs of one environment of which a mean makes sense. One color on the page."""
 
     env: str
     name: str
@@ -169,36 +191,40 @@ def group_runs(runs: Sequence[ReportedRun]) -> ReportData:
     """Put runs into groups. Environments stay in the order of their first run; the runs of a group are sorted by seed."""
     groups = []
     for env in dict.fromkeys(run.env for run in runs):
-        by_settings: dict[tuple[tuple[str, str], ...], list[ReportedRun]] = {}
+        by_settings: dict[frozenset[tuple[str, str]], list[ReportedRun]] = {}
         for run in runs:
             if run.env == env:
-                key = tuple(sorted((k, v) for k, v in run.settings.items() if k not in MAY_DIFFER_IN_A_GROUP))
-                by_settings.setdefault(key, []).append(run)
-        firsts = [members[0] for members in by_settings.values()]
+                by_settings.setdefault(frozenset(run.of_group.items()), []).append(run)
+        names: dict[Path, tuple[str, str]] = {}
+        for algo in dict.fromkeys(members[0].algo for members in by_settings.values()):
+            names |= _names([members[0] for members in by_settings.values() if members[0].algo == algo])
         for color, members in enumerate(by_settings.values()):
-            name, differences = _name(members[0], [run for run in firsts if run.algo == members[0].algo])
+            name, differences = names[members[0].path]
             groups.append(RunGroup(env, name, differences, color, tuple(sorted(members, key=lambda run: run.seed))))
     return ReportData(tuple(groups))
 
 
-def differing_settings(runs: Sequence[ReportedRun], ignore: Iterable[str] = ()) -> list[str]:
-    """Names of the settings that are not the same in all of these runs, in the order of the configuration."""
-    names = dict.fromkeys(name for run in runs for name in run.settings)
-    return [name for name in names if name not in ignore and len({run.settings.get(name) for run in runs}) > 1]
+def differing_settings(settings: Sequence[Mapping[str, str]]) -> list[str]:
+    """Names of the settings that are not the same in all of these, in the order of the configuration."""
+    names = dict.fromkeys(name for each in settings for name in each)
+    return [name for name in names if len({each.get(name) for each in settings}) > 1]
 
 
-def _name(run: ReportedRun, firsts: Sequence[ReportedRun]) -> tuple[str, str]:
-    """Name and differences of the group whose first run this is. `firsts`: the first runs of all groups of its algorithm."""
+def _names(firsts: Sequence[ReportedRun]) -> Iterator[tuple[Path, tuple[str, str]]]:
+    """Name and differences of all groups of an algorithm, by the path of the first run of each."""
+    label = algorithm_label(firsts[0].algo)
     if len(firsts) == 1:
-        return algorithm_label(run.algo), ""
-    differing = differing_settings(firsts, MAY_DIFFER_IN_A_GROUP)
-    differing.sort(key=lambda name: name not in run.algorithm_settings)  # the algorithm's first, because they say most
+        yield firsts[0].path, (label, "")
+        return
+    differing = differing_settings([run.of_group for run in firsts])
+    differing.sort(key=lambda name: name not in firsts[0].algorithm_settings)  # these first, because they say most
     needed = _distinguishing(firsts, differing)
     names = [*needed, *(name for name in differing if name not in needed)]
     shown = names[: max(len(needed), MOST_DIFFERENCES)]
-    texts = [f"{name} {run.settings[name]}" if name in run.settings else f"no {name}" for name in shown]
-    texts += [f"{len(names) - len(shown)} more"] if len(names) > len(shown) else []
-    return f"{algorithm_label(run.algo)} {_letters(firsts.index(run))}", ", ".join(texts)
+    for i, run in enumerate(firsts):
+        texts = [f"{name} {run.settings[name]}" if name in run.settings else f"no {name}" for name in shown]
+        texts += [f"{len(names) - len(shown)} more"] if len(names) > len(shown) else []
+        yield run.path, (f"{label} {_letters(i)}", ", ".join(texts))
 
 
 def _distinguishing(runs: Sequence[ReportedRun], names: Sequence[str]) -> list[str]:

@@ -6,15 +6,13 @@ Rule: text from run folders is escaped.
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
 
-import numpy as np
-
-from learner.report.charts import Series, chart
-from learner.report.curve import common_grid
-from learner.report.html_parts import color_dot, return_text, section
+from learner.report.charts import chart, key
+from learner.report.html_parts import return_text, section
+from learner.report.panels import WHAT_IS_DRAWN, how_it_is_drawn, panels
 from learner.report.reported_runs import ReportData, RunGroup, differing_settings
 from learner.report.run_lines import duration
 from learner.run_folder.episode_window import WINDOW_EPISODES
@@ -89,7 +87,7 @@ def _rows_of_group(group: RunGroup) -> str:
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
         where = f'<th scope="row" title="{escape(str(run.path))}">seed {run.seed}</th>'
         rows.append(f'<tr>{where}{numbers}<td class="text">{escape(results.stop_reason)}</td></tr>')
-    name = f"{color_dot(group)}<b>{escape(group.env)}</b> {escape(group.name)}"
+    name = f"{key(group.color)}<b>{escape(group.env)}</b> {escape(group.name)}"
     if group.differences:
         name += f"<span>{escape(group.differences)}</span>"
     whole = [run.results for run in group.runs if not run.results.cut_short]
@@ -106,40 +104,15 @@ def _facts(facts: Mapping[str, FactMean]) -> str:
 
 
 def curves(report: ReportData) -> str:
-    """Learning curves: a panel for each environment, a color for each group, and a band over its seeds."""
+    """Learning curves: a panel for each environment."""
     size = WIDE if len(report.envs) == 1 else NARROW
-    panels = []
-    for env in report.envs:
-        groups = [group for group in report.groups if group.env == env]
-        all_series = [series for group in groups for series in _series(group)]
-        legend = "".join(f"<li>{color_dot(group)}{escape(group.legend())}</li>" for group in groups)
-        if any(series.kind == "dots" for series in all_series):
-            legend += '<li><i class="ring"></i>greedy evaluations</li>'
-        drawn = chart(all_series, *size, "env steps", f"Learning curves of {env}") if all_series else ""
-        panels.append(f'<figure><h3>{escape(env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
-    about = f"Return, mean of the last {WINDOW_EPISODES} training episodes."
-    if any(group.averaged for group in report.groups):
-        about += " Bold: the mean over seeds, as far as the shortest of them goes. Band: from the worst to the best."
-        about += " Thin: each seed."
-    return section("Learning curves", about, f'<div class="panels n{min(len(report.envs), 2)}">{"".join(panels)}</div>')
-
-
-def _series(group: RunGroup) -> Iterable[Series]:
-    averaged = group.averaged
-    for curve in group.curves:
-        last = f"{return_text(float(curve.returns[-1]))} at {curve.env_steps[-1]:,.0f} env steps"
-        tooltip = f"{group.name}, seed {curve.seed}: {last}"
-        yield Series("thin" if averaged else "line", group.color, curve.env_steps, curve.returns, tooltip)
-    for run in group.runs:
-        if len(run.evaluations):
-            steps, returns = run.evaluations.T
-            yield Series("dots", group.color, steps, returns, f"{group.name}, seed {run.seed}: greedy evaluations")
-    if averaged:
-        grid, returns = common_grid(averaged)
-        if grid.size:
-            band = np.column_stack([returns.min(0), returns.max(0)])
-            yield Series("band", group.color, grid, band)
-            yield Series("line", group.color, grid, returns.mean(0), f"{group.name}: mean of {len(averaged)}")
+    figures = []
+    for panel in panels(report):
+        legend = "".join(f"<li>{sample}{escape(text)}</li>" for sample, text in panel.legend)
+        drawn = chart(panel.series, *size, "env steps", f"Learning curves of {panel.env}") if panel.series else ""
+        figures.append(f'<figure><h3>{escape(panel.env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
+    about = f"{WHAT_IS_DRAWN}. {how_it_is_drawn(report)}"
+    return section("Learning curves", about, f'<div class="panels n{min(len(report.envs), 2)}">{"".join(figures)}</div>')
 
 
 class Embedded:
@@ -186,7 +159,7 @@ def videos(report: ReportData, address_of: AddressOf | None = None) -> str:
             continue
         newest = max(run.videos, key=lambda path: (path.stat().st_mtime_ns, path.name))
         shown = _shown(newest, address_of(newest, "video/mp4"), '<video controls muted loop playsinline src="', '"></video>')
-        caption = f"<figcaption>{color_dot(group)}{escape(name)}<span>{escape(newest.name)}</span></figcaption>"
+        caption = f"<figcaption>{key(group.color)}{escape(name)}<span>{escape(newest.name)}</span></figcaption>"
         figures.append(f"<figure>{shown}{caption}</figure>")
     if not figures:
         return ""
@@ -203,7 +176,7 @@ def _shown(path: Path, address: str, before: str, after: str) -> str:
 def settings(report: ReportData) -> str:
     """Settings: first those that differ, with a column for each group. The others are in a block that is closed at first."""
     runs = [run for _, run in report.runs]
-    differ = differing_settings(runs)
+    differ = differing_settings([run.settings for run in runs])
     same = {name: value for name, value in runs[0].settings.items() if name not in differ}
     folded = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in same.items())
     summary = f"{len(same)} settings are the same in all runs" if len(runs) > 1 else f"{len(same)} settings"
@@ -211,7 +184,7 @@ def settings(report: ReportData) -> str:
     if not differ:
         return section("Settings", "", rest)
     heads = "".join(
-        f'<th scope="col">{color_dot(group)}<b>{escape(group.env)}</b><br>{escape(group.name)}</th>'
+        f'<th scope="col">{key(group.color)}<b>{escape(group.env)}</b><br>{escape(group.name)}</th>'
         for group in report.groups
     )
     rows = "".join(_setting(name, report) for name in differ)
@@ -221,7 +194,7 @@ def settings(report: ReportData) -> str:
 
 
 def _setting(name: str, report: ReportData) -> str:
-    """A row of the table: the value of a setting in each group. Only the seed has several values in a group."""
+    """A row of the table: the value of a setting in each group, or its values."""
     cells = []
     for group in report.groups:
         values = dict.fromkeys(run.settings[name] for run in group.runs if name in run.settings)

@@ -201,10 +201,13 @@ def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
     return rows, len(lines) - len(rows)
 
 
+_DECODER = msgspec.json.Decoder(dict[str, int | float | None])
+
+
 def decoded_row(line: bytes) -> dict[str, Any] | None:
     """A row: finite numbers, or null, by name; None if it cannot be read."""
     try:
-        row = msgspec.json.decode(line, type=dict[str, int | float | None])
+        row = _DECODER.decode(line)
         msgspec.convert(row[ENV_STEPS_KEY], Natural)
         if not all(number is None or math.isfinite(number) for number in row.values()):
             return None

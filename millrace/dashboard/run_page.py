@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from learner.members.held_up import in_words
-from learner.metric_names import METRICS, NONE, Meaning
-from learner.report.charts import Segment, Series, bar, chart
+from learner.metric_names import METRICS, NONE, described, label
+from learner.report.charts import DOT_KEY, Segment, Series, bar, chart
 from learner.report.curve import points
 from learner.report.html_parts import return_text, section
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
@@ -38,21 +38,6 @@ COLORS = {
     "no worker": "gone",
 }
 """Class in the style sheet of what a lane or the learner does"""
-WORDS = {
-    "rollout/ep_rew_mean": "return",
-    "rollout/ep_len_mean": "episode length",
-    "rollout/exploration_rate": "exploration rate",
-    "eval/mean_reward": "return of evaluations",
-    "eval/mean_ep_length": "episode length of evaluations",
-    "time/fps": "env steps per second",
-    "time/iterations": "updates",
-    "time/time_elapsed": "time of training",
-    "train/n_updates": "gradient steps",
-    "train/approx_kl": "approximate KL divergence",
-    "train/grad_norm": "norm of the gradient",
-}
-"""What a metric is called, where its name does not say it"""
-MEANINGS: dict[str, Meaning] = {name: meaning for group in METRICS.values() for name, meaning in group.items()}
 MOST_HISTORY = 30
 MOST_SMOOTHED = 100
 MIB = 2**20
@@ -141,6 +126,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
     if not names:
         return section("Curves", "The first update has not been made yet.", "", "curve")
     metric = choice.metric if choice.metric in names else RETURN_KEY
+    meaning = described(metric)[1]
     x, y = _points(rows, metric, choice.over_time)
     series = [Series("thin" if choice.smooth > 1 else "line", 0, x, y, "")] if x.size else []
     if choice.smooth > 1 and x.size:
@@ -149,29 +135,16 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
         at, returns = _points(rows, EVALUATION_KEY, choice.over_time)
         series += [Series("dots", 1, at, returns, "greedy evaluations")] if at.size else []
     x_label = "minutes of training" if choice.over_time else "env steps"
-    what = f"{label(metric)} over {x_label}"
+    what = f"{meaning.label} over {x_label}"
     sizes = {"for-wide": WIDE, "for-narrow": NARROW}
     drawn = "".join(f'<div class="{css}">{chart(series, *size, x_label, what)}</div>' for css, size in sizes.items())
     drawn = drawn if series else "<p>No value yet.</p>"
-    legend = (
-        '<ul class="legend"><li><i class="ring"></i>greedy evaluations</li></ul>'
-        if len(series) > 1 + (choice.smooth > 1)
-        else ""
-    )
-    meaning = MEANINGS.get(metric)
-    about = meaning.text + f" Unit: {meaning.unit}." * (meaning.unit != NONE) if meaning else f"Logged as {metric}."
+    has_dots = any(each.kind == "dots" for each in series)
+    legend = f'<ul class="legend"><li>{DOT_KEY}greedy evaluations</li></ul>' if has_dots else ""
+    about = meaning.text + f" Unit: {meaning.unit}." * (meaning.unit != NONE)
     form = _form(names, metric, choice)
     figure = f'<div class="panels"><figure>{legend}{drawn}</figure></div>'
-    return section(label(metric).capitalize(), about, form + figure, "curve")
-
-
-def label(metric: str) -> str:
-    """What a metric is called."""
-    group, _, name = metric.partition("/")
-    words = name.replace("_", " ")
-    return WORDS.get(metric) or {"stage": f"time: {words}", "ledger": f"count: {words}", "lag": f"lag, {words}"}.get(
-        group, words
-    )
+    return section(meaning.label.capitalize(), about, form + figure, "curve")
 
 
 def smoothed(y: Doubles, rows: int) -> Doubles:
@@ -190,18 +163,16 @@ def _points(rows: Sequence[Mapping[str, Any]], metric: str, over_time: bool) -> 
 def _form(names: Mapping[str, None], metric: str, choice: Choice) -> str:
     groups: dict[str, list[str]] = {}
     for name in sorted(names, key=label):
-        groups.setdefault(name.partition("/")[0], []).append(name)
-    titles = {"rollout": "training episodes", "eval": "evaluations", "time": "progress and speed",
-              "stage": "seconds by stage", "train": "the algorithm", "ledger": "tickets and transitions",
-              "custom": "of your own"}  # fmt: skip
+        groups.setdefault(described(name)[0], []).append(name)
     options = "".join(
-        f'<optgroup label="{escape(titles.get(group, group))}">'
+        f'<optgroup label="{escape(title)}">'
         + "".join(
             f'<option value="{escape(name)}"{" selected" * (name == metric)}>{escape(label(name))}</option>'
-            for name in members
+            for name in groups[title]
         )
         + "</optgroup>"
-        for group, members in groups.items()
+        for title in METRICS
+        if title in groups
     )
 
     def choose(name: str, chosen: str, values: Mapping[str, str]) -> str:

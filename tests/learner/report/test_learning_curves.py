@@ -179,4 +179,4 @@ def test_returns_of_any_size_are_drawn(tmp_path: Path) -> None:
     plot([run], tmp_path / "curves.png")
     shown = page([run])
     assert "nan" not in shown
-    assert shown.count("<path") == 1
+    assert shown.count("<path") == 5  # and the line in the legend and three tables

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ import numpy as np
 import pytest
 import tomli_w
 
+from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.report import sections
-from learner.report.charts import MINUS, Series, chart, ticks, with_si_prefix
+from learner.report.charts import COLORS, MINUS, Series, chart, key, ticks, with_si_prefix
 from learner.report.page import page, write_page
-from learner.report.reported_runs import ReportData, group_runs, read_run
+from learner.report.reported_runs import MAY_DIFFER_IN_A_GROUP, ReportData, group_runs, read_run
 from learner.report.run_lines import duration
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
@@ -191,7 +193,7 @@ def test_runs_that_differ_in_their_seeds_alone_are_one_line(tmp_path: Path) -> N
         a_run(tmp_path, seed=2),
         a_run(tmp_path, "Pendulum-v1", seed=1),
         a_run(tmp_path / "elsewhere", seed=1),
-        a_run(tmp_path, seed=4, gamma=0.5, n_epochs=3, clip_range=0.3, learning_rate=0.5, workers=1),
+        a_run(tmp_path, seed=4, gamma=0.5, n_epochs=3, clip_range=0.3, learning_rate=0.5, max_lag=1),
     )
     assert [(group.env, group.name, [run.seed for run in group.runs]) for group in found.groups] == [
         ("CartPole-v1", "PPO A", [1, 2]),
@@ -200,7 +202,7 @@ def test_runs_that_differ_in_their_seeds_alone_are_one_line(tmp_path: Path) -> N
     ]
     assert found.groups[2].differences == ""
     assert found.groups[1].differences.endswith(", 2 more")
-    assert "workers" not in found.groups[1].differences  # the algorithm's own say more
+    assert "max_lag" not in found.groups[1].differences  # the algorithm's own say more
     assert found.short_names() == [
         "CartPole-v1, PPO A, seed 1", "CartPole-v1, PPO A, seed 2", "CartPole-v1, PPO B, seed 4", "Pendulum-v1, seed 1",
     ]  # fmt: skip
@@ -210,12 +212,17 @@ def test_runs_that_differ_in_their_seeds_alone_are_one_line(tmp_path: Path) -> N
     assert Reader(page([first, first])).text == Reader(page([first])).text
 
 
+def chart_of(section: str) -> str:
+    """The only chart of a section, without its legend."""
+    (drawn,) = re.findall(r'<svg class="chart".*?</svg>', section, re.DOTALL)
+    return str(drawn)
+
+
 def test_curves_are_a_line_each_with_a_mean_and_a_band_and_dots_for_evaluations(tmp_path: Path) -> None:
-    drawn = sections.curves(report_data(*[a_run(tmp_path, seed=seed) for seed in (1, 2, 3)]))
+    drawn = chart_of(sections.curves(report_data(*[a_run(tmp_path, seed=seed) for seed in (1, 2, 3)])))
     assert [drawn.count(f'class="{kind} c0"') for kind in ("thin", "line", "band", "dots")] == [3, 1, 1, 3]
-    assert "PPO, mean of 3 seeds" in drawn
     assert "PPO, seed 2: 102.0 at 2,000 env steps" in drawn
-    alone = sections.curves(report_data(a_run(tmp_path, seed=4)))
+    alone = chart_of(sections.curves(report_data(a_run(tmp_path, seed=4))))
     assert [alone.count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [0, 1, 0]
 
 
@@ -224,8 +231,8 @@ def test_a_failed_run_is_in_its_group_and_in_no_mean(tmp_path: Path) -> None:
     failed = a_run(tmp_path, seed=3, length=5, failure="ValueError: no such room")
     drawn = sections.curves(report_data(*good, failed))
     assert "PPO, mean of 2 seeds; seed 3 ended early, not in the mean" in drawn
-    assert [drawn.count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [3, 1, 1]
-    (mean,) = re.findall(r'<path class="line c0" d="M([^"]*)"', drawn)
+    assert [chart_of(drawn).count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [3, 1, 1]
+    (mean,) = re.findall(r'<path class="line c0" d="M([^"]*)"', chart_of(drawn))
     assert mean.split("L")[-1].split()[0] == "1066.0", "the mean goes on where the failed run ended"
     said = text_of(sections.results(report_data(*good, failed)))
     assert "greedy −1,233.1 on average of 2 of 3 runs" in said
@@ -247,12 +254,12 @@ def test_groups_are_told_apart_however_late_the_setting_comes_that_differs(tmp_p
     found = report_data(
         a_run(tmp_path),
         a_run(tmp_path, **many),
-        a_run(tmp_path, **many, workers=1),
+        a_run(tmp_path, **many, max_lag=1),
         a_run(tmp_path, **many, eval_env_kwargs={"g": 1.5}),
     )
     labels = [group.differences for group in found.groups]
     assert len(set(labels)) == 4, labels
-    assert ["workers 1" in label for label in labels] == [False, False, True, False]
+    assert ["max_lag 1" in label for label in labels] == [False, False, True, False]
     assert ["eval_env_kwargs.g 1.5" in label for label in labels] == [False, False, False, True]
     assert "no eval_env_kwargs.g" in labels[1]
 
@@ -262,7 +269,35 @@ def test_workers_that_came_from_elsewhere_are_not_a_number(tmp_path: Path) -> No
     RunFolder.open(elsewhere).write_config(resolve("CartPole-v1", run_dir=str(tmp_path), seed=2), workers_elsewhere=True)
     assert "<dt>workers</dt><dd>2</dd>" in sections.settings(report_data(here))
     assert "<dt>workers</dt><dd>started elsewhere</dd>" in sections.settings(report_data(elsewhere))
-    assert [group.differences for group in report_data(here, elsewhere).groups] == ["workers 2", "workers started elsewhere"]
+    assert "<td>2, started elsewhere</td>" in sections.settings(report_data(here, elsewhere))
+
+
+def test_a_group_may_differ_in_what_changes_nothing_of_what_is_learned(tmp_path: Path) -> None:
+    alike = [
+        a_run(tmp_path, "Pendulum-v1", seed=1, steps=500, workers=2),
+        a_run(tmp_path, "Pendulum-v1", seed=2, steps=1_000, eval_every=500, workers=3, torch_threads=2),
+    ]
+    differ = sections.settings(report_data(*alike))
+    assert "PPO, mean of 2 seeds" in sections.curves(report_data(*alike))
+    for name, values in {"steps": "500, 1000", "eval_every": "0, 500", "workers": "2, 3"}.items():
+        assert f"<code>{name}</code></th><td>{values}</td>" in differ
+    annealed = [a_run(tmp_path, "Pendulum-v1", steps=steps, learning_rate_schedule="linear") for steps in (1_000, 2_000)]
+    assert [group.differences for group in report_data(*annealed).groups] == ["steps 1000", "steps 2000"]
+    evaluated = [a_run(tmp_path, "Pendulum-v1", eval_env_kwargs={"g": g}) for g in (9.0, 10.0)]
+    assert len(report_data(*evaluated).groups) == 2, "their evaluations are not comparable"
+    assert set(Config.__struct_fields__) > MAY_DIFFER_IN_A_GROUP
+
+
+def test_no_two_of_fifty_groups_look_alike(tmp_path: Path) -> None:
+    found = report_data(*[a_run(tmp_path, seed=seed, max_lag=lag) for lag in range(25) for seed in (1, 2)])
+    assert len(found.groups) == 25
+    drawn = chart_of(sections.curves(found))
+    for kind in ("thin", "band", "line"):
+        looks = Counter(re.findall(rf'<path class="{kind} (c.*?) d="M', drawn))
+        assert len(looks) == 25, kind
+    assert len({key(color) for color in range(50)}) == 50
+    style = (ROOT / "learner" / "report" / "style.css").read_text()
+    assert all(f".c{color} {{" in style for color in range(COLORS))
 
 
 def test_long_text_in_a_table_is_wrapped() -> None:
@@ -365,7 +400,7 @@ def test_rows_that_cannot_be_read_are_left_out_and_counted(tmp_path: Path, caplo
     "module", ["learner.report.page", "learner.recording.record", "learner.recording.video", "learner.recording.episodes"]
 )
 def test_the_report_and_the_recorder_start_quickly(module: str) -> None:
-    heavy = {"torch", "matplotlib", "tensorboard", "minari", "h5py", "moviepy", "pygame"}
+    heavy = {"torch", "PIL", "resvg_py", "tensorboard", "minari", "h5py", "moviepy", "pygame"}
     asks = f"import sys, {module}; assert not sys.modules.keys() & {heavy}, sys.modules.keys() & {heavy}"
     done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

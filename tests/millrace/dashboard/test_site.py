@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from learner.metric_names import METRICS
+from learner.metric_names import METRICS, described, label
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
 from millrace.dashboard.http import PageAnswer, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import LaneSample, Seen, sample
-from millrace.dashboard.run_page import Choice, label, smoothed
+from millrace.dashboard.run_page import Choice, smoothed
 from millrace.dashboard.site import Site
 from protocol.messages import Status, WorkerStatus
 from tests.learner.report.test_page import Reader, a_run
@@ -137,7 +137,8 @@ def test_any_metric_can_be_chosen(tmp_path: Path) -> None:
     assert 'aria-label="return over env steps"' in pages.text(page)
     assert 'class="dots' in pages.text(page)
     assert 'aria-label="return over minutes of training"' in pages.text(f"{page}?over=time&smooth=10")
-    assert 'aria-label="time: learner update over env steps"' in pages.text(f"{page}?metric=stage/learner_update")
+    assert 'aria-label="learner update over env steps"' in pages.text(f"{page}?metric=stage/learner_update")
+    assert '<optgroup label="Progress and speed"><option value="time/fps">env steps per second<' in pages.text(page)
     for odd in ("metric=no/such", "smooth=-1", "smooth=%C2%B2", "smooth=99999999999", "over="):
         assert 'aria-label="return over env steps"' in pages.text(f"{page}?{odd}")
 
@@ -146,10 +147,20 @@ def test_a_moving_mean_is_of_the_rows_so_far() -> None:
     assert smoothed(np.array([1.0, 3.0, 5.0, 7.0]), 2) == pytest.approx([1.0, 2.0, 4.0, 6.0])
 
 
-def test_every_metric_has_a_name_of_words() -> None:
-    for name in (name for group in METRICS.values() for name in group):
+def test_every_metric_has_a_label_of_words_and_no_other_has_the_same() -> None:
+    names = [name for group in METRICS.values() for name in group if "NAME" not in name]
+    assert len({label(name) for name in names}) == len(names)
+    for name in names:
         assert label(name)
         assert not {"/", "_"} & {*label(name)}, name
+
+
+def test_a_number_of_the_user_s_own_has_its_name_as_label_and_the_meaning_of_its_kind() -> None:
+    title, meaning = described("eval/is_success")
+    assert (title, meaning.label) == ("Evaluations", "is success")
+    assert meaning.text == METRICS["Evaluations"]["eval/NAME"].text
+    assert described("rollout/x_missing")[1].unit == "episodes"
+    assert described("no such\n")[1].label == "no such\n"
 
 
 def test_what_was_lost_is_told_with_its_time(tmp_path: Path) -> None:
