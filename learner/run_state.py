@@ -20,10 +20,10 @@ from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import AttributesState, EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_folder.results import Evaluation
+from learner.run_folder.results import EvaluatedPolicy, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Floats
-from protocol.bounds import Natural, Real, Seconds, Version, one_line
+from protocol.bounds import Natural, Real, Seconds, one_line
 from protocol.errors import BadMessage, CheckpointError, UsageError
 from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Episode
@@ -35,13 +35,6 @@ MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, 
 """What loading a state of another form raises."""
 POLICIES = ("best_policy", "pending_policy")  # of a `RunState`; a checkpoint has them as tensors
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
-
-
-class EvaluatedPolicy(msgspec.Struct, frozen=True):
-    """Which policy an evaluation is of."""
-
-    version: Version
-    env_steps: Natural
 
 
 class RunState(msgspec.Struct, kw_only=True):
@@ -59,15 +52,13 @@ class RunState(msgspec.Struct, kw_only=True):
     """Names of the facts of these episodes."""
     env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
     """Attributes of env copies that callbacks set."""
-    best: list[Real] | None = None
+    best: tuple[Real, Natural] | None = None
     """Mean return and env steps of the best evaluation."""
     best_policy: Any = None
     """Parameters [P] and buffers of the best policy, both float32."""
     newest_evaluation: Evaluation | None = None
-    evaluated_version: Version = -1
-    """The version that `newest_evaluation` belongs to."""
-    evaluated_env_steps: Natural = 0
-    """Its env steps."""
+    evaluated: EvaluatedPolicy = EvaluatedPolicy()
+    """The policy that `newest_evaluation` is of."""
     pending: EvaluatedPolicy | None = None
     """Of the evaluation beside training that has no result yet."""
     pending_policy: Any = None

@@ -362,9 +362,8 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     host: str
     pid: int
     state: str
-    """active, evaluating (it does only that), or draining"""
+    """active, spare (it has no lane), evaluating (it does only that), or draining"""
     lanes: tuple[int, ...]
-    """its lanes; none if it is a spare worker"""
     tickets: int
     """tickets that were dealt to it and have not come back"""
     steps: int
@@ -417,6 +416,8 @@ class Status(Message, frozen=True):
     """who waits for whom, and for what share of the time, in one line for people; empty if nobody waits long"""
     phase: str = ""
     """what the learner of a run does: starting, gathering rollouts, learning, or evaluating"""
+    stages: dict[str, float] = {}
+    """seconds that the learner, and all workers together, have spent in each stage"""
 
 
 ToLearner = (

@@ -18,8 +18,7 @@ from learner.between_updates.run_parts import RunParts
 from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
 from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.progress import Row
-from learner.run_folder.results import EVALUATED_AT_KEY, Best, Evaluation
-from learner.run_state import EvaluatedPolicy
+from learner.run_folder.results import EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
 from protocol.arrays import Floats
 from protocol.logs.notices import log_notice
 from protocol.random_streams import Purpose
@@ -107,18 +106,17 @@ class Evaluations:
 
     def of_newest(self) -> Evaluation | None:
         """The evaluation of the newest policy, if there is one."""
-        state = self._state
-        return state.newest_evaluation if state.evaluated_version == state.version else None
+        return self._state.newest_evaluation if self._state.evaluated.version == self._state.version else None
 
     def _confirm(self, size: EvaluationSize, watch: Callable[[], None]) -> Best | None:
         """Evaluate the best policy again, if the run kept one."""
         state = self._state
         if state.best is None:
             return None
-        chosen_by, at_env_steps = state.best
+        chosen_by, env_steps = state.best
         self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
         confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
-        return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
+        return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=confirmed)
 
     def _evaluate_newest(self, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
         """Evaluate the newest policy; the same version is not evaluated twice."""
@@ -130,8 +128,7 @@ class Evaluations:
 
     def _found(self, found: Evaluation, of: EvaluatedPolicy) -> None:
         """The newest evaluation found this, of this policy."""
-        state = self._state
-        state.newest_evaluation, state.evaluated_version, state.evaluated_env_steps = found, of.version, of.env_steps
+        self._state.newest_evaluation, self._state.evaluated = found, of
         self._tally.note = f"{of.env_steps:,} env steps: greedy {found}"
 
     def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
@@ -160,7 +157,7 @@ class Evaluations:
         """
         state = self._state
         if state.best is None or found.return_mean > state.best[0]:
-            state.best, state.best_policy = [found.return_mean, env_steps], policy()
+            state.best, state.best_policy = (found.return_mean, env_steps), policy()
             self.write_best()
 
 

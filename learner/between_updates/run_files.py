@@ -190,7 +190,7 @@ class RunFiles:
     def _position(self) -> tuple[object, ...]:
         """What of the state changes when the run goes on: version, evaluations, best policy, set attributes."""
         state = self._state
-        return state.version, state.next_evaluation, state.evaluated_version, state.best, self._attributes.changes
+        return state.version, state.next_evaluation, state.evaluated, state.best, self._attributes.changes
 
     def _summary(self, reason: str, cut_short: bool) -> Summary:
         config, state, tally, snapshot = self._config, self._state, self._tally, self._hub.snapshot()

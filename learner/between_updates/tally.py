@@ -64,7 +64,7 @@ class Tally:
             env_steps_after_next_update=state.env_steps + self._steps_per_update if state.version else 0,
             evaluation_return=None if newest is None else newest.return_mean,
             training_return=self.window.return_mean if self.window.full else None,
-            evaluated_before=state.evaluated_env_steps if state.evaluated_version != state.version else None,
+            evaluated_before=state.evaluated.env_steps if state.evaluated.version != state.version else None,
         )
 
     def training_goes_on(self) -> bool:

@@ -126,6 +126,13 @@ class Member:
         return found if found is not None and self.heard_s - found.heard_s < SUPERVISOR_WORD_S else None
 
     @property
+    def role(self) -> str:
+        """What it is to the run: draining, evaluating (it does only that), active, or spare (it has no lane)."""
+        if self.state is MemberState.DRAINING:
+            return "draining"
+        return "evaluating" if self.hello.evaluates else "active" if self.lanes else "spare"
+
+    @property
     def alive_s(self) -> float:
         """Time at which the worker was last known to be alive and well."""
         return max(self.heard_s, self.in_env_code_s)
@@ -189,7 +196,7 @@ class Member:
             worker=self.hello.worker,
             host=self.hello.host,
             pid=self.hello.pid,
-            state="evaluating" if self.hello.evaluates and self.state is MemberState.ACTIVE else self.state.value,
+            state=self.role,
             lanes=tuple(sorted(self.lanes)),
             tickets=len(self.tickets),
             steps=heartbeat.steps if heartbeat else 0,

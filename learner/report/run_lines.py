@@ -10,6 +10,7 @@ import re
 import shlex
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -91,11 +92,12 @@ def read_line(path: Path, now: float) -> RunLine:
         name = environment_name(config["env"], config.get("env_kwargs", {}), config["algo"])
     except UsageError as error:
         return RunLine(path, "unreadable", problem=str(error))
-    try:
-        summary, owner = None, living_owner(path, now)
-        row: dict[str, Any] = newest_row(path)
-    except OSError:
-        row = {}
+    summary, owner = None, None
+    row: dict[str, Any] = {}
+    with suppress(UsageError):
+        owner = living_owner(path, now)
+    with suppress(OSError):
+        row = newest_row(path)
     if owner is None:
         try:
             summary = read_summary(path)

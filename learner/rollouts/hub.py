@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeVar
 from learner.members.failure_count import FailureCount
 from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
-from learner.members.member_states import MemberState
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.collecting_member import CollectingMember
@@ -96,14 +95,8 @@ class HubSnapshot(NamedTuple):
     refused_handshakes: int
 
     def worker_states(self) -> Counter[str]:
-        """Number of workers that are active, draining, spare (active without a lane), or evaluating (they do only that)."""
-        return Counter(_state(member) for member in self.members)
-
-
-def _state(member: CollectingMember) -> str:
-    if member.state is MemberState.DRAINING:
-        return "draining"
-    return "evaluating" if member.hello.evaluates else "active" if member.lanes else "spare"
+        """Number of workers by `Member.role`."""
+        return Counter(member.role for member in self.members)
 
 
 HubObserver = Callable[["Hub"], None]

@@ -23,4 +23,5 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiti
         ledger=coordinator.rollouts.ledger.counts(),
         waiting=waiting,
         phase=phase,
+        stages=progress.stages,
     )

@@ -11,7 +11,7 @@ from typing import Any, SupportsFloat
 import msgspec
 
 from learner.run_folder.requests import Requests
-from learner.run_folder.results import Evaluation, FactMean, fact_metrics
+from learner.run_folder.results import EvaluatedPolicy, Evaluation, FactMean, fact_metrics
 from protocol.errors import UsageError
 from protocol.rollout import Episode, Rollout
 
@@ -76,10 +76,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """lag of each rollout of the last update"""
     evaluation: Evaluation | None = None
     """the last evaluation"""
-    evaluated_version: int = -1
-    """the version of the policy that it is of: with `eval_workers` an earlier one than the newest"""
-    evaluated_env_steps: int = 0
-    """env steps of training of that policy"""
+    evaluated: EvaluatedPolicy = EvaluatedPolicy()
+    """the `version` of the policy that it is of, and its `env_steps`: with `eval_workers` an earlier one than the newest"""
+    best: tuple[float, int] | None = None
+    """mean return of the best evaluation so far, and env steps of the policy that it is of"""
     checkpoint: str = ""
     """path of the newest checkpoint; empty before the first"""
     rollouts: tuple[Rollout, ...] = ()

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from learner.run_folder.regular_files import read
-from protocol.bounds import Natural, Real, Seconds
+from protocol.bounds import Natural, Real, Seconds, Version
 
 SUMMARY_FILE = "summary.json"
 EVALUATION_KEY = "eval/mean_reward"
@@ -93,6 +93,14 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
         """The numbers that are logged with a row of metrics."""
         returns = {EVALUATION_KEY: self.return_mean, "eval/mean_ep_length": self.length_mean}
         return returns | fact_metrics("eval", self.facts)
+
+
+class EvaluatedPolicy(msgspec.Struct, frozen=True):
+    """Which policy an evaluation is of. The defaults are of none."""
+
+    version: Version = -1
+    env_steps: Natural = 0
+    """env steps of training of this version"""
 
 
 class Best(msgspec.Struct, frozen=True, kw_only=True):

@@ -267,45 +267,36 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 
     Raises `UsageError`, with a one-line message, if none does, or if it cannot be asked from this machine.
     """
-    if not folder.is_dir():
-        raise UsageError(f"run {folder}: no such folder")
-    try:
-        owner = decoded(read(folder / LOCK_FILE))
-    except FileNotFoundError:
-        raise UsageError(f"run {folder}: no process trains it now") from None
-    except OSError as error:
-        raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {reason(error)}") from error
-    if owner is None:
-        raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
-    here = owner.boot == _boot()
-    if here and not owner.address.startswith("tcp://") and not _is_alive(owner.pid):  # over tcp it may be in a container
-        raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
+    owner = living_owner(folder, time.time())
     if not owner.address:
         why = "it has not begun yet; try again" if owner.closed is None else WHY_CLOSED[owner.closed]
         raise UsageError(f"run {folder}: {owner} trains it and cannot be asked: {why}")
-    if owner.address.startswith("tcp://"):
-        here = here and owner.network == _network()
+    here = owner.boot == _boot() and (not owner.address.startswith("tcp://") or owner.network == _network())
     if not here and is_local(owner.address):
         raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
     return LearnerOfRun(owner.here if here else owner.address, Path(owner.keys) if owner.keys else None, here)
 
 
-def living_owner(folder: Path, now: float) -> Owner | None:
-    """Who seems to train the run in this folder, for people to read; `now` is wall-clock time. None if nobody does.
+def living_owner(folder: Path, now: float) -> Owner:
+    """Who seems to train the run in this folder, for people to read; `now` is wall-clock time.
 
     A process here is looked for by its number. Another one, perhaps in a container, rewrites the file every few seconds; if
-    the clocks of the two machines differ by much, this is wrong, so nothing is decided by it.
+    the clocks of the two machines differ by much, this is wrong, so nothing that is written depends on it. Raises
+    `UsageError`, with a one-line message, if nobody seems to.
     """
     path = folder / LOCK_FILE
     try:
         owner, age_s = decoded(read(path)), now - path.lstat().st_mtime
-    except OSError:
-        return None
+    except FileNotFoundError:
+        raise UsageError(f"run {folder}: {'no process trains it now' if folder.is_dir() else 'no such folder'}") from None
+    except OSError as error:
+        raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {reason(error)}") from error
     if owner is None:
-        return None
-    if owner.boot == _boot() and not owner.address.startswith("tcp://"):
-        return owner if _is_alive(owner.pid) else None
-    return owner if age_s < PACE.dead_after else None
+        raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
+    by_number = owner.boot == _boot() and not owner.address.startswith("tcp://")
+    if not (_is_alive(owner.pid) if by_number else age_s < PACE.dead_after):
+        raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
+    return owner
 
 
 def _is_alive(pid: int) -> bool:

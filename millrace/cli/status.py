@@ -24,6 +24,7 @@ from learner.members.held_up import in_words
 from learner.report.run_lines import RunLine, in_sentences, read_line
 from learner.run_folder.run_format import is_run_folder
 from learner.run_folder.run_lock import learner_of_run
+from learner.run_folder.sentences import bottleneck, went_wrong
 from protocol.errors import Refused, RunError, UsageError
 from protocol.flags.fields import Flag
 from protocol.flags.parse import parse_flags
@@ -35,14 +36,6 @@ from protocol.wire.worker_link import WorkerLink
 from workers.conversation.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
-DROPS = {
-    "lost": "tickets of workers that were lost",
-    "transitions_duplicate": "transitions sent twice",
-    "transitions_late": "transitions of sessions that had ended",
-    "transitions_invalid": "invalid transitions (wrong shape, dtype, value or reset row)",
-    "messages_bad": "messages that could not be read",
-}
-"""Text for each kind of dropped data, by its name in the ledger."""
 LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are right-aligned
 
 
@@ -166,20 +159,20 @@ def last_in_json(line: RunLine) -> str:
 
 
 def as_table(status: Status) -> str:
-    """A line about the run, a table of its workers, how many there are and could be, and what was dropped, by reason."""
+    """A line about the run, what holds it up, a table of its workers, how many there could be, and what went wrong."""
     late = any(worker.late_actions for worker in status.workers)
     evaluating = sum(worker.state == "evaluating" for worker in status.workers)
     here = len(status.workers) + status.workers_left_out - evaluating
     wanted = f"workers: {here} here, {status.workers_wanted} wanted (one for each lane)\n" if status.workers_wanted else ""
-    dropped = [f"{status.ledger[name]:,} {what}" for name, what in DROPS.items() if status.ledger.get(name)]
+    held_up = bottleneck(status.waiting, status.stages)
     return "\n".join(
         [
             _run_line(status),
-            *([_printable(status.waiting)] if status.waiting else []),
+            *([_printable(held_up)] if held_up else []),
             "",
             *table([_cells(worker, status.version, late) for worker in status.workers], LEFT_ALIGNED, "no worker is here"),
             "",
-            f"{wanted}dropped: {', '.join(dropped) or 'nothing'}",
+            f"{wanted}{went_wrong(status.ledger) or 'nothing was lost or dropped'}",
         ]
     )
 
@@ -210,7 +203,7 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
         "worker": _printable(worker.worker) + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
         "host": _printable(worker.host),
         "pid": str(worker.pid),
-        "lanes": ",".join(map(str, worker.lanes)) or "spare" if worker.state == "active" else worker.state,
+        "lanes": ",".join(map(str, worker.lanes)) if worker.state == "active" else _printable(worker.state),
         "tickets": str(worker.tickets),
         "steps/s": f"{worker.steps_per_s:,.0f}",
         "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",

@@ -18,10 +18,11 @@ from learner.metric_names import METRICS, NONE, described, label
 from learner.report.charts import DOT_KEY, Segment, Series, bar, chart
 from learner.report.curve import points
 from learner.report.html_parts import return_text, section
+from learner.report.reported_runs import RunResults
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import EVALUATION_KEY
-from millrace.cli.status import DROPS
+from learner.run_folder.sentences import WRONG, bottleneck, went_wrong
 from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
 from protocol.messages import Status, WorkerStatus
@@ -63,43 +64,28 @@ class Choice(NamedTuple):
         return Choice(first("metric", RETURN_KEY), first("over", "") == "time", min(max(rows, 1), MOST_SMOOTHED))
 
 
-def head(line: RunLine, seen: Seen, newest: Mapping[str, Any], home: str) -> str:
-    """Which run it is, and in one sentence what it does, or how it ended. `newest`: its newest row."""
+def head(line: RunLine, seen: Seen, results: RunResults | None, home: str) -> str:
+    """Which run it is, and in one sentence what it does, or how it ended."""
     title = f"{escape(line.env or line.name)} <small>{escape(algorithm_label(line.algo))}, seed {line.seed}</small>"
     return (
         f'<header><p class="kicker"><a href="{home}">millrace: all runs</a></p><h1>{title}</h1>'
-        f'<p class="now {line.state}">{escape(now_sentence(line, seen, newest))}</p>'
+        f'<p class="now {line.state}">{escape(now_sentence(line, seen, results))}</p>'
         f'<p class="kicker">{escape(line.name)}</p></header>'
     )
 
 
-def now_sentence(line: RunLine, seen: Seen, newest: Mapping[str, Any]) -> str:
+def now_sentence(line: RunLine, seen: Seen, results: RunResults | None) -> str:
     """What the run does now, and what holds it up or is wrong with it."""
     if line.state != "training":
         return headline(line)
     text = [headline(line)]
     if seen.problem:
         text.append(f"Who waits for whom is not known: {seen.problem}.")
-    elif seen.status is not None and seen.status.waiting:
-        said = seen.status.waiting
-        text.append(f"The learner {said}." if said.startswith("waited") else f"The learner is {said}.")
-    else:
-        text.append(_slowest_part(newest))
-    if lost := newest.get("ledger/lost"):
-        text.append(f"{lost:,.0f} {'rollout was' if lost == 1 else 'rollouts were'} lost and dealt again.")
+    elif results is not None:
+        text.append(bottleneck(seen.status.waiting if seen.status is not None else "", results.stages))
+    if results is not None and (wrong := went_wrong(results.ledger)):
+        text.append(f"{wrong}.")
     return " ".join(filter(None, text))
-
-
-def _slowest_part(newest: Mapping[str, Any]) -> str:
-    """What takes most of the time of a run in which nobody waits long."""
-    spent = {name: newest.get(f"stage/{name}") or 0.0 for name in ("learner_wait", "learner_update", "worker_wait")}
-    workers_s = sum(value or 0.0 for name, value in newest.items() if name.startswith("stage/worker_"))
-    learner_s = spent["learner_wait"] + spent["learner_update"]
-    if not (workers_s > 0 and learner_s > 0):
-        return ""
-    update, idle = spent["learner_update"] / learner_s, spent["worker_wait"] / workers_s
-    slowest = "Updates are" if update > 2 / 3 else "Collecting is" if update < 1 / 3 else "No part is"
-    return f"{slowest} the slowest part: the learner updates for {update:.0%} of the time, and workers wait for {idle:.0%}."
 
 
 def facts(line: RunLine) -> str:
@@ -224,7 +210,7 @@ def _worker(worker: WorkerStatus, status: Status) -> str:
     name = f'<th scope="row">{escape(worker.worker)}{strikes}</th>'
     slow = worker.doing_s >= 10 and worker.doing != "waiting"
     doing = f"<td{' class=bad' * slow}>{escape(in_words(worker.doing, worker.doing_s))}</td>"
-    lanes = ", ".join(map(str, worker.lanes)) or ("spare" if worker.state == "active" else worker.state)
+    lanes = ", ".join(map(str, worker.lanes)) if worker.state == "active" else worker.state
     weights = "none yet" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind"
     numbers = (
         f"{worker.steps_per_s:,.0f}",
@@ -272,12 +258,10 @@ def history(rows: Sequence[Mapping[str, Any]]) -> str:
     """When something was lost or dropped, the newest first."""
     found, before = list[str](), dict[str, float]()
     for row in rows:
-        counts = {name: row.get(f"ledger/{name}") or 0 for name in DROPS}
-        more = {name: counts[name] - before.get(name, 0) for name in DROPS}
-        lost = [f"{more[name]:,.0f} {what}" for name, what in DROPS.items() if more[name] > 0]
-        if lost:
+        counts = {name: row.get(f"ledger/{name}") or 0 for name in WRONG}
+        if wrong := went_wrong({name: counts[name] - before.get(name, 0) for name in WRONG}):
             when = f"after {duration(row.get('time/time_elapsed') or 0)}, at {row[ENV_STEPS_KEY]:,} env steps"
-            found.append(f"<li>{escape(', '.join(lost))} <small>{escape(when)}</small></li>")
+            found.append(f"<li>{escape(wrong)} <small>{escape(when)}</small></li>")
         before = counts
     left_out = f"<p>And {len(found) - MOST_HISTORY} earlier ones.</p>" if len(found) > MOST_HISTORY else ""
     items = "".join(reversed(found[-MOST_HISTORY:]))

@@ -76,10 +76,10 @@ class Site:
         try:
             content = self._runs.content(run)
         except UsageError as error:
-            return run_page.head(line, Seen(problem=str(error)), {}, home)
+            return run_page.head(line, Seen(problem=str(error)), None, home)
         report = group_runs([content.report])
         parts = [
-            run_page.head(line, seen, content.rows[-1] if content.rows else {}, home),
+            run_page.head(line, seen, content.report.results, home),
             run_page.facts(line),
             run_page.curve(content.rows, Choice.of(request.query)),
             run_page.who_waits(seen),

@@ -17,8 +17,9 @@ from learner.config.config import Config
 from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.run_folder.atomic_write import Writes
+from learner.run_folder.results import EvaluatedPolicy
 from learner.run_folder.run_folder import RunFolder
-from learner.run_state import EvaluatedPolicy, RunState
+from learner.run_state import RunState
 from millrace.cli.flags import EvaluateFlags
 from protocol.bounds import LARGEST
 from protocol.rollout import Episode
@@ -92,7 +93,7 @@ def test_evaluations_do_not_come_in_bursts_after_a_resume_with_another_eval_ever
 def test_the_final_policy_can_be_the_best_after_a_resume_without_evaluations() -> None:
     fakes = Fakes(7.0, 7.5)
     policy = np.array([-1], np.float32), np.zeros(0, np.float32)
-    state = RunState(version=9, env_steps=4_000, best=[5.0, 100.0], best_policy=policy)
+    state = RunState(version=9, env_steps=4_000, best=(5.0, 100), best_policy=policy)
     _, evaluations = fakes.evaluations(0, state)
     assert evaluations.conclude(lambda: None)
     best = evaluations.confirmed
@@ -109,16 +110,16 @@ TARGET = "target return 5 reached"
 @pytest.mark.parametrize(
     ("eval_workers", "returns", "evaluated", "reason", "best"),
     [
-        (0, [3.0, 6.0, 1.0], [100, 200], TARGET, [6.0, 200]),
-        (1, [3.0, 6.0, 1.0], [100, 200], f"{TARGET} by the policy of 200 env steps", [6.0, 200]),
-        (1, [6.0, 1.0], [100], f"{TARGET} by the policy of 100 env steps", [6.0, 100]),
-        (0, [3.0, 1.0, 2.0, 6.0], [100, 200, 300, 400], TARGET, [6.0, 400]),
-        (1, [3.0, 1.0, 2.0, 6.0], [100, 200, 300], "all steps done", [6.0, 400]),
-        (1, [3.0, 3.0, 2.0, 1.0], [100, 200, 300], "all steps done", [3.0, 100]),
+        (0, [3.0, 6.0, 1.0], [100, 200], TARGET, (6.0, 200)),
+        (1, [3.0, 6.0, 1.0], [100, 200], f"{TARGET} by the policy of 200 env steps", (6.0, 200)),
+        (1, [6.0, 1.0], [100], f"{TARGET} by the policy of 100 env steps", (6.0, 100)),
+        (0, [3.0, 1.0, 2.0, 6.0], [100, 200, 300, 400], TARGET, (6.0, 400)),
+        (1, [3.0, 1.0, 2.0, 6.0], [100, 200, 300], "all steps done", (6.0, 400)),
+        (1, [3.0, 3.0, 2.0, 1.0], [100, 200, 300], "all steps done", (3.0, 100)),
     ],
 )
 def test_when_a_run_stops_and_which_policy_it_keeps(
-    eval_workers: int, returns: list[float], evaluated: list[int], reason: str, best: list[float]
+    eval_workers: int, returns: list[float], evaluated: list[int], reason: str, best: tuple[float, int]
 ) -> None:
     """`evaluated`: env steps of the policies whose results came before the run stopped, at 430 env steps at the latest."""
     fakes, state = Fakes(*returns, *returns), RunState()
@@ -126,7 +127,7 @@ def test_when_a_run_stops_and_which_policy_it_keeps(
     found = []
     for state.version, state.env_steps in enumerate(range(30, 431, 10), 1):
         if tally.evaluation_is_due() and evaluations.evaluate_when_due(lambda: None) is not None:
-            found.append(state.evaluated_env_steps)
+            found.append(state.evaluated.env_steps)
         if (stop := tally.stop_reason()) is not None:
             break
     assert (found, stop) == (evaluated, reason)
@@ -161,7 +162,7 @@ def test_an_evaluation_begins_again_when_the_run_is_resumed(eval_workers: int) -
         metrics = evaluations.evaluate_when_due(lambda: None)
     assert metrics is not None
     assert (metrics["eval/mean_reward"], metrics["eval/env_steps"]) == (3.0, 100)
-    assert (state.evaluated_version, state.best, fakes.written) == (3, [3.0, 100], [7.0])
+    assert (state.evaluated.version, state.best, fakes.written) == (3, (3.0, 100), [7.0])
     assert (state.pending is None) == (not eval_workers)
 
 

@@ -114,7 +114,7 @@ def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
         pages = Pages(tmp_path, seen=Seen(two, (sample(two, 5.0),)))
         said = pages.said(f"run/{key_of(run)}")
         silent = Pages(tmp_path, seen=Seen(problem="its learner does not answer")).said(f"run/{key_of(run)}")
-    assert f"The learner is {waits}." in said
+    assert f"The learner has been {waits}." in said
     assert said.index(waits) < said.index("Env steps")
     assert "box 1 worker, 7 env steps per second w0 in step" in said
     assert "far 1 worker, 7 env steps per second w1 in reset for 11 s" in said
@@ -128,7 +128,7 @@ def test_where_nobody_waits_long_the_slowest_part_is_named(tmp_path: Path) -> No
     with RunLock(run):
         said = Pages(tmp_path, seen=Seen(status(worker()))).said(f"run/{key_of(run)}")
     slowest = "Updates are the slowest part: the learner updates for 75% of the time, and workers wait for 50%."
-    assert f"{slowest} 6 rollouts were lost and dealt again." in said
+    assert f"{slowest} 6 rollouts were lost and dealt again, " in said
 
 
 def test_any_metric_can_be_chosen(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_what_was_lost_is_told_with_its_time(tmp_path: Path) -> None:
         for i, lost in enumerate((0, 0, 3, 3, 4))
     ]
     said = Safe(run_page.history(rows)).text
-    assert "1 tickets of workers that were lost after 4.0 s, at 40 env steps 3 tickets" in said
+    assert "1 rollout was lost and dealt again after 4.0 s, at 40 env steps 3 rollouts were lost" in said
     assert "after 2.0 s, at 20 env steps" in said
     assert "Nothing was lost" in run_page.history(rows[:2])
 

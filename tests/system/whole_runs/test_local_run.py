@@ -525,7 +525,7 @@ def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: 
         assert not check_format(folder).workers_elsewhere
         assert {worker["worker"] for worker in answer["workers"]} == {"w0", "w1"}
         assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in preloaded.workers_of(learner.pid)}
-        assert "dropped: nothing" in status().stdout
+        assert "nothing was lost or dropped" in status().stdout
     ended = status()
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout.startswith("Interrupted: interrupted; continue it with: millrace train --resume ")

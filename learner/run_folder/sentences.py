@@ -1,0 +1,54 @@
+"""What holds a run up, and what went wrong in it, in sentences for people: on a terminal, in a notebook, on a page. Pure.
+
+Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
+the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
+COLLECTING = ("act", "step", "wait")
+WRONG = {
+    "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
+    "transitions_duplicate": ("env step came twice", "env steps came twice"),
+    "transitions_late": ("env step came too late", "env steps came too late"),
+    "transitions_invalid": ("env step was invalid", "env steps were invalid"),
+    "messages_bad": ("message could not be read", "messages could not be read"),
+    "late_actions": ("action came too late", "actions came too late"),
+}
+"""What is said of one and of several, by name in the ledger"""
+
+
+def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
+    """Who is waited for now, or else which part of the run takes most of the time. Empty while nothing is known.
+
+    `waiting`: `Progress.waiting`. `stages`: seconds in each stage, as `Progress.stages`.
+    """
+    if waiting:
+        return f"The learner {'' if waiting.startswith('waited') else 'has been '}{waiting}."
+    learner = {name: stages.get(f"learner_{name}") or 0.0 for name in ("wait", "update", "other", "evaluate")}
+    worker = {name: stages.get(f"worker_{name}") or 0.0 for name in COLLECTING}
+    all_s, collecting_s = sum(learner.values()), sum(worker.values())
+    training_s = all_s - learner["evaluate"]
+    if learner["evaluate"] > all_s / 2:
+        return f"Evaluations are the slowest part: they take {learner['evaluate'] / all_s:.0%} of the time."
+    if not (training_s and collecting_s):
+        return ""
+    waits, idle = learner["wait"] / training_s, worker["wait"] / collecting_s
+    if abs(waits - idle) < ABOUT_EQUAL:
+        return f"No part is the slowest: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
+    if waits > idle:
+        return f"Collecting is the slowest part: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
+    what, did, seconds = "Updates are", "updates", learner["update"]
+    if learner["other"] > seconds:
+        what, did, seconds = "Callbacks, checkpoints and metrics are", "is busy with them", learner["other"]
+    of_time = f"{seconds / training_s:.0%} of the time, and workers wait for {idle:.0%}"
+    return f"{what} the slowest part: the learner {did} for {of_time}."
+
+
+def went_wrong(counts: Mapping[str, float | None]) -> str:
+    """What was lost, dropped or bad, by these counts of the ledger. Empty if nothing was."""
+    found = ((counts.get(name) or 0, texts) for name, texts in WRONG.items())
+    return ", ".join(f"{count:,.0f} {texts[count != 1]}" for count, texts in found if count > 0)
