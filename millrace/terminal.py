@@ -8,6 +8,7 @@ stream which is full or closed does not end the run.
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,14 +22,18 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from learner.report.sentences import bottleneck, went_wrong
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
+from learner.run_folder.results import ALL_STEPS_DONE
+from millrace.sparkline import ASCII, BLOCKS, Sparkline
 from protocol.bounds import escaped
 from protocol.logs.notices import is_notice
 
 REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
 LINE_EVERY_S = 5.0
+GAP = "   "  # between the figures of a row
 
 
 class ProgressView(Protocol):
@@ -219,10 +224,11 @@ class PlainLines:
     """Plain lines, for logs, pipes and batch systems."""
 
     def show(self, progress: Progress) -> None:
-        """Print one line."""
-        parts = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *main_figures(progress).values()]
-        parts += [progress.waiting] if progress.waiting else []
-        self.print_line(" | ".join(parts))
+        """Print one line. Which part is the slowest, and what went wrong, is said at the end."""
+        ended = bool(progress.stop_reason)
+        said = bottleneck(progress.waiting, progress.stages if ended else {})
+        parts = [main_figures(progress), said, went_wrong(progress.ledger) if ended else ""]
+        self.print_line(" | ".join(filter(None, parts)))
 
     def print_line(self, line: str) -> None:
         """Print the line."""
@@ -254,28 +260,23 @@ class NotebookCell:
             self.show("", "")
 
 
-class NotebookBlock:
-    """A block that is updated in the cell's output. Notes are printed below it."""
+class NotebookBlock(PlainLines):
+    """A block that is updated in the cell's output. Notes are lines below it."""
 
     def __init__(self, cell: NotebookCell) -> None:
-        self._cell = cell
+        self._cell, self._returns = cell, Sparkline()
 
     def show(self, progress: Progress) -> None:
         """Update the block."""
-        figures = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *main_figures(progress).values()]
-        cells = [(escape(name), escape(escaped(text))) for name, text in detail_rows(progress).items()]
+        self._returns.add(progress.env_steps, progress.return_mean)
+        share, head = how_far(progress)
+        cells = [(escape(name), escape(escaped(text))) for name, text in block_rows(progress, self._returns).items()]
         left = "style='text-align:left'"
         rows = "".join(f"<tr><td {left}>{name}</td><td {left}>{text}</td></tr>" for name, text in cells)
-        bar = f"<progress max='{max(1, progress.total_steps)}' value='{progress.env_steps}' style='width:20em'></progress>"
-        head = " &nbsp; ".join(map(escape, figures))
-        self._cell.show(" | ".join(figures), f"{bar}<div>{head}</div><table style='font-size:smaller'>{rows}</table>")
-
-    def print_line(self, line: str) -> None:
-        """Print the line."""
-        print(escaped(line), flush=True)
-
-    def close(self) -> None:
-        """Leave the block as it is."""
+        total = max(1, progress.total_steps)
+        bar = "" if share is None else f"<progress max='{total}' value='{share * total:.0f}' style='width:20em'></progress> "
+        html = f"<div>{bar}{escape(escaped(head))}</div><table style='font-size:smaller'>{rows}</table>"
+        self._cell.show(main_figures(progress), html)
 
 
 class JsonEvents:
@@ -302,13 +303,14 @@ class LiveBlock:
     """A block that is redrawn in place on a terminal."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
+        self._console, self._returns = console, Sparkline(ASCII if console.options.ascii_only else BLOCKS)
         self._live = Live(console=console, auto_refresh=False)
         self._live.start()
 
     def show(self, progress: Progress) -> None:
         """Redraw the block."""
-        self._live.update(render_block(progress), refresh=True)
+        self._returns.add(progress.env_steps, progress.return_mean)
+        self._live.update(render_block(progress, self._returns), refresh=True)
 
     def print_line(self, line: str) -> None:
         """Print the line above the block."""
@@ -319,75 +321,81 @@ class LiveBlock:
         self._live.stop()
 
 
-def main_figures(progress: Progress) -> dict[str, str]:
-    """The most important figures, as text by name."""
-    expected = progress.workers_expected
-    score = "none yet" if progress.return_mean is None else f"{progress.return_mean:,.1f}"
-    return {
-        "speed": f"{progress.steps_per_s:,.0f} steps/s",
-        "return": f"return {score}",
-        "lag": f"lag {progress.lag_mean:.1f} (max {progress.lag_max})",
-        "workers": f"workers {progress.workers_alive}" + (f" of {expected}" if expected else ""),
-        "update": f"update {progress.updates:,}",
+def main_figures(progress: Progress) -> str:
+    """The most important figures in one line."""
+    figures = [
+        f"{progress.env_steps:,} of {progress.total_steps:,} env steps",
+        f"{progress.steps_per_s:,.0f} steps/s",
+        f"return {_return(progress)}",
+        _lag(progress),
+        f"workers {_workers(progress)}",
+        f"update {progress.updates:,}",
+    ]
+    return " | ".join(figures)
+
+
+def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
+    """What a block shows below its head, as text by name. `returns`: of the run so far."""
+    best = progress.best
+    steps = f"{progress.env_steps:,} of {progress.total_steps:,}"
+    evaluated = "" if best is None else f"best evaluation {best[0]:,.1f} at {best[1]:,} env steps"
+    rows = {
+        "env steps": GAP.join((steps, f"{progress.steps_per_s:,.0f} a second", f"update {progress.updates:,}")),
+        "return": GAP.join(filter(None, (_return(progress), str(returns), evaluated))),
+        "workers": GAP.join((_workers(progress), _lag(progress))),
+        "time": bottleneck("" if progress.stop_reason else progress.waiting, progress.stages),
+        "lost": went_wrong(progress.ledger),
+        "run": progress.run,
     }
+    return {name: text for name, text in rows.items() if text}
 
 
-def render_block(progress: Progress) -> RenderableType:
-    """A progress bar, the main figures, where the time goes, what became of tickets and transitions, the run folder."""
-    done = min(1.0, progress.env_steps / progress.total_steps) if progress.total_steps else 0.0
-    bar = Table.grid(padding=(0, 1))
-    bar.add_row(
-        ProgressBar(total=1.0, completed=done, width=34, complete_style="cyan", finished_style="green"),
-        Text(f"{done:4.0%}", style="bold"),
-        Text(f"{progress.env_steps:,} of {progress.total_steps:,} env steps"),
-        Text(_elapsed_and_left(progress, done), style="dim"),
-    )
-    head = Text("   ").join(_styled(name, text, progress) for name, text in main_figures(progress).items())
+def how_far(progress: Progress) -> tuple[float | None, str]:
+    """The share of the run that is done, and what to say of it. Of one that ended early no share, but why it ended."""
+    took = _clock_time(progress.wall_s)
+    if progress.stop_reason == ALL_STEPS_DONE:
+        return 1.0, f"100%  done in {took}"
+    if progress.stop_reason:
+        return None, f"{'Interrupted' if progress.cut_short else 'Finished'} after {took}: {progress.stop_reason}"
+    share = min(1.0, progress.env_steps / progress.total_steps) if progress.total_steps else 0.0
+    left_s = (progress.total_steps - progress.env_steps) / progress.steps_per_s if progress.steps_per_s else 0.0
+    return share, f"{math.floor(100 * share)}%  {took}" + (f", {_clock_time(left_s)} left" if left_s >= 1 else "")
+
+
+def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
+    """A progress bar, or how the run ended; then the rows."""
+    share, said = how_far(progress)
+    head: RenderableType = Text(escaped(said), style="bold")
+    if share is not None:
+        bar = Table.grid(padding=(0, 1))
+        bar.add_row(ProgressBar(total=1.0, completed=share, width=34, complete_style="cyan", finished_style="green"), head)
+        head = bar
     rows = Table.grid(padding=(0, 2))
     rows.add_column(style="dim", no_wrap=True)
     rows.add_column(overflow="fold")
-    for name, text in detail_rows(progress).items():
-        rows.add_row(name, Text(escaped(text)))
-    return Group(bar, head, rows)
+    missing = not progress.stop_reason and progress.workers_alive < progress.workers_expected
+    styles = {"return": "bold green", "workers": "bold yellow" if missing else ""}
+    for name, text in block_rows(progress, returns).items():
+        rows.add_row(name, Text(escaped(text), style=styles.get(name, "")))
+    return Group(head, rows)
 
 
-def detail_rows(progress: Progress) -> dict[str, str]:
-    """The details, as text by name: each stage's share of the time, counts that are not zero, the run folder."""
-    rows = {"now": progress.waiting} if progress.waiting else {}
-    for owner in ("learner", "worker"):
-        seconds = {name.removeprefix(f"{owner}_"): s for name, s in progress.stages.items() if name.startswith(owner)}
-        if total := sum(seconds.values()):
-            rows[f"{owner} time"] = " · ".join(f"{name} {s / total:.0%}" for name, s in seconds.items())
-    for kind in ("tickets", "transitions", "messages"):
-        counts = {name: count for name, count in progress.ledger.items() if _kind(name) == kind and count}
-        if counts:
-            rows[kind] = " · ".join(f"{name.removeprefix(f'{kind}_')} {count:,}" for name, count in counts.items())
-    return rows | {"run": progress.run}
+def _return(progress: Progress) -> str:
+    return "none yet" if progress.return_mean is None else f"{progress.return_mean:,.1f}"
 
 
-def _kind(name: str) -> str:
-    """The unit of a count of the ledger: transitions or messages by its prefix, else tickets."""
-    first, _, rest = name.partition("_")
-    return first if rest and first in ("transitions", "messages") else "tickets"
+def _lag(progress: Progress) -> str:
+    return f"lag {progress.lag_mean:.1f} (max {progress.lag_max})"
 
 
-def _elapsed_and_left(progress: Progress, done: float) -> str:
-    steps = progress.total_steps - progress.env_steps
-    if done >= 1 or not progress.steps_per_s:
-        return f"{_clock_time(progress.wall_s)} in all"
-    return f"{_clock_time(progress.wall_s)}, {_clock_time(steps / progress.steps_per_s)} left"
+def _workers(progress: Progress) -> str:
+    return f"{progress.workers_alive}" + (f" of {progress.workers_expected}" if progress.workers_expected else "")
 
 
 def _clock_time(seconds: float) -> str:
     minutes, s = divmod(round(seconds), 60)
     hours, m = divmod(minutes, 60)
     return f"{hours}:{m:02}:{s:02}" if hours else f"{m}:{s:02}"
-
-
-def _styled(name: str, text: str, progress: Progress) -> Text:
-    running = progress.env_steps < progress.total_steps
-    missing = name == "workers" and running and progress.workers_alive < progress.workers_expected
-    return Text(text, style={"return": "bold green"}.get(name, "bold yellow" if missing else "bold"))
 
 
 class _WarningHandler(logging.Handler):

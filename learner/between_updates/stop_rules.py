@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from learner.config.config import Config
+from learner.run_folder.results import ALL_STEPS_DONE
 
 
 def reason_to_stop(
@@ -26,4 +27,4 @@ def reason_to_stop(
     target = config.target_mean_return
     if target is not None and training_return is not None and training_return >= target:
         return f"mean return {target:g} of the last episodes reached"
-    return "all steps done" if env_steps_after_next_update > config.steps else None
+    return ALL_STEPS_DONE if env_steps_after_next_update > config.steps else None

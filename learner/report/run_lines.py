@@ -6,6 +6,7 @@ no process trains it, and it has no results.
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 import time
@@ -21,7 +22,7 @@ from learner.report.metrics_tail import newest_row
 from learner.run_folder.lease import Owner
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
 from learner.run_folder.regular_files import reason
-from learner.run_folder.results import Summary, read_summary
+from learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
 from learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
 from learner.run_folder.run_lock import living_owner
 from protocol.bounds import MAX_NAME, one_line
@@ -29,6 +30,7 @@ from protocol.errors import UsageError
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
 MOST_RUNS = 1_000  # of a folder
+MOST_REASON = 40  # characters
 STARTED = re.compile(r"-(\d{8}-\d{6})(?:-\d{1,9})?")
 
 
@@ -60,9 +62,12 @@ class RunLine(NamedTuple):
         return one_line(self.path.resolve().name, MAX_NAME)
 
     @property
-    def progress(self) -> float:
-        """The share of its env steps that is done."""
-        return min(1.0, self.env_steps / self.total_steps) if self.total_steps > 0 else 0.0
+    def done(self) -> str:
+        """How much of it is done, or why it ended before."""
+        if self.summary is not None:
+            reason = self.summary.stop_reason
+            return "100%" if reason == ALL_STEPS_DONE else one_line(reason, MOST_REASON)
+        return f"{math.floor(100 * min(1.0, self.env_steps / self.total_steps)) if self.total_steps > 0 else 0}%"
 
     @property
     def left_s(self) -> float | None:
@@ -137,7 +142,7 @@ def headline(line: RunLine) -> str:
     match line.state:
         case "training":
             left = "" if line.left_s is None else f", about {duration(line.left_s)} left"
-            return f"Training: {line.progress:.0%} done, {line.steps_per_s:,.0f} env steps per second{left}."
+            return f"Training: {line.done} done, {line.steps_per_s:,.0f} env steps per second{left}."
         case "unreadable":
             return f"It cannot be read: {line.problem}."
         case "dead":

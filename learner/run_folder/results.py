@@ -14,6 +14,8 @@ from learner.run_folder.regular_files import read
 from protocol.bounds import Natural, Real, Seconds, Version
 
 SUMMARY_FILE = "summary.json"
+ALL_STEPS_DONE = "all steps done"
+"""why a run ended that was not ended before"""
 EVALUATION_KEY = "eval/mean_reward"
 EVALUATED_AT_KEY = "eval/env_steps"
 """env steps of the policy that was evaluated beside training: fewer than those of the row with the result"""

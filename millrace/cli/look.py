@@ -30,7 +30,7 @@ def _cells(line: RunLine) -> dict[str, str]:
         "algorithm": algorithm_label(line.algo),
         "return": "-" if line.return_mean is None else f"{line.return_mean:,.1f}",
         "env steps": f"{line.env_steps:,.0f}",
-        "done": f"{line.progress:.0%}",
+        "done": line.done,
         "steps/s": f"{line.steps_per_s:,.0f}",
         "started": line.started,
     }

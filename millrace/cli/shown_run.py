@@ -1,4 +1,4 @@
-"""Train, show the progress meanwhile, and print how the run ended.
+"""Train, show the progress meanwhile, and print how the run ended, and commands that go on with it.
 
 Rule: output that cannot be written is dropped; the run goes on.
 """
@@ -6,11 +6,13 @@ Rule: output that cannot be written is dropped; the run goes on.
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from learner.config.presets import origin
+from learner.run_folder.results import ALL_STEPS_DONE
 from learner.run_folder.run_folder import RunFolder
 from learner.standard_streams import unfailing
 from millrace.terminal import progress_view
@@ -20,16 +22,24 @@ if TYPE_CHECKING:
     from learner.callbacks.callbacks import Watch
     from learner.config.config import Config
     from learner.run_folder.progress import Progress
+    from learner.run_folder.results import Summary
 
 log = logging.getLogger("millrace.learner")
 
 
-def show_run(argv: list[str], train: Callable[[Watch], Path], new: Config | None = None) -> int:
-    """Train. `new`: the settings of a new run, whose origin is shown before its first progress. Returns the exit code."""
+def show_run(argv: list[str], train: Callable[[Watch], Path], new: Config | None = None, command: str = "train") -> int:
+    """Train. `new`: the settings of a new run, whose origin is shown before its first progress. Returns the exit code.
+
+    `command`: that of millrace which resumes the run.
+    """
+    log_json = "--log-json" in argv
     with unfailing("stdout"):
-        with progress_view("--log-json" in argv) as watch:
+        with progress_view(log_json) as watch:
             run = train(watch if new is None else _after_origin(new, watch))
-        return _print_result(run)
+        summary = RunFolder(run).summary()
+        lines = [] if summary is None else result(summary)
+        print("\n".join([*lines, *([f"run folder: {run}"] if log_json else next_commands(run, summary, command))]))
+        return 0
 
 
 def _after_origin(config: Config, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
@@ -44,14 +54,20 @@ def _after_origin(config: Config, watch: Callable[[Progress], None]) -> Callable
     return logged
 
 
-def _print_result(run: Path) -> int:
-    """Print how a run ended, and its folder."""
-    summary = RunFolder(run).summary()
-    if summary is not None:
-        print(f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s")
-        if summary.evaluation is not None:
-            print(f"greedy {summary.evaluation}")
-        if (best := summary.best) is not None and best.env_steps != summary.env_steps:
-            print(f"best policy, after {best.env_steps:,} env steps: greedy {best.evaluation}")
-    print(f"run folder: {run}")
-    return 0
+def result(summary: Summary) -> list[str]:
+    """How a run ended, and what its policy reached."""
+    lines = [f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s"]
+    if summary.evaluation is not None:
+        lines.append(f"greedy {summary.evaluation}")
+    if (best := summary.best) is not None and best.env_steps != summary.env_steps:
+        lines.append(f"best policy, after {best.env_steps:,} env steps: greedy {best.evaluation}")
+    return lines
+
+
+def next_commands(run: Path, summary: Summary | None, command: str) -> list[str]:
+    """Commands for a shell: look at the run, play its policy, and train it about twice as long if it made all its steps."""
+    where = shlex.quote(str(run))
+    commands = [f"dashboard {where}", f"evaluate {where}"]
+    if summary is not None and summary.stop_reason == ALL_STEPS_DONE:
+        commands.append(f"{command} --resume {where} --steps {float(f'{2 * summary.env_steps:.2g}'):.0f}")
+    return ["next:", *(f"  millrace {line}" for line in commands)]

@@ -22,9 +22,9 @@ from msgspec import Meta
 
 from learner.members.held_up import in_words
 from learner.report.run_lines import RunLine, in_sentences, read_line
+from learner.report.sentences import bottleneck, went_wrong
 from learner.run_folder.run_format import is_run_folder
 from learner.run_folder.run_lock import learner_of_run
-from learner.run_folder.sentences import bottleneck, went_wrong
 from protocol.errors import Refused, RunError, UsageError
 from protocol.flags.fields import Flag
 from protocol.flags.parse import parse_flags

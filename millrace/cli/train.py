@@ -23,4 +23,4 @@ def _train(argv: list[str], command: Literal["train", "learner"]) -> int:
     from millrace.launch import training  # takes 0.2 s to import: not before the flags are known to be right
 
     elsewhere, new = command == "learner", None if resume else config
-    return show_run(argv, lambda watch: training.train(config, resume, watch, elsewhere=elsewhere), new)
+    return show_run(argv, lambda watch: training.train(config, resume, watch, elsewhere=elsewhere), new, command)

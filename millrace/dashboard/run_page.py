@@ -20,9 +20,9 @@ from learner.report.curve import points
 from learner.report.html_parts import return_text, section
 from learner.report.reported_runs import RunResults
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
+from learner.report.sentences import WRONG, bottleneck, went_wrong
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import EVALUATION_KEY
-from learner.run_folder.sentences import WRONG, bottleneck, went_wrong
 from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
 from protocol.messages import Status, WorkerStatus

@@ -170,7 +170,7 @@ def _run_row(line: RunLine, home: str) -> str:
     cells = [
         f'<td><b class="state {line.state}">{line.state}</b></td>',
         f'<td class="number">{score}</td>',
-        f'<td class="number">{line.progress:.0%}{left}</td>',
+        f'<td class="number">{escape(line.done)}{left}</td>',
         f'<td class="number late">{line.steps_per_s:,.0f}</td>',
         f'<td class="late">{line.started}</td>',
     ]

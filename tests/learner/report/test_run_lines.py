@@ -21,13 +21,14 @@ def test_a_finished_run_says_why_it_ended(tmp_path: Path) -> None:
     line = read_line(a_run(tmp_path), time.time())
     assert line.state == "finished"
     assert headline(line) == "Finished: all steps done."
+    assert line.done == "100%"
     assert "123,456 of 100,000 env steps" in in_sentences(line)
     assert "greedy return -1233.6 ± 7.5" in in_sentences(line)
 
 
 def test_a_run_that_failed_says_why_and_how_to_continue(tmp_path: Path) -> None:
     line = read_line(a_run(tmp_path, failure="no worker came"), time.time())
-    assert line.state == "interrupted"
+    assert (line.state, line.done) == ("interrupted", "no worker came"), "no percentage"
     assert headline(line).startswith("Interrupted: no worker came; continue it with: millrace train --resume ")
 
 
@@ -35,7 +36,8 @@ def test_a_run_without_a_process_and_without_results_is_dead(tmp_path: Path) -> 
     run = a_run(tmp_path, finished=False)
     line = read_line(run, time.time())
     assert line.state == "dead"
-    assert (line.env_steps, line.updates, line.return_mean) == (2000, 20, 101.0)
+    assert (line.env_steps, line.updates, line.return_mean, line.done) == (2000, 20, 101.0, "2%")
+    assert line._replace(env_steps=99_999).done == "99%", "it is not done"
     (run / METRICS_FILE).unlink()
     assert (read_line(run, time.time()).env_steps, line.left_s) == (0, None)
 

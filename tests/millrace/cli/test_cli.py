@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import millrace
 from learner.callbacks.callbacks import Callbacks
@@ -28,6 +29,7 @@ from learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.cli.commands import COMMANDS
 from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.cli.main import main
+from millrace.cli.shown_run import next_commands
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, NoWorkers
@@ -242,16 +244,36 @@ def test_the_end_of_a_run_names_its_best_policy_unless_it_is_the_final_one(
     )  # fmt: skip
     assert main(["train", "CartPole-v1"]) == 0
     named = ["best policy, after 100 env steps: greedy return 9.5 ± 0.5 over 2 episodes"] if final != 100 else []
-    assert capsys.readouterr().out.splitlines()[-2 - len(named) :] == [
-        "greedy return 9.5 ± 0.5 over 2 episodes", *named, "run folder: runs/a-run",
+    assert capsys.readouterr().out.splitlines()[-5 - len(named) :] == [
+        "greedy return 9.5 ± 0.5 over 2 episodes", *named, "next:", "  millrace dashboard runs/a-run",
+        "  millrace evaluate runs/a-run", f"  millrace train --resume runs/a-run --steps {2 * final}",
     ]  # fmt: skip
+
+
+def test_the_next_commands_are_for_a_shell_and_more_steps_for_a_run_that_made_all() -> None:
+    ended = Summary(
+        env="E", algo="ppo", seed=1, env_steps=29_996, updates=1, wall_s=0.5, env_steps_per_s=20.0,
+        stop_reason="all steps done", return_mean_100=None, evaluation=None,
+    )  # fmt: skip
+    commands = next_commands(Path("my runs/a"), ended, "learner")
+    assert commands[1] == "  millrace dashboard 'my runs/a'"
+    assert commands[-1] == "  millrace learner --resume 'my runs/a' --steps 60000"
+    assert len(next_commands(Path("a"), replace(ended, stop_reason="target return 9 reached"), "train")) == 3
+
+
+def test_for_programs_the_last_line_is_the_run_folder(asked: list[Any], capsys: Captured) -> None:
+    assert main(["train", "CartPole-v1", "--log-json"]) == 0
+    assert capsys.readouterr().out == "run folder: runs/a-run\n"
 
 
 def test_flags_stand_above_the_file_and_the_preset(asked: list[Any], capsys: Captured) -> None:
     Path("my.toml").write_text('env = "CartPole-v1"\nseed = 7\n[ppo]\ngamma = 0.5\nnet = [8]\n[env_kwargs]\na = 1\nb = 1\n')
     argv = "--config my.toml --net 32 16 --target-return -150 --no-normalize-advantage --env-kwargs b 2.5 c True --workers 3"
     assert main(["train", *argv.split()]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "run folder: runs/a-run"
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "  millrace dashboard runs/a-run",
+        "  millrace evaluate runs/a-run",
+    ]
     ((config, resume, _),) = asked
     assert resume is None
     assert config == resolve(

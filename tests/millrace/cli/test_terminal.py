@@ -14,14 +14,15 @@ from rich.console import Console
 
 from learner.run_folder.progress import Progress
 from learner.standard_streams import never_fails
+from millrace.sparkline import ASCII, BLOCKS, COLUMNS, MOST_POINTS, Sparkline
 from millrace.terminal import (
     LINE_EVERY_S,
     REDRAW_EVERY_S,
     LiveBlock,
     PlainLines,
     RateLimitedView,
+    block_rows,
     count_line,
-    detail_rows,
     in_notebook,
     progress_view,
     render_block,
@@ -34,7 +35,7 @@ PROGRESS = Progress(
     return_mean=231.44, length_mean=231.0, lag_mean=0.5, lag_max=1, workers_alive=1, workers_expected=2,
     ledger={"issued": 976, "used": 970, "lost": 2, "outstanding": 4, "transitions_used": 62_208,
             "messages_bad": 1},
-    stages={"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 5.0},
+    stages={"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 5.0, "worker_wait": 5.0},
 )  # fmt: skip
 
 
@@ -82,42 +83,65 @@ def test_a_plain_line_has_the_main_figures(capsys: pytest.CaptureFixture[str]) -
     )
 
 
-def test_the_block_has_everything() -> None:
-    console = Console(file=io.StringIO(), width=100, force_terminal=True, color_system=None)
-    console.print(render_block(PROGRESS))
-    assert isinstance(console.file, io.StringIO)
-    lines = [line.rstrip() for line in console.file.getvalue().splitlines()]
-    assert lines[0].endswith("62% 62,208 of 100,000 env steps 0:15, 0:09 left")
-    assert lines[1:] == [
-        "4,210 steps/s   return 231.4   lag 0.5 (max 1)   workers 1 of 2   update 243",
-        "learner time  wait 25% · update 75%",
-        "worker time   step 100%",
-        "tickets       issued 976 · used 970 · lost 2 · outstanding 4",
-        "transitions   used 62,208",
-        "messages      bad 1",
-        "run           runs/CartPole-v1-ppo-s1",
-    ]
-
-
+SLOWEST = "Updates are the slowest part: the learner updates for 75% of the time, and workers wait for 50%."
+LOST = "2 rollouts were lost and dealt again, 1 message could not be read"
 WAITING = (
     "waiting 12 s for lane 3 (worker cpu2-w1 on cpu2: in reset for 11 s); so far 71% waiting for rollouts, 29% learning"
 )
 
 
-def test_who_waits_for_whom_is_a_row_whose_first_line_has_the_main_thing() -> None:
-    for width, first in ((140, WAITING), (80, WAITING.partition(" s);")[0]), (40, "waiting 12 s for lane 3")):
-        console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
-        console.print(render_block(replace(PROGRESS, waiting=WAITING)))
-        assert isinstance(console.file, io.StringIO)
-        (row,) = [line for line in console.file.getvalue().splitlines() if line.startswith("now ")]
-        assert row.removeprefix("now ").strip() == first
-        shown = " ".join(console.file.getvalue().split())
-        assert WAITING in shown, "nothing is cut off"
-
-
-def test_who_waits_for_whom_ends_a_plain_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plain_line_says_who_waits_and_the_last_one_the_slowest_part(capsys: pytest.CaptureFixture[str]) -> None:
     PlainLines().show(replace(PROGRESS, waiting=WAITING))
-    assert capsys.readouterr().out.endswith(f" | update 243 | {WAITING}\n")
+    assert capsys.readouterr().out.endswith(f" | update 243 | The learner has been {WAITING}.\n")
+    PlainLines().show(replace(PROGRESS, stop_reason="all steps done"))
+    assert capsys.readouterr().out.endswith(f" | update 243 | {SLOWEST} | {LOST}\n")
+
+
+def drawn(progress: Progress, width: int = 120, returns: Sparkline | None = None) -> list[str]:
+    console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+    console.print(render_block(progress, returns or Sparkline()))
+    assert isinstance(console.file, io.StringIO)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_the_block_has_everything() -> None:
+    returns = Sparkline()
+    for steps, mean in enumerate((9.0, 20.0, 20.0, 80.0)):
+        returns.add(steps, mean)
+    lines = drawn(replace(PROGRESS, best=(240.0, 50_000)), 120, returns)
+    assert lines[0].endswith(" 62%  0:15, 0:09 left")
+    assert lines[1:] == [
+        "env steps  62,208 of 100,000   4,210 a second   update 243",
+        "return     231.4   ▁▂▂▇   best evaluation 240.0 at 50,000 env steps",
+        "workers    1 of 2   lag 0.5 (max 1)",
+        f"time       {SLOWEST}",
+        f"lost       {LOST}",
+        "run        runs/CartPole-v1-ppo-s1",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ended", "head"),
+    [
+        ({"stop_reason": "all steps done"}, " 100%  done in 0:15"),
+        ({"stop_reason": "target return 475 reached"}, "Finished after 0:15: target return 475 reached"),
+        ({"stop_reason": "interrupted", "cut_short": True}, "Interrupted after 0:15: interrupted"),
+    ],
+)
+def test_a_run_that_ended_is_done_or_says_why_and_no_percentage(ended: dict[str, Any], head: str) -> None:
+    lines = drawn(replace(PROGRESS, env_steps=99_999, waiting=WAITING, **ended))
+    assert lines[0].endswith(head)
+    assert lines[0] == head or head.startswith(" 100%")
+    assert lines[4] == f"time       {SLOWEST}", "nobody waits any more"
+
+
+def test_who_waits_for_whom_is_a_row_whose_first_line_has_the_main_thing() -> None:
+    said = f"The learner has been {WAITING}."
+    for width, first in ((160, said), (80, said.partition(" in reset")[0]), (40, "The learner has been waiting")):
+        lines = drawn(replace(PROGRESS, waiting=WAITING), width)
+        (row,) = [line for line in lines if line.startswith("time ")]
+        assert row.removeprefix("time ").strip() == first
+        assert said in " ".join(" ".join(lines).split()), "nothing is cut off"
 
 
 def test_lines_without_an_update_come_ever_less_often() -> None:
@@ -141,8 +165,10 @@ def test_a_block_that_is_redrawn_is_not_slowed_by_a_long_wait() -> None:
 
 
 def test_an_empty_progress_is_shown_too() -> None:
-    assert detail_rows(Progress()) == {"run": ""}
-    Console(file=io.StringIO()).print(render_block(Progress()))
+    assert block_rows(Progress(), Sparkline()) == {
+        "env steps": "0 of 0   0 a second   update 0", "return": "none yet", "workers": "0   lag 0.0 (max 0)",
+    }  # fmt: skip
+    assert drawn(Progress())[0].endswith(" 0%  0:00")
 
 
 def test_the_live_block_redraws_and_restores_the_terminal() -> None:
@@ -153,10 +179,10 @@ def test_the_live_block_redraws_and_restores_the_terminal() -> None:
     view.show(Progress(env_steps=7, total_steps=10))
     view.close()
     assert isinstance(console.file, io.StringIO)
-    drawn = console.file.getvalue()
-    assert "a [line] that stays" in drawn
-    assert drawn.rindex("7 of 10 env steps") > drawn.rindex("1 of 10 env steps")
-    assert drawn.count("\x1b[?25l") == drawn.count("\x1b[?25h") == 1  # the cursor comes back
+    shown = console.file.getvalue()
+    assert "a [line] that stays" in shown
+    assert shown.rindex("7 of 10 ") > shown.rindex("1 of 10 ")
+    assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h") == 1  # the cursor comes back
 
 
 def test_warnings_of_the_log_are_shown_meanwhile(capsys: pytest.CaptureFixture[str]) -> None:
@@ -187,20 +213,18 @@ def test_a_reader_that_has_gone_does_not_end_the_run(tmp_path: Path, monkeypatch
         monkeypatch.undo()
 
 
-HOSTILE = Progress(
-    run="runs/[/red]\x1b[7777m", stages={"worker_[/red]": 1.0, "worker_[bold]step": 2.0}, note="[/x]\x1b[7777m"
-)
+HOSTILE = Progress(run="runs/[/red]\x1b[7777m", waiting="learning [bold]\x1b[7777m", note="[/x]\x1b[7777m")
 
 
 def test_no_text_is_read_as_markup_or_controls_the_terminal() -> None:
-    """A stage named [/red] ended the learner: rich raised MarkupError."""
+    """Text with [/red] ended the learner: rich raised MarkupError."""
     file = io.StringIO()
     view = LiveBlock(Console(file=file, force_terminal=True, width=100))
     view.show(HOSTILE)
     view.print_line("warning: [/red] \x1b[7777m\ud800")
     view.close()
     shown = file.getvalue()
-    assert "[/red] 33% · [bold]step 67%" in shown
+    assert "The learner has been learning [bold]\\x1b[7777m." in shown
     assert "warning: [/red] \\x1b[7777m\\ud800" in shown
     assert "\x1b[7777m" not in shown
 
@@ -321,3 +345,30 @@ def test_what_a_watch_returns_or_raises_reaches_the_run() -> None:
         assert show is not None
         assert show(PROGRESS) is False
         show(Progress())
+
+
+def test_a_curve_is_a_line_of_blocks_over_the_run_so_far() -> None:
+    line = Sparkline()
+    line.add(0, None)
+    line.add(1, 5.0)
+    assert str(line) == ""
+    line.add(2, 5.0)
+    assert str(line) == "▁▁", "a constant"
+    for x in range(3, 10 * MOST_POINTS):
+        line.add(x, float(x))
+    assert (len(str(line)), str(line)[0], str(line)[-1]) == (COLUMNS, "▁", "▇")
+    assert sorted(str(line)) == sorted(str(line), key=BLOCKS.index) == [*str(line)]
+    assert len(line._points) <= MOST_POINTS
+
+
+def test_where_the_encoding_has_no_blocks_the_curve_is_ascii() -> None:
+    file = io.TextIOWrapper(io.BytesIO(), "ascii", "backslashreplace")
+    view = LiveBlock(Console(file=file, force_terminal=True, width=100, color_system=None))
+    for steps in (1, 2):
+        view.show(Progress(env_steps=steps, total_steps=3, return_mean=float(steps)))
+    view.close()
+    file.flush()
+    assert isinstance(file.buffer, io.BytesIO)
+    shown = file.buffer.getvalue().decode()
+    assert f"2.0   {ASCII[0]}{ASCII[-1]}" in shown
+    assert "\\u" not in shown

@@ -54,7 +54,7 @@ EVENTS = (
     "progress",
     "said",
 )  # of `--log-json`
-BLOCK = re.compile(rb"[^\w]* \d+% |[\d,]+ steps/s |(learner time|worker time|tickets|transitions|messages|run) |\s*$")
+BLOCK = re.compile(rb"[^\w]* \d+% |(env steps|return|workers|time|lost|run)  | {11}|\s*$")
 FORGED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
 

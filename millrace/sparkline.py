@@ -1,0 +1,41 @@
+"""A curve as one line of text: blocks of five heights, over the run so far. Pure.
+
+Rule: its memory is bounded. Of many points, only the last of each of equal parts of the run is kept.
+"""
+
+from __future__ import annotations
+
+import math
+
+BLOCKS, ASCII = "▁▂▃▅▇", ".:=*#"
+COLUMNS = 16
+MOST_POINTS = 1_000
+
+
+class Sparkline:
+    """The values of a number that grew with `x`."""
+
+    def __init__(self, blocks: str = BLOCKS) -> None:
+        """`blocks`: characters, the lowest first."""
+        self._blocks = blocks
+        self._points: list[tuple[float, float]] = []
+
+    def add(self, x: float, y: float | None) -> None:
+        """The number was `y` at `x`; nothing is added if it was not known, or has not moved on."""
+        if y is not None and math.isfinite(y) and (not self._points or x > self._points[-1][0]):
+            self._points.append((x, y))
+            if len(self._points) > MOST_POINTS:
+                self._points = self._last_of_parts(MOST_POINTS // 2)
+
+    def __str__(self) -> str:
+        if len(self._points) < 2:
+            return ""
+        values = [y for _, y in self._last_of_parts(COLUMNS)]
+        low, high = min(values), max(values)
+        step = (high - low) / (len(self._blocks) - 1) or 1.0
+        return "".join(self._blocks[round((y - low) / step)] for y in values)
+
+    def _last_of_parts(self, parts: int) -> list[tuple[float, float]]:
+        """The last point of each of equal parts of the run; the newest one is a part of its own."""
+        first, last = self._points[0][0], self._points[-1][0]
+        return list({int((parts - 1) * (x - first) / (last - first)): (x, y) for x, y in self._points}.values())
