@@ -23,10 +23,8 @@ from rich.progress import track
 from rich.table import Table
 
 import millrace
-from benchmarks.writing import RESULTS, write
-from learner.report.curve import Curve, common_grid
-from learner.report.learning_curves import COLORS, DPI, GREY, read_curve
-from learner.run_folder.metrics_log import read_rows
+from benchmarks.writing import COLORS, DPI, GREY, RESULTS, write
+from learner.report.curve import Curve, common_grid, read_run_files
 from learner.run_folder.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -75,8 +73,11 @@ def train(algo: str, max_lag: int, seed: int) -> Trained:
     summary = RunFolder.open(run).summary()
     assert summary is not None
     assert summary.evaluation is not None
-    lag = statistics.fmean(row["lag/mean"] for row in read_rows(run / "metrics.jsonl"))
-    return Trained(algo, max_lag, seed, lag, summary.evaluation.return_mean, summary.wall_s, read_curve(run))
+    files = read_run_files(run)
+    curve = files.curve()
+    assert curve is not None
+    lag = statistics.fmean(row["lag/mean"] for row in files.rows)
+    return Trained(algo, max_lag, seed, lag, summary.evaluation.return_mean, summary.wall_s, curve)
 
 
 def show(runs: Sequence[Trained]) -> Table:

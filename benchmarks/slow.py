@@ -29,8 +29,7 @@ import millrace
 from benchmarks import programs
 from benchmarks.programs import CONTENDERS, Contender, contenders
 from benchmarks.slow_env import STEPS_PER_S, TIMELINE, Lognormal
-from benchmarks.writing import write
-from learner.report.learning_curves import COLORS, DPI, GREY
+from benchmarks.writing import COLORS, DPI, GREY, write
 
 COPIES = 16
 IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time

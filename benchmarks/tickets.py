@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.simulated import canned, run_spec
-from learner.report.learning_curves import COLORS, DPI, GREY
+from benchmarks.writing import COLORS, DPI, GREY
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello
 

@@ -11,10 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from learner.report.learning_curves import COLORS, DPI, GREY
 from learner.run_folder.run_format import versions
 
 RESULTS = Path(__file__).parent / "results"
+DPI = 150
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # Okabe and Ito
+GREY = "#555555"
 Bars = tuple[str, Mapping[str, float]]
 """a title, and the length of each bar by its label"""
 

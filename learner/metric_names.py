@@ -89,7 +89,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
     },
     "Updates: all algorithms": {
         "train/learning_rate": Meaning(NONE, "Learning rate of this update."),
-        "train/n_updates": Meaning(NONE, "PPO: epochs. DQN, SAC, TD3: gradient steps. Others: updates.", "gradient steps"),
+        "train/n_updates": Meaning(NONE, "PPO: epochs; DQN, SAC, TD3: gradient steps; others: updates.", "learning rounds"),
         "train/grad_norm": Meaning(NONE, "Its norm before it is clipped, mean over the update.", "norm of the gradient"),
     },
     "Updates: actor-critic algorithms": {

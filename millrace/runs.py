@@ -31,7 +31,7 @@ from protocol.envs.wrappers import WrapperLike, wrapper_names
 from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
-    from learner.report.figure import PngFigure
+    from learner.report.picture import Picture
 
 NOT_FINISHED = "not finished"
 
@@ -158,20 +158,22 @@ class Run(os.PathLike[str]):
         return train(resume=self, **{**self._given, **keywords})
 
     @checked
-    def plot(self, out: str | os.PathLike[str] | None = None) -> PngFigure:
-        """Draw the learning curve, as `millrace plot` does. Returns a matplotlib figure, which a notebook shows.
+    def plot(self, out: str | os.PathLike[str] | None = None) -> Picture:
+        """Draw the learning curve, as `millrace plot` does. Returns a picture, which a notebook shows.
 
-        `out`: also write it to this file, as a PNG. Raises `UsageError` if no episode has ended.
+        `out`: also write it to this file, whose name ends in .svg or .png. Raises `UsageError` if no episode has ended.
 
         >>> import millrace
-        >>> figure = millrace.Run(run).plot("curve.png")
+        >>> picture = millrace.Run(run).plot("curve.png")
+        >>> picture.save("curve.svg").name
+        'curve.svg'
         """
-        from learner.report.learning_curves import curves, write
+        from learner.report.picture import draw
 
-        figure = curves([self.path])
+        picture = draw([self.path])
         if out is not None:
-            write(figure, Path(out))
-        return figure
+            picture.save(out)
+        return picture
 
     def __fspath__(self) -> str:
         return os.fspath(self.path)

@@ -82,7 +82,7 @@ HAS_RANDOM_NUMBERS_OF_ITS_OWN = (  # from constants, not from a run's seed
     "millrace/conformance/",
     "workers/envs/toy.py",
 )
-SLOW_TO_IMPORT = {"torch", "matplotlib", "tensorboard"}
+SLOW_TO_IMPORT = {"torch", "PIL", "resvg_py", "tensorboard"}
 OPTIONAL = {  # packages of an extra or of notebooks
     *("IPython", "ale_py", "envpool", "h5py", "minari", "moviepy", "ray", "stable_baselines3", "zstandard"),
 }
@@ -92,7 +92,7 @@ IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `lea
     "learner.imports_ahead": "only if it was imported before",
     "learner.prometheus": "26 ms, for --metrics-bind only",
     "learner.recording.video": "27 ms, for --video only",
-    "learner.report.learning_curves": "21 ms, for plots only",
+    "learner.report.picture": "for plots only",
     "millrace.cli.main": "a signal waits until it is imported",
     "millrace.launch.learner_inference": "it is for --inference learner only",
     "millrace.launch.training": "120 ms, after the flags are known to be right",
@@ -407,7 +407,7 @@ def test_every_public_name_of_millrace_is_documented() -> None:
         ("workers.__main__", {"numpy", "gymnasium", "torch"}),
         ("millrace.cli.main", SLOW_TO_IMPORT),
         ("learner.config.command_line", SLOW_TO_IMPORT),
-        ("learner.report.learning_curves", SLOW_TO_IMPORT),
+        ("learner.report.picture", SLOW_TO_IMPORT),
         ("learner.policy_player", SLOW_TO_IMPORT),
         ("learner.algorithms", SLOW_TO_IMPORT),
     ],

@@ -26,8 +26,6 @@ SECONDS_KEY = "time/time_elapsed"
 class Curve(NamedTuple):
     """The learning curve of one run."""
 
-    env: str
-    algo: str
     seed: int
     env_steps: Doubles  # [K] rising
     returns: Doubles  # [K] mean return of the last 100 training episodes
@@ -48,7 +46,7 @@ class RunRecord(NamedTuple):
     def curve(self) -> Curve | None:
         """The learning curve, or None before the first episode has ended."""
         found = points(self.rows, RETURN_KEY)
-        return Curve(self.env, self.algo, self.seed, *found.T) if len(found) else None
+        return Curve(self.seed, *found.T) if len(found) else None
 
 
 def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:

@@ -10,26 +10,23 @@ from learner.report.charts import MINUS
 
 def document(title: str, head: Sequence[str], main: str) -> str:
     """A whole page. `head` is HTML: its policy, its style, its script. `main` is HTML too."""
-    return "\n".join(
-        [
-            "<!doctype html>",
-            '<html lang="en">',
-            "<head>",
-            '<meta charset="utf-8">',
-            *head,
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<meta name="color-scheme" content="light dark">',
-            f"<title>{escape(title)}</title>",
-            "</head>",
-            "<body>",
-            "<main>",
-            main,
-            "</main>",
-            "</body>",
-            "</html>",
-            "",
-        ]
-    )
+    first = "\n".join(head)
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+{first}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>{escape(title)}</title>
+</head>
+<body>
+<main>
+{main}
+</main>
+</body>
+</html>
+"""
 
 
 def section(name: str, about: str, content: str, key: str = "") -> str:

@@ -43,24 +43,13 @@ def head(report: ReportData) -> str:
 
 def results(report: ReportData) -> str:
     """The table of results: a row for each run, under its group."""
-    columns = (
-        "Run",
-        "Greedy return",
-        f"Last {WINDOW_EPISODES} episodes",
-        "Env steps",
-        "Steps/s",
-        "Wall time",
-        "Versions",
-        "Ended",
-    )
-    heads = "".join(f'<th scope="col" class="{_column_class(name)}">{escape(name)}</th>' for name in columns)
+    last = f"Last {WINDOW_EPISODES} episodes"
+    numbers = dict.fromkeys(("Greedy return", last, "Env steps", "Steps/s", "Wall time", "Versions"), "number")
+    columns = {"Run": "text", **numbers, "Ended": "text"}
+    heads = "".join(f'<th scope="col" class="{css}">{name}</th>' for name, css in columns.items())
     bodies = "".join(_rows_of_group(group) for group in report.groups)
     table = f'<table class="runs"><thead><tr>{heads}</tr></thead>{bodies}</table>'
     return section("Runs", "", f'<div class="scroll">{table}</div>')
-
-
-def _column_class(column: str) -> str:
-    return "text" if column in ("Run", "Ended") else "number"
 
 
 def _rows_of_group(group: RunGroup) -> str:

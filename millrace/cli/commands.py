@@ -38,7 +38,7 @@ GROUPS = {
         "dashboard": Command("dashboard:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
         "evaluate": Command("play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
         "record": Command("play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
-        "plot": Command("look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),
+        "plot": Command("look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as SVG or PNG"),
         "report": Command("look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
     },
     "Write a client in another language": {

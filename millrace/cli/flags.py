@@ -70,12 +70,12 @@ class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Draw learning curves as a PNG: a panel for each environment, a color for each algorithm, a band for several seeds."""
+    """Draw the learning curves of a report: a panel for each environment, a color for each group, a band over seeds."""
 
     runs: Annotated[tuple[Path, ...], Flag("RUN ...", positional=True)]
     """run folders"""
     out: Annotated[Path | None, Flag("PATH")] = None
-    """file to write; if not given, curves.png in the first run folder"""
+    """file to write, as SVG or PNG; if not given, curves.png in the first run folder"""
 
 
 class RecordFlags(PlayFlags, frozen=True, kw_only=True):

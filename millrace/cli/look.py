@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from learner.report import learning_curves
 from learner.report.page import write_page
+from learner.report.picture import draw
 from learner.report.run_lines import RunLine, algorithm_label, find_runs, read_line
 from millrace.cli.flags import ListFlags, PlotFlags, ReportFlags
 from millrace.cli.status import table
@@ -40,7 +40,7 @@ def plot(argv: list[str]) -> int:
     """Draw learning curves, and print the file's path. Returns the exit code."""
     flags = parse_flags(PlotFlags, argv, "plot")
     first = _first(flags.runs, "plot")
-    print(learning_curves.plot(flags.runs, flags.out or first / "curves.png"))
+    print(draw(flags.runs).save(flags.out or first / "curves.png"))
     return 0
 
 

@@ -24,8 +24,8 @@ from protocol.errors import UsageError, UserFacingError, did_you_mean, usage_err
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 NOT_IN_WORKERS = {
-    "matplotlib",
     "prometheus_client",
+    "resvg_py",
     "rich",
     "safetensors",
     "tensorboard",

@@ -147,25 +147,13 @@ def _points(rows: Sequence[Mapping[str, Any]], metric: str, over_time: bool) -> 
 
 
 def _form(names: Mapping[str, None], metric: str, choice: Choice) -> str:
-    groups: dict[str, list[str]] = {}
+    groups = dict.fromkeys(METRICS, "")
     for name in sorted(names, key=label):
-        groups.setdefault(described(name)[0], []).append(name)
-    options = "".join(
-        f'<optgroup label="{escape(title)}">'
-        + "".join(
-            f'<option value="{escape(name)}"{" selected" * (name == metric)}>{escape(label(name))}</option>'
-            for name in groups[title]
-        )
-        + "</optgroup>"
-        for title in METRICS
-        if title in groups
-    )
+        groups[described(name)[0]] += _option(name, label(name), metric)
+    options = "".join(f'<optgroup label="{escape(title)}">{inner}</optgroup>' for title, inner in groups.items() if inner)
 
     def choose(name: str, chosen: str, values: Mapping[str, str]) -> str:
-        inner = "".join(
-            f'<option value="{value}"{" selected" * (value == chosen)}>{text}</option>' for value, text in values.items()
-        )
-        return f'<select name="{name}">{inner}</select>'
+        return f'<select name="{name}">{"".join(_option(value, text, chosen) for value, text in values.items())}</select>'
 
     over = choose("over", "time" if choice.over_time else "steps", {"steps": "env steps", "time": "time of training"})
     kinds = {"1": "not smoothed", "10": "10 rows", "30": "30 rows", "100": "100 rows"}
@@ -174,6 +162,10 @@ def _form(names: Mapping[str, None], metric: str, choice: Choice) -> str:
         f'<form class="choose" method="get"><label>Show <select name="metric">{options}</select></label>'
         f"<label>over {over}</label><label>mean over {smooth}</label><button>Show</button></form>"
     )
+
+
+def _option(value: str, text: str, chosen: str) -> str:
+    return f'<option value="{escape(value)}"{" selected" * (value == chosen)}>{escape(text)}</option>'
 
 
 def workers(seen: Seen) -> str:

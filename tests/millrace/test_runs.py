@@ -194,12 +194,14 @@ def test_what_was_given_as_an_object_is_given_again(tmp_path: Path, monkeypatch:
     assert millrace.evaluate(run.path, 2, env=pole, **PLAY).episodes == 2
 
 
-def test_plot_is_a_figure_and_the_file_of_the_command(run: millrace.Run, tmp_path: Path) -> None:
-    figure = run.plot(tmp_path / "python.png")
-    assert main(["plot", str(run.path), "--out", str(tmp_path / "command.png")]) == 0
-    assert (tmp_path / "python.png").read_bytes() == (tmp_path / "command.png").read_bytes()
-    assert figure._repr_png_()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert figure.axes[0].get_title(loc="left") == "CartPole-v1"
+@pytest.mark.parametrize("kind", ["svg", "png"])
+def test_plot_is_a_picture_and_the_file_of_the_command(run: millrace.Run, tmp_path: Path, kind: str) -> None:
+    picture = run.plot(tmp_path / f"python.{kind}")
+    assert main(["plot", str(run.path), "--out", str(tmp_path / f"command.{kind}")]) == 0
+    content = (tmp_path / f"python.{kind}").read_bytes()
+    assert content == (tmp_path / f"command.{kind}").read_bytes()
+    assert content == (picture._repr_svg_().encode() if kind == "svg" else picture.png())
+    assert ">CartPole-v1</text>" in picture.svg
 
 
 def test_the_caller_s_process_runs_no_environment_code(tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ import millrace
 from learner.algorithms import algorithm_class
 from learner.config.layers import resolve
 from learner.env_spaces import EnvSpaces
-from learner.report.learning_curves import read_curve
 from learner.report.page import page
+from learner.report.picture import draw
 from learner.resume_checks import unless_finished
 from learner.run_folder.lease import Owner
 from learner.run_folder.metrics_log import MetricsLog
@@ -112,7 +112,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "evaluate": lambda run: load_policy(run, "final"),
     "evaluate --best": lambda run: load_policy(run, "best"),
     "report": lambda run: page([run]),
-    "plot": read_curve,
+    "plot": lambda run: draw([run]).svg,
     "load": lambda run: millrace.load(run)(OBSERVED[0][0]),
     "Run": look,
     "lock": locked,

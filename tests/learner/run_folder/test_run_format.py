@@ -10,8 +10,8 @@ import pytest
 
 from learner.config.command_line import read_config
 from learner.config.layers import config_of_run, resolve
-from learner.report.learning_curves import plot
 from learner.report.page import write_page
+from learner.report.picture import draw
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import RunFolder
@@ -42,7 +42,7 @@ def run(tmp_path: Path) -> Path:
 
 READERS: list[Callable[[Path], object]] = [
     load_policy,
-    lambda run: plot([run], run / "curves.png"),
+    lambda run: draw([run]),
     lambda run: write_page([run], run / "report.html"),
     lambda run: read_config("train", ["--resume", str(run)]),
     lambda run: resolve(resume=run),

@@ -42,7 +42,7 @@ def thin(tmp_path: Path) -> dict[str, str]:
     extras = [line for lines in project["optional-dependencies"].values() for line in lines]
     missing = names(project["dependencies"] + extras) - names((ROOT / "docker" / "worker.txt").read_text().splitlines())
     learner_only = {"prometheus_client", "rich", "safetensors", "tensorboard", "threadpoolctl", "tomli_w", "torch"}
-    assert learner_only | {"matplotlib"} <= missing
+    assert learner_only | {"resvg_py"} <= missing
     folder = tmp_path / "thin"
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(SITECUSTOMIZE.format(missing=missing))
