@@ -25,6 +25,7 @@ from learner.resume_checks import Resumption, check_spaces
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
+from learner.run_folder.run_log import kept_log
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import UsageError
@@ -84,7 +85,7 @@ def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]
     """
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
     try:
-        with RunLock(folder.path) as folder.lock:
+        with RunLock(folder.path) as folder.lock, kept_log(folder.path):
             for line in () if resume is None else resume.differences:
                 log.warning("%s", line)
             yield folder

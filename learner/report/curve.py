@@ -12,7 +12,7 @@ from learner.config.presets import environment_name
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.regular_files import reason
-from learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
+from learner.run_folder.results import EVALUATED_AT_KEY
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.run_format import check_format, read_config
 from protocol.arrays import Doubles
@@ -58,7 +58,7 @@ def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = Fal
     def at(row: Mapping[str, Any]) -> Any:
         if over_time:
             return row.get(SECONDS_KEY)
-        return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY]) if key == EVALUATION_KEY else row[ENV_STEPS_KEY]
+        return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY]) if key.startswith("eval/") else row[ENV_STEPS_KEY]
 
     found = [(at(row), row[key]) for row in rows if row.get(key) is not None]
     return np.asarray([point for point in found if point[0] is not None], np.float64).reshape(-1, 2).clip(*DRAWN)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from learner.report import ledger_and_stages, sections
+from learner.report.history import history
 from learner.report.html_parts import document
 from learner.report.reported_runs import group_runs, read_run
 from learner.run_folder.atomic_write import write_file
@@ -40,6 +41,7 @@ def page(runs: Sequence[Path]) -> str:
         sections.curves(report),
         sections.images(report),
         sections.videos(report),
+        history(report),
         sections.settings(report),
         ledger_and_stages.ledgers(report),
         ledger_and_stages.stages(report),

@@ -22,6 +22,7 @@ from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, 
 from learner.run_folder.regular_files import regular_files
 from learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
 from learner.run_folder.run_folder import RunFolder
+from learner.run_folder.run_log import LoggedLine, newest_lines
 from protocol.arrays import Doubles
 from protocol.bounds import Natural, Real, Seconds
 from protocol.errors import UsageError
@@ -85,6 +86,8 @@ class ReportedRun:
     videos: tuple[Path, ...]
     images: tuple[Path, ...]
     """pictures of what the policy sees, one for each image of an observation"""
+    log: tuple[LoggedLine, ...] = ()
+    """its newest warnings and notices, the oldest first"""
 
     @property
     def of_group(self) -> dict[str, str]:
@@ -184,6 +187,7 @@ def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRu
         evaluations=points(files.rows, EVALUATION_KEY),
         videos=tuple(regular_files(path, "videos/*.mp4")),
         images=tuple(regular_files(path, "observation*.png")),
+        log=tuple(newest_lines(path)),
     )
 
 

@@ -16,7 +16,7 @@ from protocol.bounds import Natural, Real, Seconds, Version
 SUMMARY_FILE = "summary.json"
 ALL_STEPS_DONE = "all steps done"
 """why a run ended that was not ended before"""
-EVALUATION_KEY = "eval/mean_reward"
+EVALUATION_KEY, EVALUATION_LENGTH_KEY = "eval/mean_reward", "eval/mean_ep_length"
 EVALUATED_AT_KEY = "eval/env_steps"
 """env steps of the policy that was evaluated beside training: fewer than those of the row with the result"""
 
@@ -93,7 +93,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 
     def metrics(self) -> dict[str, float | None]:
         """The numbers that are logged with a row of metrics."""
-        returns = {EVALUATION_KEY: self.return_mean, "eval/mean_ep_length": self.length_mean}
+        returns = {EVALUATION_KEY: self.return_mean, EVALUATION_LENGTH_KEY: self.length_mean}
         return returns | fact_metrics("eval", self.facts)
 
 

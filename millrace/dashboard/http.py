@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import re
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -27,14 +28,17 @@ HEADERS = {
 }
 REASONS = {
     200: "OK",
+    206: "Partial Content",
     304: "Not Modified",
     400: "Bad Request",
     404: "Not Found",
     405: "Method Not Allowed",
+    416: "Range Not Satisfiable",
     421: "Misdirected Request",
     500: "Internal Server Error",
 }
 MOST_FIELDS = 100  # of a query
+RANGE = re.compile(r"bytes=([0-9]{0,15})-([0-9]{0,15})")  # one part; of several, the whole is sent
 
 
 class PageRequest(NamedTuple):
@@ -100,6 +104,10 @@ def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
         headers["ETag"] = tag = f'"{hashlib.blake2b(body, digest_size=16).hexdigest()}"'
         if request.headers.get("if-none-match") == tag:
             status, body = 304, b""
+        elif request.method == "GET" and (part := _wanted_part(request.headers, tag, len(body))) is not None:
+            status = 206 if part else 416  # a film is played from the middle
+            headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{len(body)}"
+            body = body[part.start : part.stop]
     if status == 405:
         headers["Allow"] = "GET, HEAD"
     if status != 304:
@@ -108,3 +116,16 @@ def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
         body = b""
     lines = [f"HTTP/1.1 {status} {REASONS[status]}", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
     return "\r\n".join(lines).encode() + body
+
+
+def _wanted_part(headers: Mapping[str, str], tag: str, size: int) -> range | None:
+    """The bytes that a Range asks for, none if there are no such bytes; None if all are wanted (RFC 9110, section 14)."""
+    match = RANGE.fullmatch(headers.get("range", ""))
+    if match is None or not any(match.groups()) or headers.get("if-range", tag) != tag:
+        return None
+    first, last = match.groups()
+    if not first:
+        return range(max(0, size - int(last)), size)
+    if last and int(last) < int(first):
+        return None
+    return range(min(int(first), size), min(int(last) + 1, size) if last else size)

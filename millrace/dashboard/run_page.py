@@ -20,9 +20,9 @@ from learner.report.curve import points
 from learner.report.html_parts import return_text, section
 from learner.report.reported_runs import RunResults
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
-from learner.report.sentences import WRONG, bottleneck, went_wrong
+from learner.report.sentences import bottleneck, went_wrong
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.results import EVALUATION_KEY
+from learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY
 from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
 from protocol.messages import Status, WorkerStatus
@@ -39,8 +39,8 @@ COLORS = {
     "no worker": "gone",
 }
 """Class in the style sheet of what a lane or the learner does"""
-MOST_HISTORY = 30
 MOST_SMOOTHED = 100
+MOST_LINES = 10  # of evaluations
 MIB = 2**20
 
 
@@ -246,20 +246,24 @@ def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segme
     return found
 
 
-def history(rows: Sequence[Mapping[str, Any]]) -> str:
-    """When something was lost or dropped, the newest first."""
-    found, before = list[str](), dict[str, float]()
-    for row in rows:
-        counts = {name: row.get(f"ledger/{name}") or 0 for name in WRONG}
-        if wrong := went_wrong({name: counts[name] - before.get(name, 0) for name in WRONG}):
-            when = f"after {duration(row.get('time/time_elapsed') or 0)}, at {row[ENV_STEPS_KEY]:,} env steps"
-            found.append(f"<li>{escape(wrong)} <small>{escape(when)}</small></li>")
-        before = counts
-    left_out = f"<p>And {len(found) - MOST_HISTORY} earlier ones.</p>" if len(found) > MOST_HISTORY else ""
-    items = "".join(reversed(found[-MOST_HISTORY:]))
-    about = "What was lost was collected again; no update used it." if found else "Nothing was lost or dropped."
-    content = f"<div><ol class=history>{items}</ol>{left_out}</div>" if found else ""
-    return section("What went wrong", about, content, "history")
+def evaluations(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The newest evaluations, and which was the best of all."""
+    returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
+    if not len(returns):
+        return ""
+    best = int(returns[:, 1].argmax())
+    at, highest = returns[best]
+    length_at = dict(lengths.tolist())
+    about = f"The best of {len(returns)} was at {at:,.0f} env steps, with a mean return of {return_text(highest)}."
+    lines = [
+        f'<tr><th scope="row" class="number">{steps:,.0f}</th><td class="number">{return_text(value)}'
+        f"{' <small>the best</small>' * (i == best)}</td>"
+        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td></tr>'
+        for i, (steps, value) in enumerate(returns)
+    ]
+    heads = "".join(f'<th scope="col" class="number">{name}</th>' for name in ("Env steps", "Return", "Episode length"))
+    table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(lines[: -MOST_LINES - 1 : -1])}</tbody></table>"
+    return section("Evaluations", about, f'<div class="scroll">{table}</div>', "evaluations")
 
 
 def logs(newest: Sequence[tuple[str, str]]) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from learner.report import ledger_and_stages, sections
+from learner.report.history import history
 from learner.report.html_parts import document, return_text, section
 from learner.report.page import STYLE
 from learner.report.reported_runs import ReportData, group_runs
@@ -84,9 +85,10 @@ class Site:
             run_page.curve(content.rows, Choice.of(request.query)),
             run_page.who_waits(seen),
             run_page.workers(seen),
+            run_page.evaluations(content.rows),
             sections.videos(report, _addresses(home, run)),
             sections.images(report, _addresses(home, run)),
-            run_page.history(content.rows),
+            history(report),
             ledger_and_stages.stages(report),
             ledger_and_stages.ledgers(report),
             sections.settings(report),

@@ -82,3 +82,32 @@ def test_a_head_has_the_length_and_no_body() -> None:
     found = answer_bytes(parsed(head("HEAD")), PageAnswer(b"page"))
     assert b"Content-Length: 4\r\n" in found
     assert found.endswith(b"\r\n\r\n")
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "part", "place"),
+    [
+        ("bytes=0-", 206, b"0123456789", "0-9/10"),
+        ("bytes=2-4", 206, b"234", "2-4/10"),
+        ("bytes=8-100", 206, b"89", "8-9/10"),
+        ("bytes=-3", 206, b"789", "7-9/10"),
+        ("bytes=-100", 206, b"0123456789", "0-9/10"),
+        ("bytes=10-", 416, b"", "*/10"),
+        ("bytes=-0", 416, b"", "*/10"),
+        ("bytes=4-2", 200, b"0123456789", ""),
+        ("bytes=-", 200, b"0123456789", ""),
+        ("bytes=0-1,4-5", 200, b"0123456789", ""),
+        ("lines=0-1", 200, b"0123456789", ""),
+        ('bytes=2-4\r\nIf-Range: "an older film"', 200, b"0123456789", ""),
+    ],
+)
+def test_a_film_is_played_from_its_middle(asked: str, status: int, part: bytes, place: str) -> None:
+    film = PageAnswer(b"0123456789", "video/mp4")
+    first, _, body = answer_bytes(parsed(head("GET", f"/{TOKEN}/", HOSTS[0], f"Range: {asked}")), film).partition(
+        b"\r\n\r\n"
+    )
+    lines = first.decode().split("\r\n")
+    assert lines[0].startswith(f"HTTP/1.1 {status} ")
+    assert body == part
+    assert f"Content-Length: {len(part)}" in lines
+    assert [line for line in lines if line.startswith("Content-Range: ")] == [f"Content-Range: bytes {place}"] * bool(place)

@@ -1,7 +1,9 @@
 """The pages: what they say of runs, and that nothing in a run folder or of a learner becomes part of their markup."""
 
 import json
+import logging
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +12,18 @@ import pytest
 from learner.metric_names import METRICS, described, label
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import RunLock
+from learner.run_folder.run_log import kept_log
 from millrace.dashboard import run_page, site
 from millrace.dashboard.http import PageAnswer, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import LaneSample, Seen, sample
 from millrace.dashboard.run_page import Choice, smoothed
 from millrace.dashboard.site import Site
+from protocol.logs.notices import log_notice
 from protocol.messages import Status, WorkerStatus
 from tests.learner.report.test_page import Reader, a_run
+
+log = logging.getLogger("millrace.learner")
 
 HOSTILE = "</option></svg></title>\"'><script>alert(1)</script><img src=x onerror=alert(1)>"
 
@@ -102,8 +108,22 @@ def test_a_finished_run_shows_its_last_state_and_no_learner_is_asked(tmp_path: P
     said = pages.said(f"run/{key_of(run)}")
     assert "Finished: all steps done." in said
     assert "Final policy, 100 greedy episodes −1,233.6 ± 7.5" in said
-    assert "What went wrong" in said
+    assert "What happened" in said
     assert pages.looked == []
+
+
+def test_the_newest_evaluations_are_a_table_that_marks_the_best() -> None:
+    rows = [
+        {"time/total_timesteps": 10 * i, "eval/mean_reward": 9.0 if i == 4 else float(i % 4), "eval/mean_ep_length": 7.0}
+        for i in range(30)
+    ]
+    rows[29] |= {"eval/env_steps": 285}
+    said = Safe(run_page.evaluations(rows)).text
+    assert "The best of 30 was at 40 env steps, with a mean return of 9.0." in said
+    assert "285 1.0 7.0 280 0.0 7.0" in said
+    assert "the best" not in said.partition("Return")[2]
+    assert "40 9.0 the best 7.0" in Safe(run_page.evaluations(rows[:6])).text
+    assert run_page.evaluations([{"time/total_timesteps": 10}]) == ""
 
 
 def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
@@ -163,15 +183,18 @@ def test_a_number_of_the_user_s_own_has_its_name_as_label_and_the_meaning_of_its
     assert described("no such\n")[1].label == "no such\n"
 
 
-def test_what_was_lost_is_told_with_its_time(tmp_path: Path) -> None:
-    rows = [
-        {"time/total_timesteps": 10 * i, "time/time_elapsed": float(i), "ledger/lost": lost}
-        for i, lost in enumerate((0, 0, 3, 3, 4))
-    ]
-    said = Safe(run_page.history(rows)).text
-    assert "1 rollout was lost and dealt again after 4.0 s, at 40 env steps 3 rollouts were lost" in said
-    assert "after 2.0 s, at 20 env steps" in said
-    assert "Nothing was lost" in run_page.history(rows[:2])
+def test_what_happened_is_told_with_its_time_the_newest_first(tmp_path: Path) -> None:
+    run, pages = a_run(tmp_path), Pages(tmp_path)
+    assert "There was nothing to warn of." in pages.said(f"run/{key_of(run)}")
+    with kept_log(run):
+        log.warning("w0 was lost")
+        log.warning("an environment raised: ValueError: no\nTraceback\n  line 3")
+        log_notice(log, "the run goes on")
+    said = pages.said(f"run/{key_of(run)}")
+    assert re.search(r"20\d\d-\d\d-\d\d [\d:]{8} the run goes on .* raised: ValueError: no .*line 3 .* w0 was lost", said)
+    text = pages.text(f"run/{key_of(run)}")
+    assert text.count('<li class="warning">') == 2
+    assert text.count('<li class="notice">') == 1
 
 
 def test_several_runs_are_compared_as_a_report_does(tmp_path: Path) -> None:
@@ -199,6 +222,8 @@ def test_nothing_in_a_run_folder_becomes_markup(tmp_path: Path) -> None:
     with (run / METRICS_FILE).open("a") as file:
         row = {"time/total_timesteps": 9_000, f"custom/{HOSTILE}": 1.0, HOSTILE: 1e308, "ledger/lost": 10**15}
         file.write(json.dumps(row) + "\n")
+    with kept_log(run):
+        log.warning("%s\n%s\x1b[2J", HOSTILE, HOSTILE)
     (run / "workers").mkdir()
     (run / "workers" / f"{HOSTILE.replace('/', '')}.log").write_bytes(HOSTILE.encode() + b"\x00\xff\x1b[2J\n")
     (run / "videos").mkdir()

@@ -1,0 +1,33 @@
+"""A section of the page, as HTML text: what the runs warned of. Pure."""
+
+from __future__ import annotations
+
+from html import escape
+
+from learner.report.html_parts import section
+from learner.report.reported_runs import ReportData
+from learner.run_folder.run_log import LoggedLine
+from protocol.bounds import escaped
+
+MOST_HISTORY = 30
+
+
+def history(report: ReportData) -> str:
+    """What the runs warned of, the newest first."""
+    names = report.short_names() if len(report.runs) > 1 else [""]
+    lines = [(line, name) for name, (_, run) in zip(names, report.runs, strict=True) for line in reversed(run.log)]
+    lines.sort(key=lambda each: each[0].time, reverse=True)
+    items = "".join(_logged(line, name) for line, name in lines[:MOST_HISTORY])
+    about = "What the learner warned of or gave notice of, the newest first." if lines else "There was nothing to warn of."
+    if len(lines) > MOST_HISTORY:
+        about += f" {len(lines) - MOST_HISTORY} earlier lines are in log.jsonl of the run folder."
+    return section("What happened", about, f'<ol class="history">{items}</ol>' if items else "", "history")
+
+
+def _logged(line: LoggedLine, run: str) -> str:
+    text, _, more = escaped(line.message).partition("\n")
+    when = f"{line.time.astimezone():%Y-%m-%d %H:%M:%S}"
+    said = f"<small>{escape(', '.join(filter(None, (when, run))))}</small> {escape(text)}"
+    if more:
+        said = f'<details><summary>{said}</summary><pre class="log" tabindex="0">{escape(more)}</pre></details>'
+    return f'<li class="{"notice" if line.level == "info" else "warning"}">{said}</li>'
