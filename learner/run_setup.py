@@ -23,9 +23,9 @@ from learner.members.describe_coordinator import Accept
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resume_checks import Resumption, check_spaces
 from learner.rollouts.hub import HubObserver
+from learner.run_folder.json_log import kept_log
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
-from learner.run_folder.run_log import kept_log
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import UsageError

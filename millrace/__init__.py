@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from learner.recording.record import RecordedDataset
     from learner.run_folder.progress import Progress
     from learner.run_folder.results import Evaluation, Summary
+    from millrace.launch.page_beside import Dashboard
     from millrace.launch.vector import make_vec
     from millrace.loaded_policy import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
@@ -53,6 +54,7 @@ __all__ = [
     "MLP",
     "Callback",
     "CheckpointError",
+    "Dashboard",
     "EnvCopy",
     "EnvironmentFailed",
     "Evaluation",
@@ -93,6 +95,7 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "learner.callbacks.callback",
+    "Dashboard": "millrace.launch.page_beside",
     "EnvCopy": "protocol.envs.which_copy",
     "Evaluation": "learner.run_folder.results",
     "LoadedPolicy": "millrace.loaded_policy",

@@ -66,7 +66,7 @@ MILLRACE = {  # the same for each folder of the public package
     "conformance": set[str](),
     "dashboard": {"cli"},
     "integrations": set[str](),
-    "launch": {"arguments", "cli", "own_policy", "policies"},
+    "launch": {"arguments", "cli", "own_policy", "policies", "terminal"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
 MAY_PRINT = ("millrace/cli/", "millrace/terminal.py")

@@ -11,7 +11,9 @@ sections. What is in none of these sections is internal: it may change in any ve
 
 """
 GROUPS = {
-    "Train and look at runs": ("train", "Run", "Metrics", "Summary", "Evaluation", "evaluate", "record", "RecordedDataset"),
+    "Train and look at runs": (
+        "train", "Run", "Metrics", "Summary", "Evaluation", "evaluate", "record", "RecordedDataset", "Dashboard",
+    ),
     "Use a policy": ("load", "LoadedPolicy"),
     "Callbacks": ("Callback", "Progress"),
     "Vector environment": ("make_vec",),

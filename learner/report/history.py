@@ -6,7 +6,7 @@ from html import escape
 
 from learner.report.html_parts import section
 from learner.report.reported_runs import ReportData
-from learner.run_folder.run_log import LoggedLine
+from learner.run_folder.json_log import LoggedLine
 from protocol.bounds import escaped
 
 MOST_HISTORY = 30

@@ -1,21 +1,34 @@
-"""The log as JSON, one event per line (`--log-json`).
+"""The log as JSON, one event per line: on stderr (`--log-json`), and its warnings and notices in the run folder (log.jsonl).
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
 "left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin" (`learner.members.events`,
 whose fields stand beside it), "progress", or "said" for any other line of the log.
+
+Rule: log.jsonl is bounded, and nothing depends on it. Of a file that has grown too long, the newer half is kept. Lines that
+the disk refuses are dropped. It is opened for each line, because somebody may delete it, or its folder, meanwhile.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import NOT_SHOWN, Progress
+from learner.run_folder.regular_files import open_regular
 from protocol.logs.notices import is_notice
+
+RUN_LOG_FILE = "log.jsonl"
+MOST_BYTES_OF_LOG = 1 << 20
+READ_BYTES = 1 << 16
 
 
 class JsonLines(logging.Formatter):
@@ -41,3 +54,66 @@ def progress_line(progress: Progress, now: float) -> str:
 def _line(time: float, level: str, event: str, message: str, fields: dict[str, Any]) -> str:
     stamp = datetime.fromtimestamp(time, UTC).isoformat(timespec="milliseconds")
     return msgspec.json.encode({"time": stamp, "level": level, "event": event, "message": message, **fields}).decode()
+
+
+class LoggedLine(msgspec.Struct, frozen=True):
+    """A line of the log."""
+
+    time: datetime
+    level: str
+    message: str
+    """Lines after the first are a traceback."""
+
+
+@contextmanager
+def kept_log(folder: Path) -> Iterator[None]:
+    """What millrace warns of goes into the folder, too."""
+    handler = _RunLog(folder / RUN_LOG_FILE)
+    logger = logging.getLogger("millrace")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def newest_lines(folder: Path) -> list[LoggedLine]:
+    """The last lines of the log of a run folder, the oldest first. Empty if it has none that can be read."""
+    try:
+        with os.fdopen(open_regular(folder / RUN_LOG_FILE), "rb") as file:
+            lines = _end(file.fileno(), READ_BYTES).splitlines()
+    except OSError:
+        return []
+    found = []
+    for line in lines:
+        with suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
+            found.append(msgspec.json.decode(line, type=LoggedLine))
+    return found
+
+
+class _RunLog(logging.Handler):
+    def __init__(self, path: Path) -> None:
+        super().__init__(logging.WARNING)
+        self._path = path
+        self.setFormatter(JsonLines())
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Append one line, unless it is a notice that is not kept."""
+        if not getattr(record, "kept", True):
+            return
+        with suppress(OSError, UnicodeError):
+            file = open_regular(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT)
+            try:
+                os.write(file, self.format(record).encode() + b"\n")
+                if os.fstat(file).st_size > MOST_BYTES_OF_LOG:
+                    newer = _end(file, MOST_BYTES_OF_LOG // 2)
+                    write_atomically(self._path, lambda shorter: shorter.write(newer))
+            finally:
+                os.close(file)
+
+
+def _end(file: int, most: int) -> bytes:
+    """Whole lines from the end of a file, of so many bytes at most. Raises OSError."""
+    begin = max(0, os.fstat(file).st_size - most)
+    end = os.pread(file, most, begin)
+    return end.partition(b"\n")[2] if begin else end

@@ -11,7 +11,7 @@
       observation*.png      what the policy sees, if that is an image (recording/image_sample.py)
       policy.json           the meaning of these arrays: with it, another program can act
       summary.json          the results of the run (results.py)
-      log.jsonl             warnings and notices of the learner (run_log.py)
+      log.jsonl             warnings and notices of the learner (json_log.py)
       workers/              the logs of local worker processes
       run.lock              who trains the run now (run_lock.py)
 

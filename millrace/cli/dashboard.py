@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from pathlib import Path
 
 from learner.report.run_lines import find_runs
 from millrace.cli.flags import DashboardFlags
-from millrace.dashboard.known_runs import KnownRuns
-from millrace.dashboard.live import Lookout
-from millrace.dashboard.server import DashboardServer
-from millrace.dashboard.site import Site
+from millrace.dashboard.serve import serve
 from protocol.address import is_local
 from protocol.errors import UsageError
 from protocol.flags.parse import parse_flags
@@ -28,9 +23,7 @@ def dashboard(argv: list[str]) -> int:
     def listening(address: str) -> None:
         print(f"dashboard of {', '.join(map(str, folders))}: {address}", flush=True)
 
-    with Lookout() as lookout:
-        site = Site(KnownRuns(folders, time.time), lookout.look)
-        asyncio.run(DashboardServer(site.answer).serve(host, port, listening))
+    serve(folders, host, port, listening)
     return 0
 
 

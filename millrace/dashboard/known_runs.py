@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 from learner.report.metrics_tail import MetricsTail
 from learner.report.reported_runs import ReportedRun, read_run
 from learner.report.run_lines import RunLine, find_runs, read_line
+from learner.run_folder.json_log import RUN_LOG_FILE
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.regular_files import open_regular, reason, regular_files
 from learner.run_folder.results import SUMMARY_FILE
-from learner.run_folder.run_format import CONFIG_FILE, RUN_FILE
+from learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
 from learner.run_folder.run_lock import LOCK_FILE
-from learner.run_folder.run_log import RUN_LOG_FILE
 from protocol.bounds import escaped
 from protocol.errors import UsageError
 
@@ -45,6 +45,11 @@ class KnownRuns:
         self._tails: dict[Path, MetricsTail] = {}
         self._read: dict[Path, tuple[object, RunContent]] = {}
         self._lines: dict[Path, tuple[object, RunLine]] = {}
+
+    @property
+    def only(self) -> Path | None:
+        """The run folder, if the dashboard is of this one alone."""
+        return self._folders[0] if len(self._folders) == 1 and is_run_folder(self._folders[0]) else None
 
     def find(self) -> dict[str, Path]:
         """The runs by their keys, the newest first. Folders that are not there any more hold none."""

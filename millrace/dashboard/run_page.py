@@ -65,10 +65,11 @@ class Choice(NamedTuple):
 
 
 def head(line: RunLine, seen: Seen, results: RunResults | None, home: str) -> str:
-    """Which run it is, and in one sentence what it does, or how it ended."""
+    """Which run it is, and in one sentence what it does, or how it ended. `home`: of all runs, if it shows others."""
+    kicker = f'<a href="{home}">millrace: all runs</a>' if home else "millrace"
     title = f"{escape(line.env or line.name)} <small>{escape(algorithm_label(line.algo))}, seed {line.seed}</small>"
     return (
-        f'<header><p class="kicker"><a href="{home}">millrace: all runs</a></p><h1>{title}</h1>'
+        f'<header><p class="kicker">{kicker}</p><h1>{title}</h1>'
         f'<p class="now {line.state}">{escape(now_sentence(line, seen, results))}</p>'
         f'<p class="kicker">{escape(line.name)}</p></header>'
     )

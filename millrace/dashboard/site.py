@@ -46,6 +46,8 @@ class Site:
         """The page, or part of it. The first part of the path, the token, is right."""
         home = f"/{quote(request.path[0])}/"
         match request.path[1:]:
+            case ("",) if (run := self._runs.only) is not None:
+                title, main = run.name, self._run(run, request, home)
             case ("",):
                 title, main = "Runs", all_runs([self._runs.line(run) for run in self._runs.find().values()], home)
             case ("run", key):
@@ -72,15 +74,15 @@ class Site:
         return PageAnswer(text.encode(errors="replace"))
 
     def _run(self, run: Path, request: PageRequest, home: str) -> str:
-        line = self._runs.line(run)
+        line, back = self._runs.line(run), "" if self._runs.only else home
         seen = self._look(run) if line.state == "training" else Seen()
         try:
             content = self._runs.content(run)
         except UsageError as error:
-            return run_page.head(line, Seen(problem=str(error)), None, home)
+            return run_page.head(line, Seen(problem=str(error)), None, back)
         report = group_runs([content.report])
         parts = [
-            run_page.head(line, seen, content.report.results, home),
+            run_page.head(line, seen, content.report.results, back),
             run_page.facts(line),
             run_page.curve(content.rows, Choice.of(request.query)),
             run_page.who_waits(seen),

@@ -21,12 +21,13 @@ from learner.interrupts import Interrupts
 from learner.members.bind_settings import BindSettings
 from learner.members.describe_coordinator import Accept
 from learner.resume_checks import Resumption
-from learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
+from learner.run_setup import RunSetup, known_environment, prometheus_observer
 from learner.torch_setup import one_thread, torch_device
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import worker_flags
+from millrace.launch.page_beside import opened_folder
 from millrace.launch.vector import listen
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -53,7 +54,7 @@ def train(
         link = endpoint.link
         listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
-        folder = stack.enter_context(run_folder(config, resume))
+        folder = opened_folder(config, resume, stack)
         started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
 
         def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 
 
-def log_notice(log: logging.Logger, line: str) -> None:
-    """Log one line as a notice."""
-    log.warning("%s", line, extra={"notice": True})
+def log_notice(log: logging.Logger, line: str, *, kept: bool = True) -> None:
+    """Log one line as a notice. `kept`: it may also be written to a file; an address with a token is not."""
+    log.warning("%s", line, extra={"notice": True, "kept": kept})
 
 
 def is_notice(record: logging.LogRecord) -> bool:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from learner.members.events import WorkerLeft
-from learner.run_folder import run_log
-from learner.run_folder.run_log import RUN_LOG_FILE, kept_log, newest_lines
+from learner.run_folder import json_log
+from learner.run_folder.json_log import RUN_LOG_FILE, kept_log, newest_lines
 from protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
@@ -30,7 +30,7 @@ def test_warnings_and_notices_are_kept_and_the_rest_is_not(tmp_path: Path) -> No
 
 
 def test_of_a_long_log_the_newer_half_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_log, "MOST_BYTES_OF_LOG", 4_000)
+    monkeypatch.setattr(json_log, "MOST_BYTES_OF_LOG", 4_000)
     with kept_log(tmp_path):
         for number in range(200):
             log.warning("line %d", number)

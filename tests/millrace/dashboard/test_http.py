@@ -60,7 +60,6 @@ def test_every_answer_forbids_what_its_page_does_not_need() -> None:
             "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:;",
             "Referrer-Policy: no-referrer",
             "X-Content-Type-Options: nosniff",
-            "X-Frame-Options: DENY",
             "Cache-Control: no-store",
         ):
             assert f"\r\n{line}" in text

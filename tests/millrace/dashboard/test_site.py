@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from learner.metric_names import METRICS, described, label
+from learner.run_folder.json_log import kept_log
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import RunLock
-from learner.run_folder.run_log import kept_log
 from millrace.dashboard import run_page, site
 from millrace.dashboard.http import PageAnswer, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs

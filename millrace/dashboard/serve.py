@@ -1,0 +1,53 @@
+"""Serves the dashboard. As a program, it serves one for the program that started it, until that ends or closes its input.
+
+`python -m millrace.dashboard.serve RUNS ...` prints the address of the first page, or why there is none.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from millrace.dashboard.known_runs import KnownRuns
+from millrace.dashboard.live import Lookout
+from millrace.dashboard.server import DashboardServer
+from millrace.dashboard.site import Site
+from protocol.errors import UserFacingError
+
+LINGER_S = 2.5  # so that pages which are open show the end
+
+
+def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:
+    """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`."""
+    with Lookout() as lookout:
+        site = Site(KnownRuns(folders, time.time), lookout.look)
+        asyncio.run(DashboardServer(site.answer).serve(host, port, listening))
+
+
+def _end_with_input() -> None:
+    sys.stdin.buffer.read()
+    time.sleep(LINGER_S)
+    os._exit(0)  # nothing of it is kept
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """Serve at a free port of this machine."""
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    try:
+        serve([Path(folder) for folder in sys.argv[1:]], "127.0.0.1", 0, _say)
+    except UserFacingError as error:
+        _say(str(error))
+
+
+if __name__ == "__main__":
+    main()
