@@ -57,7 +57,8 @@ class Picture:
             file.write(font.font_bytes)
             file.flush()
             text = self.svg.replace(MINUS, "-")  # the font has no other
-            return svg_to_bytes(text, zoom=ZOOM, font_files=[file.name], sans_serif_family=font.getname()[0])
+            png: bytes = svg_to_bytes(text, zoom=ZOOM, font_files=[file.name], sans_serif_family=font.getname()[0])
+        return png
 
     def save(self, out: str | os.PathLike[str]) -> Path:
         """Write it to a file, whose name ends in .svg or .png. Raises `UserFacingError`, with a one-line message."""
