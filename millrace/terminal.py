@@ -17,23 +17,25 @@ from html import escape
 from typing import Any, Protocol, TextIO
 
 from rich.console import Console, Group, RenderableType
+from rich.constrain import Constrain
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from learner.report.sentences import bottleneck, went_wrong
+from learner.report.sentences import bottleneck, ending, went_wrong
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import ALL_STEPS_DONE
 from millrace.sparkline import ASCII, BLOCKS, Sparkline
-from protocol.bounds import escaped
+from protocol.bounds import escaped, one_line
 from protocol.logs.notices import is_notice
 
 REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
 LINE_EVERY_S = 5.0
 GAP = "   "  # between the figures of a row
+MOST_REASON = 80  # characters; an error has a line of its own below the block
 
 
 class ProgressView(Protocol):
@@ -310,7 +312,8 @@ class LiveBlock:
     def show(self, progress: Progress) -> None:
         """Redraw the block."""
         self._returns.add(progress.env_steps, progress.return_mean)
-        self._live.update(render_block(progress, self._returns), refresh=True)
+        room = self._console.width - 2  # for the terminal's ^C, which would begin a new line
+        self._live.update(Constrain(render_block(progress, self._returns), room), refresh=True)
 
     def print_line(self, line: str) -> None:
         """Print the line above the block."""
@@ -356,7 +359,7 @@ def how_far(progress: Progress) -> tuple[float | None, str]:
     if progress.stop_reason == ALL_STEPS_DONE:
         return 1.0, f"100%  done in {took}"
     if progress.stop_reason:
-        return None, f"{'Interrupted' if progress.cut_short else 'Finished'} after {took}: {progress.stop_reason}"
+        return None, ending(one_line(progress.stop_reason, MOST_REASON), f" after {took}", cut_short=progress.cut_short)
     share = min(1.0, progress.env_steps / progress.total_steps) if progress.total_steps else 0.0
     left_s = (progress.total_steps - progress.env_steps) / progress.steps_per_s if progress.steps_per_s else 0.0
     return share, f"{math.floor(100 * share)}%  {took}" + (f", {_clock_time(left_s)} left" if left_s >= 1 else "")

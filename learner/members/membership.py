@@ -180,11 +180,15 @@ class Member:
         return more if 0 <= more <= MAX_LATE_ACTIONS else 0
 
     def stages(self) -> Stages:
-        """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session."""
+        """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session.
+
+        A member that only evaluates waits for nothing that training could give it, so that is not counted.
+        """
         lasted_s = self.heard_s - self.joined_s
         return {
             stage: max(0.0, min(seconds - self.stages_before.get(stage, 0.0), lasted_s))
             for stage, seconds in (self.heartbeat.stages if self.heartbeat is not None else {}).items()
+            if not (self.hello.evaluates and stage == "wait")
         }
 
     def status(self, now: float) -> WorkerStatus:

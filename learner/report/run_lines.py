@@ -19,6 +19,7 @@ import msgspec
 
 from learner.config.presets import environment_name
 from learner.report.metrics_tail import newest_row
+from learner.report.sentences import ending
 from learner.run_folder.lease import Owner
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
 from learner.run_folder.regular_files import reason
@@ -149,8 +150,8 @@ def headline(line: RunLine) -> str:
             return f"Dead: no process trains it, and it has no results. It was killed, or its machine went down; {resume}"
         case _:
             assert line.summary is not None
-            why = one_line(line.summary.stop_reason)
-            return f"Interrupted: {why}; {resume}" if line.summary.cut_short else f"Finished: {why}."
+            said = ending(one_line(line.summary.stop_reason), cut_short=line.summary.cut_short)
+            return f"{said}; {resume}" if line.summary.cut_short else f"{said}."
 
 
 def in_sentences(line: RunLine) -> str:

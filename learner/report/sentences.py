@@ -1,4 +1,4 @@
-"""What holds a run up, and what went wrong in it, in sentences for people: on a terminal, in a notebook, on a page. Pure.
+"""What holds a run up, what went wrong in it, and how it ended, in sentences for people. Pure.
 
 Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
 the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits.
@@ -46,6 +46,12 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
         what, did, seconds = "Callbacks, checkpoints and metrics are", "is busy with them", learner["other"]
     of_time = f"{seconds / training_s:.0%} of the time, and workers wait for {idle:.0%}"
     return f"{what} the slowest part: the learner {did} for {of_time}."
+
+
+def ending(reason: str, after: str = "", *, cut_short: bool) -> str:
+    """How a run ended, and why. `after`: after how long."""
+    how = "Interrupted" if cut_short else "Finished"
+    return f"{how}{after}" if reason == how.lower() else f"{how}{after}: {reason}"
 
 
 def went_wrong(counts: Mapping[str, float | None]) -> str:

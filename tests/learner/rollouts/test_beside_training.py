@@ -9,6 +9,7 @@ from learner.members.failure_count import FailureCount
 from learner.members.membership import Outgoing
 from learner.rollouts.stall_watch import StallWatch
 from protocol.alive import CallTimeouts
+from protocol.bounds import Stages
 from protocol.errors import EnvironmentFailed
 from protocol.messages import PROTOCOL_VERSION, Collect, Evaluate, Heartbeat, Hello, Weights, WorkerExit
 from tests.learner.rollouts.test_evaluation_dealer import answer, orders, plan
@@ -66,6 +67,15 @@ def test_they_play_it_while_the_others_collect() -> None:
     learner.delivers(number)
     learner.take()
     assert len(permits(learner.publish(1), A)) == 1
+
+
+def test_only_those_who_collect_wait_for_training() -> None:
+    learner = learner_with(A, E)
+    learner.now = 60.0
+    for peer in (A, E):
+        spent: Stages = {"wait": 20.0, "evaluate": 10.0}
+        learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), tuple(learner.tickets(peer)), 0, spent, 0))
+    assert learner.coordinator.membership.stages() == {"wait": 20.0, "evaluate": 20.0}
 
 
 def test_a_lost_ticket_is_played_under_the_version_that_is_evaluated() -> None:

@@ -3,6 +3,7 @@
 import io
 import logging
 import os
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -125,7 +126,7 @@ def test_the_block_has_everything() -> None:
     [
         ({"stop_reason": "all steps done"}, " 100%  done in 0:15"),
         ({"stop_reason": "target return 475 reached"}, "Finished after 0:15: target return 475 reached"),
-        ({"stop_reason": "interrupted", "cut_short": True}, "Interrupted after 0:15: interrupted"),
+        ({"stop_reason": "interrupted", "cut_short": True}, "Interrupted after 0:15"),
     ],
 )
 def test_a_run_that_ended_is_done_or_says_why_and_no_percentage(ended: dict[str, Any], head: str) -> None:
@@ -183,6 +184,17 @@ def test_the_live_block_redraws_and_restores_the_terminal() -> None:
     assert "a [line] that stays" in shown
     assert shown.rindex("7 of 10 ") > shown.rindex("1 of 10 ")
     assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h") == 1  # the cursor comes back
+
+
+def test_the_terminal_can_write_ctrl_c_behind_every_line_of_the_block() -> None:
+    """It wrote it on the next line, and the last redraw left a line with a percentage."""
+    console = Console(file=io.StringIO(), width=60, force_terminal=True, color_system=None)
+    view = LiveBlock(console)
+    view.show(replace(PROGRESS, waiting=WAITING, run="r" * 200))
+    view.close()
+    assert isinstance(console.file, io.StringIO)
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", console.file.getvalue()).splitlines()
+    assert max(map(len, lines)) == 58
 
 
 def test_warnings_of_the_log_are_shown_meanwhile(capsys: pytest.CaptureFixture[str]) -> None:
