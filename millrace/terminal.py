@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from html import escape
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.constrain import Constrain
@@ -38,20 +38,17 @@ GAP = "   "  # between the figures of a row
 MOST_REASON = 80  # characters; an error has a line of its own below the block
 
 
-class ProgressView(Protocol):
-    """A way to show progress."""
+class ProgressView:
+    """A way to show progress. What it does not say does nothing."""
 
     def show(self, progress: Progress) -> None:
         """Show this progress now."""
-        ...
 
     def print_line(self, line: str) -> None:
         """Print a line that is not redrawn."""
-        ...
 
     def close(self) -> None:
         """Restore the terminal."""
-        ...
 
 
 @contextmanager
@@ -165,7 +162,7 @@ def _view(log_json: bool) -> tuple[ProgressView, float]:
     return PlainLines(), LINE_EVERY_S
 
 
-class DroppingView:
+class DroppingView(ProgressView):
     """Shows what can be shown, and drops the rest: standard output may be full, closed, or anything the user put there."""
 
     def __init__(self, view: ProgressView) -> None:
@@ -222,7 +219,7 @@ class RateLimitedView:
             self._waiting, self._shown_s = None, self._clock()
 
 
-class PlainLines:
+class PlainLines(ProgressView):
     """Plain lines, for logs, pipes and batch systems."""
 
     def show(self, progress: Progress) -> None:
@@ -235,9 +232,6 @@ class PlainLines:
     def print_line(self, line: str) -> None:
         """Print the line."""
         print(escaped(line), flush=True)
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 class NotebookCell:
@@ -281,18 +275,12 @@ class NotebookBlock(PlainLines):
         self._cell.show(main_figures(progress), html)
 
 
-class JsonEvents:
-    """JSON lines on stderr, for programs."""
+class JsonEvents(ProgressView):
+    """JSON lines on stderr, for programs. Notes are part of the progress, and the log has its own handler."""
 
     def show(self, progress: Progress) -> None:
         """Print one line."""
         sys.stderr.write(f"{progress_line(progress, time.time())}\n")
-
-    def print_line(self, line: str) -> None:
-        """Do nothing: notes are part of the progress, and the log has its own handler."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 def _json_log_handler() -> logging.Handler:
@@ -301,7 +289,7 @@ def _json_log_handler() -> logging.Handler:
     return handler
 
 
-class LiveBlock:
+class LiveBlock(ProgressView):
     """A block that is redrawn in place on a terminal."""
 
     def __init__(self, console: Console) -> None:

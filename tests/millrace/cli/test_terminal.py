@@ -21,6 +21,7 @@ from millrace.terminal import (
     REDRAW_EVERY_S,
     LiveBlock,
     PlainLines,
+    ProgressView,
     RateLimitedView,
     block_rows,
     count_line,
@@ -40,7 +41,7 @@ PROGRESS = Progress(
 )  # fmt: skip
 
 
-class RecordingView:
+class RecordingView(ProgressView):
     def __init__(self) -> None:
         self.shown: list[int] = []
         self.lines: list[str] = []
