@@ -67,6 +67,7 @@ def test_a_worker_holds_the_versions_that_its_tickets_name(searched: Search) -> 
     assert ((0, 1), (0, 1)) in held
 
 
+@pytest.mark.model
 def test_the_reductions_leave_out_no_state_of_the_learner_or_of_a_worker(searched: Search) -> None:
     """Every rule is about the learner or about one worker, so a broken one shows in the same states with and without."""
 

@@ -38,6 +38,7 @@ from learner.env_spaces import EnvSpaces
 from learner.report.page import page
 from learner.report.picture import draw
 from learner.resume_checks import unless_finished
+from learner.run_folder.json_log import kept_log
 from learner.run_folder.lease import Owner
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.newest_run import newest_run
@@ -67,6 +68,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "workers").mkdir(exist_ok=True)
     (folder / "workers" / "w0.log").write_text("a line of a worker\n")
     (folder / "videos").mkdir()
+    with kept_log(folder):
+        logging.getLogger("millrace").warning("a worker was lost\n%s", "a line of its traceback\n" * 20)
     for picture in ("observation.png", "videos/a.mp4"):
         (folder / picture).write_bytes(b"a picture")
     owner = Owner(host="there", pid=1, boot="another", token="t", address="tcp://127.0.0.1:1")
@@ -122,6 +125,7 @@ FILES = {
     "config.toml": ("resume", "resume auto", "is_finished", "evaluate", "report", "plot", "Run"),
     "run.json": ("resume", "resume auto", "is_finished", "evaluate", "report", "plot"),
     "metrics.jsonl": ("resume", "report", "plot", "Run"),
+    "log.jsonl": ("report", "resume"),
     "summary.json": ("resume", "is_finished", "report", "Run"),
     "policy.json": ("resume", "evaluate", "evaluate --best", "load"),
     "policy.safetensors": ("evaluate", "resume", "load"),
@@ -360,9 +364,9 @@ def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_sample_of_damages(whole: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
-    counts = check(whole, tmp_path, name, cuts=10, flips=10, caplog=caplog, count=10)
+    counts = check(whole, tmp_path, name, cuts=5, flips=5, caplog=caplog, count=6)
     sys.stdout.write(f"\n{name}: {dict(sorted(counts.items()))}\n")
-    assert counts.total() >= 25 * len(FILES[name])
+    assert counts.total() >= 12 * len(FILES[name])
 
 
 @pytest.mark.soak

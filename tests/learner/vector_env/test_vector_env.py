@@ -81,7 +81,7 @@ def test_results_through_shared_memory_equal_those_of_sync_vector_env(env: str, 
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@pytest.mark.parametrize("transport", ["ipc", "tcp", "inproc"])
+@pytest.mark.parametrize("transport", ["ipc", pytest.param("tcp", marks=pytest.mark.soak), "inproc"])
 def test_results_by_messages_equal_those_of_sync_vector_env(transport: str, mode: AutoresetMode) -> None:
     with both("workers.envs.toy:Informs-v0", 5, mode, transport) as (ours, theirs):
         play(ours, theirs, 150, mode)

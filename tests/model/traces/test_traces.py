@@ -63,6 +63,7 @@ def test_every_method_that_a_shell_may_call_is_recorded_or_left_out_on_purpose(p
     assert public == {*METHODS[part.__name__], *NOT_RECORDED.get(part.__name__, ())}
 
 
+@pytest.mark.model
 def test_the_run_is_one_of_the_model(accepted: Acceptance) -> None:
     counts = accepted.counts
     assert counts["learners"] == 2
@@ -115,6 +116,7 @@ def learners(folder: Path) -> list[Path]:
     return sorted(folder.glob("learner-*"), key=lambda path: next(read(path)).at_s)
 
 
+@pytest.mark.model
 def test_a_call_that_is_left_out_shows(copy: Path) -> None:
     def without_a_rollout(records: list[Record]) -> list[Record]:
         place = next(n for n, each in enumerate(records) if any(isinstance(one, SaidRollout) for one in each.arguments))
@@ -125,6 +127,7 @@ def test_a_call_that_is_left_out_shows(copy: Path) -> None:
         accept(copy)
 
 
+@pytest.mark.model
 def test_a_message_that_nobody_said_shows(copy: Path) -> None:
     """A worker's process ended before it said what the learner heard."""
     path = max(copy.glob("worker-*"), key=lambda path: path.stat().st_size)
@@ -133,6 +136,7 @@ def test_a_message_that_nobody_said_shows(copy: Path) -> None:
         accept(copy)
 
 
+@pytest.mark.model
 def test_a_message_that_is_heard_before_it_is_said_shows(copy: Path) -> None:
     path = max(copy.glob("worker-*"), key=lambda path: path.stat().st_size)
     change(path, lambda records: [each._replace(at_s=each.at_s - 1000) for each in records])
@@ -140,6 +144,7 @@ def test_a_message_that_is_heard_before_it_is_said_shows(copy: Path) -> None:
         accept(copy)
 
 
+@pytest.mark.model
 def test_a_message_may_come_twice(copy: Path, accepted: Acceptance) -> None:
     """The network of the model repeats messages. A repeat of weights changes nothing in a worker."""
 
@@ -151,6 +156,7 @@ def test_a_message_may_come_twice(copy: Path, accepted: Acceptance) -> None:
     assert accept(copy).counts["messages to workers"] == accepted.counts["messages to workers"] + 1
 
 
+@pytest.mark.model
 def test_a_learner_that_begins_where_no_checkpoint_was_shows(copy: Path) -> None:
     def without_snapshots(records: list[Record]) -> list[Record]:
         return [each for each in records if each.method != "incarnations"]
@@ -166,6 +172,7 @@ def test_a_learner_that_begins_where_no_checkpoint_was_shows(copy: Path) -> None
         accept(copy)
 
 
+@pytest.mark.model
 def test_a_trace_that_is_cut_in_a_record_is_read_up_to_there(copy: Path) -> None:
     """So ends the trace of a process that was killed while it wrote."""
     path = learners(copy)[-1]

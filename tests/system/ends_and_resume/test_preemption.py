@@ -52,6 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "dqn, prioritized": {**DQN, "priority_alpha": 0.6, "n_step": 3, "amsgrad": True, "dueling": True},
     "ppo, evaluated beside": {**PPO_SETTINGS, **NORMAL, "eval_workers": 1, "learning_rate": 0.02},
 }
+IN_MAKE_TEST = ("ppo", "ppo, lstm", "dqn, prioritized", "ppo, evaluated beside")  # `make soak` runs the others
 STOP = 6  # the update after which a run is interrupted
 Watch = Callable[[Progress], None]
 
@@ -112,7 +113,9 @@ def numbers(row: dict[str, Any]) -> dict[str, Any]:
     return kept | {name: row[name] for name in ("time/iterations", "time/total_timesteps", "ledger/used")}
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "variant", [name if name in IN_MAKE_TEST else pytest.param(name, marks=pytest.mark.soak) for name in VARIANTS]
+)
 def test_a_resumed_run_equals_one_whose_lanes_were_started_anew(tmp_path: Path, variant: str) -> None:
     settings = VARIANTS[variant]
     reference = restarted(tmp_path, STOP, **settings)
@@ -295,7 +298,7 @@ def test_a_second_sigterm_changes_nothing_and_a_second_ctrl_c_ends_at_once() -> 
         assert signal.getsignal(signal.SIGTERM) == before, "without a grace time, the second one must be able to end it"
 
 
-@pytest.mark.parametrize("grace_s", [1.5, 8.0])
+@pytest.mark.parametrize("grace_s", [1.5, pytest.param(8.0, marks=pytest.mark.soak)])
 def test_a_process_ends_within_its_grace_time_though_a_worker_does_not_leave(stage: Stage, grace_s: float) -> None:
     """The worker is in a step that takes ten minutes."""
     command = [

@@ -86,7 +86,7 @@ def evaluated(folder: Path, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("how", ["script", "prompt"])
+@pytest.mark.parametrize("how", ["script", pytest.param("prompt", marks=pytest.mark.soak)])
 def test_a_script_trains_resumes_evaluates_and_records_what_it_registers(tmp_path: Path, how: str) -> None:
     pytest.importorskip("minari")
     program = REGISTERED + TRAIN + WHOLE

@@ -34,7 +34,7 @@ SMALL: dict[str, Any] = {
     "eval_episodes": 1,
     "steps": 600,
 }
-ALGORITHMS = pytest.mark.parametrize("algo", ["sac", "td3"])
+ALGORITHMS = pytest.mark.parametrize("algo", ["sac", pytest.param("td3", marks=pytest.mark.soak)])
 
 
 def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) -> Path:

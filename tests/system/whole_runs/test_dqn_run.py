@@ -40,7 +40,11 @@ def ratios(folder: Path) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"priority_alpha": 0.6, "n_step": 3, "dueling": True, "normalize_observations": True}]
+    "settings",
+    [
+        pytest.param({}, marks=pytest.mark.soak),
+        {"priority_alpha": 0.6, "n_step": 3, "dueling": True, "normalize_observations": True},
+    ],
 )
 def test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:
     policies, found = {}, {}

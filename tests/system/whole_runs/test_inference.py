@@ -23,6 +23,7 @@ from tests.system.stage.run_folders import policy_of, summary
 from tests.system.stage.runs import balanced
 
 IN_LEARNER: dict[str, Any] = {"inference": "learner"}
+REINFORCE: dict[str, Any] = {"steps": 16_000, "algo": "reinforce", "preset": "none", "rollout_steps": 501}
 
 
 # ---------------------------------------------------------------- the same weights
@@ -32,12 +33,12 @@ IN_LEARNER: dict[str, Any] = {"inference": "learner"}
     ("env", "settings"),
     [
         ("CartPole-v1", {"steps": 4_000, "n_epochs": 2}),
-        ("Pendulum-v1", {"steps": 7_000, "rollout_steps": 64, "n_epochs": 1}),
+        pytest.param("Pendulum-v1", {"steps": 7_000, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
         ("CartPole-v1", {"steps": 3_000, "core": "lstm", "core_size": 8, "n_epochs": 1, "normalize_observations": True}),
-        ("CartPole-v1", {"steps": 3_000, "algo": "a2c"}),
-        ("CartPole-v1", {"steps": 4_000, "algo": "dqn"}),
-        ("CartPole-v1", {"steps": 16_000, "algo": "reinforce", "preset": "none", "rollout_steps": 501}),
-        ("CartPole-v1", {"steps": 4_000, "algo": "impala", "max_lag": 0}),
+        pytest.param("CartPole-v1", {"steps": 3_000, "algo": "a2c"}, marks=pytest.mark.soak),
+        ("CartPole-v1", {"steps": 2_500, "algo": "dqn"}),
+        pytest.param("CartPole-v1", REINFORCE, marks=pytest.mark.soak),
+        pytest.param("CartPole-v1", {"steps": 4_000, "algo": "impala", "max_lag": 0}, marks=pytest.mark.soak),
     ],
     ids=["ppo", "gaussian", "lstm", "a2c", "dqn", "reinforce", "impala"],
 )
@@ -66,6 +67,7 @@ def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> N
     assert policy_of(run(tmp_path, "CartPole-v1", seed=4, **other)) != policies[1], "the seed changes nothing"
 
 
+@pytest.mark.soak
 def test_a_run_with_learner_inference_learns(tmp_path: Path) -> None:
     folder = run(tmp_path, "CartPole-v1", steps=60_000, target_mean_return=150.0, eval_episodes=10, **IN_LEARNER)
     assert summary(folder)["stop_reason"] == "mean return 150 of the last episodes reached"
@@ -106,7 +108,7 @@ def test_every_whole_episode_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
 # ---------------------------------------------------------------- thin workers
 
 
-@pytest.mark.parametrize("inference", ["workers", "learner"])
+@pytest.mark.parametrize("inference", [pytest.param("workers", marks=pytest.mark.soak), "learner"])
 def test_workers_that_only_step_do_not_import_torch_for_images(tmp_path: Path, inference: str) -> None:
     with_torch: list[bool] = []
 

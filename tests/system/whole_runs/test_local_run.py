@@ -50,7 +50,7 @@ def inference(request: pytest.FixtureRequest) -> str:
 @pytest.mark.parametrize(
     ("env", "settings"),
     [
-        ("CartPole-v1", {"steps": 5_300, "n_epochs": 2}),
+        ("CartPole-v1", {"steps": 5_300, "n_epochs": 1}),
         pytest.param("Pendulum-v1", {"steps": 10_700, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
     ],
 )

@@ -63,10 +63,10 @@ def test_the_vectorized_form_shows_rewards_and_ends_as_the_loop_does(
 @pytest.mark.parametrize(
     "settings",
     [
-        {"fire_on_reset": True},
-        {"clip_rewards": True},
-        {"terminal_on_life_loss": True},
-        {"fire_after_life_loss": True},
+        *(
+            pytest.param({name: True}, marks=pytest.mark.soak)  # one alone; what follows has each of them
+            for name in ("fire_on_reset", "clip_rewards", "terminal_on_life_loss", "fire_after_life_loss")
+        ),
         {"fire_on_reset": True, "clip_rewards": True, "terminal_on_life_loss": True},
         {"fire_on_reset": True, "fire_after_life_loss": True, "terminal_on_life_loss": True},
     ],
