@@ -23,7 +23,11 @@ LINGER_S = 2.5  # so that pages which are open show the end
 
 
 def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`."""
+    """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`.
+
+    What trains on this machine goes first: the process is nicer than any other.
+    """
+    os.nice(19)
     with Lookout() as lookout:
         site = Site(KnownRuns(folders, time.time), lookout.look)
         asyncio.run(DashboardServer(site.answer).serve(host, port, listening))

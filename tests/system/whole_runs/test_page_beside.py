@@ -6,6 +6,7 @@ import re
 import sys
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,11 @@ SHORT: dict[str, Any] = {"steps": 256, "workers": 1, "envs": 2, "lanes": 1, "rol
 
 def page_processes() -> list[psutil.Process]:
     """Those of this process that serve a page."""
-    running = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-    return [child for child in running if "millrace.dashboard.serve" in child.cmdline()]
+    found = []
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):  # it has just ended
+            found += [child] if "millrace.dashboard.serve" in child.cmdline() else []
+    return found
 
 
 def said(address: str) -> str:
