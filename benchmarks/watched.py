@@ -1,8 +1,8 @@
 """What an open page of the dashboard costs the run that it shows: env steps/s with the page open, and without a dashboard.
 
 `python -m benchmarks.watched`. The page is served and read by processes of their own, on the machine that trains, as with
-`--dashboard` and a browser there; it is asked for once a second. The rate is that of the seconds between two updates.
-Contenders take turns, and each goes first as often as the other.
+`--dashboard` and a browser there; it is asked for once a second. The rate is that between two updates after the same numbers
+of env steps: CartPole's episodes grow longer while it learns. Contenders take turns, and each goes first as often.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import Any
 
 import millrace
@@ -25,7 +25,8 @@ while True:
     urllib.request.urlopen(sys.argv[1] + "?part=main", timeout=10).read()
     time.sleep(1.0)
 """
-WARM_UP_S = 5.0
+STEPS = {"CartPole": (20_000, 80_000), "slow": (1_500, 6_500)}
+"""from how many env steps to how many the rate is measured"""
 SETTINGS: dict[str, dict[str, Any]] = {
     "CartPole": {"env": "CartPole-v1", "workers": 2},
     "slow": {
@@ -35,31 +36,27 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def rate(name: str, seconds: float, seed: int, *, page: bool) -> float:
-    """Env steps/s between the first update after the warm-up and the last one."""
+def rate(name: str, seed: int, *, page: bool) -> float:
+    """Env steps/s."""
+    first, last = STEPS[name]
     moments: list[tuple[int, float]] = []
-    begins_s = 0.0
+    to_open = page
     with ExitStack() as stack:
 
         def watch(progress: millrace.Progress) -> None:
-            nonlocal begins_s
-            if not begins_s:
-                begins_s = time.monotonic() + WARM_UP_S
-                if page:
-                    address = stack.enter_context(millrace.Dashboard(progress.run)).address
-                    reader = subprocess.Popen([sys.executable, "-c", READER, address], stderr=subprocess.DEVNULL)
-                    stack.callback(reader.wait)
-                    stack.callback(reader.kill)
-            now = time.monotonic()
-            if now >= begins_s and (not moments or progress.env_steps > moments[-1][0]):
-                moments.append((progress.env_steps, now))
-            if now >= begins_s + seconds:
-                raise TimeoutError
+            nonlocal to_open
+            if to_open:
+                to_open = False
+                address = stack.enter_context(millrace.Dashboard(progress.run)).address
+                reader = subprocess.Popen([sys.executable, "-c", READER, address], stderr=subprocess.DEVNULL)
+                stack.callback(reader.wait)
+                stack.callback(reader.kill)
+            if progress.env_steps >= first and (not moments or progress.env_steps > moments[-1][0]):
+                moments.append((progress.env_steps, time.monotonic()))
 
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        settings = {"eval_every": 0, "steps": 1_000_000_000, "progress": False, **SETTINGS[name]}
-        with suppress(TimeoutError):
-            millrace.train(**settings, seed=seed, run_dir=folder, watch=watch)
+        settings = {"eval_every": 0, "eval_episodes": 1, "progress": False, **SETTINGS[name], "steps": last}
+        millrace.train(**settings, seed=seed, run_dir=folder, watch=watch)
     (first, began_s), (last, ended_s) = moments[0], moments[-1]
     return (last - first) / (ended_s - began_s)
 
@@ -67,7 +64,6 @@ def rate(name: str, seconds: float, seed: int, *, page: bool) -> float:
 def main() -> int:
     """Measure, print a table, and write it to benchmarks/results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--rounds", type=int, default=4)
     flags = parser.parse_args()
     found: dict[str, dict[str, list[float]]] = {}
@@ -75,7 +71,7 @@ def main() -> int:
         of_env: dict[bool, list[float]] = {False: [], True: []}
         for seed in range(flags.rounds):
             for page in (False, True) if seed % 2 else (True, False):
-                of_env[page].append(rate(name, flags.seconds, seed, page=page))
+                of_env[page].append(rate(name, seed, page=page))
         without, with_page = (statistics.median(of_env[page]) for page in (False, True))
         sys.stdout.write(
             f"{name:10} without {without:8,.0f}, page open {with_page:8,.0f} env steps/s, {with_page / without:.3f}\n"
