@@ -60,7 +60,9 @@ class DashboardServer:
         assert task is not None
         self._open[task] = None
         if len(self._open) > MOST_CONNECTIONS:
-            next(iter(self._open)).cancel()
+            oldest = next(iter(self._open))
+            del self._open[oldest]  # so that the next one closes another
+            oldest.cancel()
         try:
             with suppress(
                 OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.CancelledError

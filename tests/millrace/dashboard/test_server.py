@@ -12,7 +12,7 @@ import pytest
 
 from millrace.cli.dashboard import where_to_listen
 from millrace.dashboard import server as dashboard_server
-from millrace.dashboard.http import PageAnswer, PageRequest
+from millrace.dashboard.http import PageAnswer, PageRequest, parsed
 from millrace.dashboard.server import MOST_CONNECTIONS, MOST_HEAD_BYTES, DashboardServer
 from protocol.errors import UsageError
 
@@ -93,6 +93,29 @@ def test_idle_clients_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
             assert idle[0].recv(1) == b"", "of too many, the one that has been open for longest is closed"
         finally:
             for client in idle:
+                client.close()
+
+
+def test_of_clients_that_come_at_once_no_more_stay_than_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    come, held = threading.Event(), threading.Event()
+
+    def held_up(head: bytes) -> PageRequest | None:
+        held.set()
+        come.wait(TIMEOUT_S)
+        return parsed(head)
+
+    monkeypatch.setattr(dashboard_server, "HEAD_WITHIN_S", 1_000.0)
+    monkeypatch.setattr(dashboard_server, "MOST_CONNECTIONS", 4)
+    monkeypatch.setattr(dashboard_server, "parsed", held_up)
+    with served() as address, closing(connect(address)) as first:
+        first.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert held.wait(TIMEOUT_S)
+        clients = [connect(address) for _ in range(40)]
+        come.set()
+        try:
+            assert [client.recv(1) for client in clients[:-4]] == [b""] * 36
+        finally:
+            for client in clients:
                 client.close()
 
 
