@@ -42,6 +42,7 @@ MAY_DIFFER_IN_A_GROUP = frozenset({
     "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind",
 })  # fmt: skip
 """Settings on which it does not depend what is learned from an env step"""
+MOST_IMAGES = 16  # of one observation
 MOST_DIFFERENCES = 3  # settings that are listed after the name of a group, if no more are needed to tell groups apart
 ELSEWHERE = "started elsewhere"
 """What is shown as the number of workers if the learner started none."""
@@ -186,7 +187,7 @@ def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRu
         curve=files.curve(),
         evaluations=points(files.rows, EVALUATION_KEY),
         videos=tuple(regular_files(path, "videos/*.mp4")),
-        images=tuple(regular_files(path, "observation*.png")),
+        images=tuple(regular_files(path, "observation*.png")[:MOST_IMAGES]),
         log=tuple(newest_lines(path)),
     )
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -52,10 +52,20 @@ class PageRequest(NamedTuple):
     """by names in small letters"""
 
 
+class StoredBody(NamedTuple):
+    """A body of which no more than the part that is wanted is read."""
+
+    tag: str
+    """other content has another one"""
+    size: int
+    read: Callable[[int, int], bytes]
+    """from a place up to another"""
+
+
 class PageAnswer(NamedTuple):
     """What it gets."""
 
-    body: bytes
+    body: bytes | StoredBody
     content_type: str = "text/html; charset=utf-8"
     status: int = 200
 
@@ -99,23 +109,28 @@ def why_refused(request: PageRequest | None, token: str, hosts: Collection[str])
 
 def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
     """The answer as it is sent. If the browser has the same already, or asked for the head only, it gets no body."""
-    headers, body, status = dict(HEADERS), answer.body, answer.status
+    headers, whole, status = dict(HEADERS), _stored(answer.body), answer.status
+    part = range(whole.size)
     if request is not None and status == 200:
-        headers["ETag"] = tag = f'"{hashlib.blake2b(body, digest_size=16).hexdigest()}"'
+        headers["ETag"] = tag = f'"{whole.tag}"'
         if request.headers.get("if-none-match") == tag:
-            status, body = 304, b""
-        elif request.method == "GET" and (part := _wanted_part(request.headers, tag, len(body))) is not None:
-            status = 206 if part else 416  # a film is played from the middle
-            headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{len(body)}"
-            body = body[part.start : part.stop]
+            status = 304
+        elif request.method == "GET" and (wanted := _wanted_part(request.headers, tag, whole.size)) is not None:
+            status, part = 206 if wanted else 416, wanted  # a film is played from the middle
+            headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{whole.size}"
     if status == 405:
         headers["Allow"] = "GET, HEAD"
     if status != 304:
-        headers |= {"Content-Type": answer.content_type, "Content-Length": str(len(body))}
-    if request is not None and request.method == "HEAD":
-        body = b""
+        headers |= {"Content-Type": answer.content_type, "Content-Length": str(len(part))}
+    has_body = status != 304 and not (request is not None and request.method == "HEAD")
     lines = [f"HTTP/1.1 {status} {REASONS[status]}", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
-    return "\r\n".join(lines).encode() + body
+    return "\r\n".join(lines).encode() + (whole.read(part.start, part.stop) if has_body else b"")
+
+
+def _stored(body: bytes | StoredBody) -> StoredBody:
+    if isinstance(body, StoredBody):
+        return body
+    return StoredBody(hashlib.blake2b(body, digest_size=16).hexdigest(), len(body), lambda begin, end: body[begin:end])
 
 
 def _wanted_part(headers: Mapping[str, str], tag: str, size: int) -> range | None:

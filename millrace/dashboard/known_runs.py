@@ -24,7 +24,7 @@ from learner.run_folder.run_lock import LOCK_FILE
 from protocol.bounds import escaped
 from protocol.errors import UsageError
 
-CHANGES = (CONFIG_FILE, RUN_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
+CHANGES = ("", CONFIG_FILE, RUN_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
 MOST_KEPT = 64  # runs whose rows are in memory
 MOST_LOGS, LOG_BYTES = 4, 4_096
 

@@ -8,6 +8,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
@@ -19,9 +21,9 @@ from learner.report.html_parts import document, return_text, section
 from learner.report.page import STYLE
 from learner.report.reported_runs import ReportData, group_runs
 from learner.report.run_lines import RunLine, algorithm_label, duration
-from learner.run_folder.regular_files import read
+from learner.run_folder.regular_files import open_regular
 from millrace.dashboard import run_page
-from millrace.dashboard.http import PageAnswer, PageRequest, refusal
+from millrace.dashboard.http import PageAnswer, PageRequest, StoredBody, refusal
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import Seen
 from millrace.dashboard.run_page import Choice
@@ -129,9 +131,23 @@ class Site:
         if wanted not in (*shown.videos, *shown.images):
             return refusal(404)
         try:
-            return PageAnswer(read(wanted, MOST_FILM_BYTES), MEDIA[wanted.suffix])
+            return PageAnswer(_stored(wanted), MEDIA[wanted.suffix])
         except OSError:
             return refusal(404)
+
+
+def _stored(path: Path) -> StoredBody:
+    """The content of a file, if it is not too large. Raises `OSError`."""
+
+    def read(begin: int, end: int) -> bytes:
+        with os.fdopen(open_regular(path), "rb") as file:
+            return os.pread(file.fileno(), end - begin, begin)
+
+    with os.fdopen(open_regular(path), "rb") as file:
+        found = os.fstat(file.fileno())
+    if found.st_size > MOST_FILM_BYTES:
+        raise OSError(errno.EFBIG, "too large for a page", str(path))
+    return StoredBody(f"{found.st_ino}-{found.st_size}-{found.st_mtime_ns}", found.st_size, read)
 
 
 def comparison(report: ReportData) -> list[str]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from millrace.dashboard.http import PageAnswer, answer_bytes, parsed, refusal, why_refused
+from millrace.dashboard.http import PageAnswer, StoredBody, answer_bytes, parsed, refusal, why_refused
 
 TOKEN = "the-token"
 HOSTS = ("127.0.0.1:8080",)
@@ -110,3 +110,19 @@ def test_a_film_is_played_from_its_middle(asked: str, status: int, part: bytes, 
     assert body == part
     assert f"Content-Length: {len(part)}" in lines
     assert [line for line in lines if line.startswith("Content-Range: ")] == [f"Content-Range: bytes {place}"] * bool(place)
+
+
+def test_of_a_film_no_more_is_read_than_is_wanted() -> None:
+    read: list[tuple[int, int]] = []
+
+    def part(begin: int, end: int) -> bytes:
+        read.append((begin, end))
+        return b"0123456789"[begin:end]
+
+    film = PageAnswer(StoredBody("tag", 10, part), "video/mp4")
+    asked = {"Range: bytes=2-4": [(2, 5)], 'If-None-Match: "tag"': [], "Accept: video/mp4": [(0, 10)]}
+    for line, wanted in asked.items():
+        read.clear()
+        answer = answer_bytes(parsed(head("GET", f"/{TOKEN}/", HOSTS[0], line)), film)
+        assert read == wanted
+        assert answer.partition(b"\r\n\r\n")[2] == b"".join(b"0123456789"[begin:end] for begin, end in wanted)

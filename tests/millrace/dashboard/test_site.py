@@ -14,7 +14,7 @@ from learner.run_folder.json_log import kept_log
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
-from millrace.dashboard.http import PageAnswer, parsed
+from millrace.dashboard.http import PageAnswer, answer_bytes, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import LaneSample, Seen, sample
 from millrace.dashboard.run_page import Choice, smoothed
@@ -48,6 +48,7 @@ class Pages:
     def text(self, path: str = "") -> str:
         answer = self.answer(path)
         assert answer.status == 200
+        assert isinstance(answer.body, bytes)
         return answer.body.decode()
 
     def said(self, path: str = "") -> str:
@@ -257,7 +258,9 @@ def test_only_films_and_pictures_of_a_run_are_served(tmp_path: Path) -> None:
     (run / "videos" / "link.mp4").symlink_to(tmp_path / "secret.mp4")
     os.mkfifo(run / "videos" / "fifo.mp4")
     pages, of_run = Pages(tmp_path), f"file/{key_of(run)}"
-    assert pages.answer(f"{of_run}/videos/a.mp4") == PageAnswer(b"film", "video/mp4")
+    film = pages.answer(f"{of_run}/videos/a.mp4")
+    assert answer_bytes(None, film).endswith(b"\r\n\r\nfilm")
+    assert film.content_type == "video/mp4"
     assert f"/token/{of_run}/videos/a.mp4" in pages.text(f"run/{key_of(run)}")
     for path in (
         "videos/link.mp4",
@@ -301,6 +304,15 @@ def test_the_page_grows_with_its_run(tmp_path: Path) -> None:
     after = pages.said(f"run/{key_of(run)}?part=main")
     assert "2,100 of" in after
     assert "500.0" in after
+
+
+def test_a_picture_that_is_deleted_is_gone_from_the_page(tmp_path: Path) -> None:
+    run = a_run(tmp_path)
+    (run / "observation.png").write_bytes(b"picture")
+    pages = Pages(tmp_path)
+    assert "What the policy sees" in pages.said(f"run/{key_of(run)}")
+    (run / "observation.png").unlink()
+    assert "What the policy sees" not in pages.said(f"run/{key_of(run)}")
 
 
 def test_a_choice_of_the_reader_is_bounded() -> None:
