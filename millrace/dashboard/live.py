@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -29,6 +30,7 @@ FORGOTTEN_S = 300.0
 SAMPLES = 300
 MOST_LANES = 64  # that are shown
 ANSWER_WITHIN_S = 0.5
+MOST_ANSWERS = 4  # that are read each second: a learner may send more than it is asked for
 
 LEARNER: dict[str, str] = {
     "gathering": "waiting",
@@ -152,12 +154,14 @@ class Lookout:
         if watched.link is None:
             return
         watched.link.poll(timeout_s)
-        answers = [message for message in watched.link.answers() if isinstance(message, Status)]
+        newest = None
+        for message in islice(watched.link.answers(), MOST_ANSWERS):
+            newest = message if isinstance(message, Status) else newest
         now = self._clock()
         with self._lock:
-            if answers:
-                watched.status, watched.answered_s, watched.problem = answers[-1], now, ""
-                watched.samples.append(sample(answers[-1], now))
+            if newest is not None:
+                watched.status, watched.answered_s, watched.problem = newest, now, ""
+                watched.samples.append(sample(newest, now))
             elif now - watched.answered_s > LOOKED_AT_S:
                 watched.status = None
                 problem = watched.link.problem

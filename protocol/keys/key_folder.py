@@ -74,7 +74,7 @@ class KeyFolder:
 
     def allowed(self) -> ClientList:
         """The list of clients; empty if there is no list."""
-        return self._read_list() if self.list_path.exists() else ClientList()
+        return self._read_list() if self.list_path.is_file() else ClientList()
 
     def ensure_first_client(self, now: datetime) -> ClientList:
         """The list of clients. If there is none, it is created with a first client."""

@@ -3,6 +3,7 @@
 import tempfile
 import threading
 from collections.abc import Iterator
+from itertools import repeat
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,21 @@ def test_a_learner_is_asked_as_long_as_somebody_looks(tmp_path: Path, address: s
 def test_a_run_that_cannot_be_asked_says_why(tmp_path: Path) -> None:
     with Lookout() as lookout:
         assert "no process trains it now" in looked(lookout, tmp_path, 1).problem
+
+
+def test_a_learner_that_never_stops_answering_holds_nobody_up(tmp_path: Path) -> None:
+    class Answering:
+        problem = None
+
+        def poll(self, timeout_s: float) -> None:
+            pass
+
+        def answers(self) -> Iterator[Status]:
+            return repeat(status(worker()))
+
+    watched = live._Watched(0.0, Answering())  # type: ignore[arg-type]
+    Lookout()._listen(watched, 0.0)
+    assert watched.status == status(worker())
 
 
 def test_what_is_remembered_is_bounded(tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:

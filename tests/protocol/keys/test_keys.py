@@ -348,6 +348,13 @@ def test_a_list_that_changes_is_read_again(folder: KeyFolder) -> None:
     assert "was revoked" in ring.allowed.rejection_reason(lab)
 
 
+def test_who_reads_a_list_never_waits_for_a_fifo_in_its_place(folder: KeyFolder) -> None:
+    folder.path.mkdir(parents=True, exist_ok=True)
+    folder.list_path.unlink(missing_ok=True)
+    os.mkfifo(folder.list_path)
+    assert folder.allowed() == ClientList()
+
+
 def test_a_list_that_changes_before_the_learner_has_begun_is_read_again(folder: KeyFolder) -> None:
     read = folder.ensure_first_client(NOW)
     default = Token.from_text(folder.token_path("default").read_text(), "").client.public
