@@ -53,10 +53,15 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
     Such a folder may come from a stranger, and what it names is imported; so nothing is imported from the folder itself.
     """
     inside = folder.resolve()
+    entries = [
+        entry
+        for entry in {Path(each).resolve() for each in sys.path}
+        if entry.is_relative_to(inside) or inside.is_relative_to(entry)
+    ]
     for name in names:
         module, colon, _ = name.partition(":")
         first, *_ = parts = module.split(".")
-        for entry in (Path(entry).resolve() for entry in sys.path if colon and first):
+        for entry in entries if colon and first else ():
             if entry.is_relative_to(inside):
                 found = entry.is_dir() and any(path.name.partition(".")[0] == first for path in entry.iterdir())
             else:

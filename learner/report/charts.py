@@ -18,6 +18,7 @@ COLORS = 7  # number of colors in the style sheet
 DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14 5 4 5")  # with round ends
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 10, 40
 MOST_POINTS = 500
+LEAST_SPAN = 1e-300  # steps of less are no numbers
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -37,7 +38,7 @@ class Series(NamedTuple):
 def ticks(low: float, high: float, about: int) -> list[float]:
     """Round numbers from `low` to `high`, 1, 2 or 5 times a power of ten apart; about as many as `about`."""
     span = high - low
-    if not (span > 0 and math.isfinite(span)):
+    if not LEAST_SPAN < span < math.inf:
         return [low]
     power = 10.0 ** math.floor(math.log10(span / about))
     step = min((factor * power for factor in (1, 2, 5, 10)), key=lambda step: abs(span / step - about))

@@ -26,7 +26,7 @@ def history(report: ReportData) -> str:
 
 def _logged(line: LoggedLine, run: str) -> str:
     text, _, more = escaped(line.message).partition("\n")
-    when = f"{line.time.astimezone():%Y-%m-%d %H:%M:%S}"
+    when = f"{line.time:%Y-%m-%d %H:%M:%S}"
     said = f"<small>{escape(', '.join(filter(None, (when, run))))}</small> {escape(text)}"
     if more:
         said = f'<details><summary>{said}</summary><pre class="log" tabindex="0">{escape(more)}</pre></details>'

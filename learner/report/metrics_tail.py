@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
-from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,11 @@ import numpy as np
 from learner.run_folder.metrics_log import METRICS_FILE, decoded_row
 from learner.run_folder.regular_files import MOST_BYTES, open_regular
 from learner.run_folder.results import EVALUATION_KEY
+from protocol.arrays import Ints
 
 MOST_ROWS = 256  # at least, and twice as many at most: a chart has 500 points
-CHUNK_BYTES = 1 << 24
-MOST_LINE_BYTES = 1 << 20
+CHUNK_BYTES = 1 << 22
+MOST_LINE_BYTES = 1 << 16
 NEWLINE = 10
 OF_AN_EVALUATION = b'"%s"' % EVALUATION_KEY.encode()
 
@@ -59,8 +59,6 @@ class MetricsTail:
             self._newest, rest = None, b""
             while chunk := file.read(CHUNK_BYTES):
                 rest = self._add(rest + chunk)
-                if len(rest) - len(self._newest or b"") > MOST_LINE_BYTES:
-                    raise OSError(errno.EFBIG, f"a row has more than {MOST_LINE_BYTES:,} bytes", str(self._path))
         self._seen = seen
         return True
 
@@ -72,16 +70,18 @@ class MetricsTail:
     def _add(self, text: bytes) -> bytes:
         """Add the lines of this text. Returns its end, from the newest whole line on, which may change."""
         ends = np.flatnonzero(np.frombuffer(text, np.uint8) == NEWLINE)
+        begins = np.concatenate([[0], ends + 1])
+        if np.diff(begins, append=len(text)).max() > MOST_LINE_BYTES:
+            raise OSError(errno.EFBIG, f"a row has more than {MOST_LINE_BYTES:,} bytes", str(self._path))
         if not ends.size:
             return text
-        begins = np.concatenate([[0], ends[:-1] + 1])
-        self._newest = text[begins[-1] : ends[-1]]
-        first, spans = self._all.count, list(zip(begins[:-1].tolist(), ends[:-1].tolist(), strict=True))
-        lines = dict.fromkeys(bisect_left(ends, place) for place in _places(text, OF_AN_EVALUATION))
-        self._evaluations.add(text, first, spans, [i for i in lines if i < len(spans)])
-        self._all.add(text, first, spans, range(len(spans)))
-        self._offset += int(begins[-1])
-        return text[begins[-1] :]
+        self._newest = text[begins[-2] : ends[-1]]
+        first, spans = self._all.count, np.column_stack([begins[:-2], ends[:-1]])
+        lines = np.unique(np.searchsorted(ends, [*_places(text, OF_AN_EVALUATION)]))
+        self._evaluations.add(text, first, spans, lines[lines < len(spans)])
+        self._all.add(text, first, spans, np.arange(len(spans)))
+        self._offset += int(begins[-2])
+        return text[begins[-2] :]
 
 
 class _Thinned:
@@ -92,7 +92,7 @@ class _Thinned:
         self.count = 0  # lines that were added
         self.lines: dict[int, bytes] = {}  # by their numbers in the file
 
-    def add(self, text: bytes, first: int, spans: Sequence[tuple[int, int]], which: Sequence[int]) -> None:
+    def add(self, text: bytes, first: int, spans: Ints, which: Ints) -> None:
         """`which` of the lines at these places of the text. `first`: the number of its first line in the file."""
         before, every = self.count, self._every
         self.count += len(which)
@@ -100,7 +100,7 @@ class _Thinned:
             self._every *= 2
         if self._every > every:
             self.lines = dict([*self.lines.items()][:: self._every // every])
-        for i in which[-before % self._every :: self._every]:
+        for i in which[-before % self._every :: self._every].tolist():
             begin, end = spans[i]
             self.lines[first + i] = text[begin:end]
 
@@ -116,6 +116,6 @@ def _places(text: bytes, part: bytes) -> Iterator[int]:
 def newest_row(run: Path) -> dict[str, Any]:
     """The last whole row of a metrics.jsonl; empty if there is none. Reads its end only. Raises OSError."""
     with os.fdopen(open_regular(run / METRICS_FILE), "rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES // 16))
+        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES))
         lines = file.read(MOST_LINE_BYTES).split(b"\n")[:-1]
     return next((row for line in reversed(lines) if (row := decoded_row(line)) is not None), {})

@@ -26,7 +26,7 @@ from learner.run_folder.regular_files import reason
 from learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
 from learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
 from learner.run_folder.run_lock import living_owner
-from protocol.bounds import MAX_NAME, one_line
+from protocol.bounds import LARGEST, MAX_NAME, one_line
 from protocol.errors import UsageError
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
@@ -119,7 +119,7 @@ def read_line(path: Path, now: float) -> RunLine:
         seed=config["seed"],
         return_mean=row.get(RETURN_KEY),
         env_steps=row.get(ENV_STEPS_KEY, 0),
-        total_steps=steps if isinstance(steps, int | float) else 0,
+        total_steps=steps if isinstance(steps, int | float) and 0 <= steps <= LARGEST else 0,
         steps_per_s=row.get("time/fps") or 0.0,
         updates=row.get(UPDATES_KEY) or 0,
         wall_s=row.get("time/time_elapsed") or 0.0,
@@ -166,7 +166,7 @@ def in_sentences(line: RunLine) -> str:
 
 def duration(seconds: float) -> str:
     """A duration in s, min or h."""
-    if seconds < 100:
+    if not 100 <= seconds < math.inf:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

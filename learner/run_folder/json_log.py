@@ -17,9 +17,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
+from msgspec.structs import replace
 
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import NOT_SHOWN, Progress
@@ -57,9 +59,9 @@ def _line(time: float, level: str, event: str, message: str, fields: dict[str, A
 
 
 class LoggedLine(msgspec.Struct, frozen=True):
-    """A line of the log."""
+    """A line of the log. Its time is local."""
 
-    time: datetime
+    time: Annotated[datetime, Meta(tz=True)]
     level: str
     message: str
     """Lines after the first are a traceback."""
@@ -86,8 +88,9 @@ def newest_lines(folder: Path) -> list[LoggedLine]:
         return []
     found = []
     for line in lines:
-        with suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
-            found.append(msgspec.json.decode(line, type=LoggedLine))
+        with suppress(msgspec.MsgspecError, UnicodeError, RecursionError, OverflowError, ValueError):
+            logged = msgspec.json.decode(line, type=LoggedLine)
+            found.append(replace(logged, time=logged.time.astimezone()))
     return found
 
 

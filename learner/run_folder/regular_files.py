@@ -16,7 +16,7 @@ from pathlib import Path
 
 from protocol.errors import first_line
 
-MOST_TEXT_BYTES = 1 << 26  # of a file of settings or results
+MOST_TEXT_BYTES = 1 << 22  # of a file of settings or results
 MOST_BYTES = 1 << 31  # of metrics, and of the arrays of a policy
 
 log = logging.getLogger("millrace.learner")

@@ -32,6 +32,8 @@ POLICY_JSON = "policy.json"
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
 HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
 END = "# end\n"
+MOST_CONFIG_BYTES = 1 << 18
+MOST_NESTED = 1_000_000  # lines, times dots in one line: tomllib reads each line by the name of its table, part for part
 """The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 
 
@@ -89,7 +91,7 @@ def read_config(run: Path) -> dict[str, Any]:
     """
     where = run / CONFIG_FILE
     try:
-        table = parse_toml(read(where).decode(), str(where))
+        table = parse_toml(read(where, MOST_CONFIG_BYTES).decode(), str(where))
         msgspec.convert(table, _Identity)
     except FileNotFoundError:
         raise UsageError(f"run {run}: expected a run folder with a {CONFIG_FILE}, got none") from None
@@ -107,6 +109,9 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     """The content of a TOML file. Raises `UsageError`, also for a config.toml that has the first line and not the last."""
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
+    lines = text.split("\n")
+    if len(lines) * max(line.count(".") for line in lines) > MOST_NESTED:
+        raise UsageError(f"{where} has tables in tables in tables, or very long lines; expected the settings of a run")
     try:
         table = tomllib.loads(text)
         msgspec.json.encode(table)  # raises for a whole number of more digits than Python writes

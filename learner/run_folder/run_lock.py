@@ -23,7 +23,7 @@ from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
-from learner.run_folder.lease import Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
 from learner.run_folder.regular_files import open_regular, read, reason
 from protocol.address import is_local
 from protocol.errors import RunError, RunTakenOver, UsageError
@@ -286,7 +286,7 @@ def living_owner(folder: Path, now: float) -> Owner:
     """
     path = folder / LOCK_FILE
     try:
-        owner, age_s = decoded(read(path)), now - path.lstat().st_mtime
+        owner, age_s = decoded(read(path, WIDTH)), now - path.lstat().st_mtime
     except FileNotFoundError:
         raise UsageError(f"run {folder}: {'no process trains it now' if folder.is_dir() else 'no such folder'}") from None
     except OSError as error:

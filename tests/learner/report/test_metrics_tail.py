@@ -2,6 +2,7 @@
 
 import json
 import os
+import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
@@ -98,6 +99,20 @@ def test_a_file_that_is_no_table_is_refused_before_it_fills_the_memory(tmp_path:
     for reads in (MetricsTail(tmp_path).read, lambda: newest_row(tmp_path)):
         with pytest.raises(OSError, match="got a FIFO"):
             reads()
+
+
+def test_short_lines_take_little_memory_and_a_long_one_is_refused(tmp_path: Path) -> None:
+    path, size = tmp_path / METRICS_FILE, 1 << 20
+    path.write_bytes(b"\n" * size)
+    tracemalloc.start()
+    try:
+        MetricsTail(tmp_path).read()
+        assert tracemalloc.get_traced_memory()[1] < 80 * size
+    finally:
+        tracemalloc.stop()
+    path.write_bytes(b"{}\n" + b"x" * (MOST_LINE_BYTES + 1) + b"\n{}\n")
+    with pytest.raises(OSError, match="a row has more than"):
+        MetricsTail(tmp_path).read()
 
 
 def test_the_newest_row_is_found_at_the_end(tmp_path: Path) -> None:

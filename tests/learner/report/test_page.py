@@ -2,6 +2,7 @@
 
 import base64
 import html
+import math
 import os
 import re
 import subprocess
@@ -338,6 +339,7 @@ def test_ticks_are_round_and_within() -> None:
     assert ticks(-1290, -140, 5) == [-1200, -1000, -800, -600, -400, -200]
     assert ticks(0.1, 0.9, 4) == pytest.approx([0.2, 0.4, 0.6, 0.8])
     assert ticks(3, 3, 5) == [3]
+    assert ticks(0, 5e-324, 5) == [0]
     assert [with_si_prefix(x) for x in (0, 0.25, 500, 2e4, -1200, 1.5e6)] == [
         "0",
         "0.25",
@@ -346,8 +348,8 @@ def test_ticks_are_round_and_within() -> None:
         f"{MINUS}1.2k",
         "1.5M",
     ]
-    assert [duration(s) for s in (0.04, 99.96, 119.8, 3599.0, 7260.0)] == [
-        "0.0 s", "100.0 s", "2 min 0 s", "59 min 59 s", "2 h 1 min",
+    assert [duration(s) for s in (0.04, 99.96, 119.8, 3599.0, 7260.0, math.inf)] == [
+        "0.0 s", "100.0 s", "2 min 0 s", "59 min 59 s", "2 h 1 min", "inf s",
     ]  # fmt: skip
 
 

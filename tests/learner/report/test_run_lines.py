@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from learner.report.run_lines import find_runs, headline, in_sentences, read_line
 from learner.run_folder.lease import Listens, decoded
 from learner.run_folder.metrics_log import METRICS_FILE
+from learner.run_folder.run_format import CONFIG_FILE
 from learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
 from protocol.errors import UsageError
 from tests.learner.report.test_page import a_run
@@ -87,3 +88,16 @@ def test_nothing_in_a_folder_can_control_a_terminal(tmp_path: Path) -> None:
     line = read_line(named, time.time())
     for text in (line.name, headline(line), *in_sentences(line).split("\n")):
         assert text.isprintable()
+
+
+@pytest.mark.parametrize("steps", ["inf", "nan", "-1", "1" + "0" * 400])
+def test_odd_numbers_of_a_folder_are_a_line_too(tmp_path: Path, steps: str) -> None:
+    run = a_run(tmp_path, finished=False)
+    config = (run / CONFIG_FILE).read_text()
+    (run / CONFIG_FILE).write_text(config.replace("steps = 100000\n", f"steps = {steps}\n"))
+    (run / METRICS_FILE).write_text('{"time/total_timesteps": 5, "time/fps": 1e-320}\n')
+    with RunLock(run):
+        line = read_line(run, time.time())
+        assert line.state == "training"
+        assert line.total_steps == 0
+        assert headline(line._replace(total_steps=100.0)) == "Training: 5% done, 0 env steps per second, about inf s left."

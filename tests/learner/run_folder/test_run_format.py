@@ -15,7 +15,7 @@ from learner.report.picture import draw
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import RunFolder
-from learner.run_folder.run_format import RUN_FILE, RUN_FORMAT, check_format
+from learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, RUN_FORMAT, check_format
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import RunError, UsageError
@@ -126,6 +126,17 @@ def test_a_damaged_format_is_said_in_one_line(run: Path) -> None:
     (run / RUN_FILE).write_text("{")
     with pytest.raises(UsageError, match=r"run\.json cannot be read: Input data was truncated"):
         RunFolder.open(run)
+
+
+def test_settings_that_would_take_minutes_to_read_are_refused(run: Path) -> None:
+    nested = f"[{'.'.join(['a'] * 4_000)}]\n" + "".join(f"k{i} = 1\n" for i in range(1_000))
+    for settings, why in (
+        (nested, "has tables in tables in tables"),
+        ("x = 1\n" * 100_000, "expected at most 262,144 bytes"),
+    ):
+        (run / CONFIG_FILE).write_text(settings)
+        with pytest.raises(UsageError, match=why):
+            config_of_run(run)
 
 
 def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:

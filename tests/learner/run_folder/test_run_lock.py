@@ -248,6 +248,10 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
             assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
         held.announce(SOCKET)
         assert learner_of_run(tmp_path).address == SOCKET.here, "it is open again"
+        with (tmp_path / LOCK_FILE).open("ab") as file:
+            file.write(b" ")
+        with pytest.raises(UsageError, match=f"expected at most {WIDTH:,} bytes"):
+            learner_of_run(tmp_path)
     with pytest.raises(UsageError, match="no process trains it now"):
         learner_of_run(tmp_path)
 

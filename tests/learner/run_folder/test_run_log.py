@@ -45,6 +45,8 @@ def test_lines_that_cannot_be_read_are_left_out(tmp_path: Path) -> None:
         log.warning("before")
         with (tmp_path / RUN_LOG_FILE).open("ab") as file:
             file.write(b'\xff\n[[[\n{"time":"yesterday","level":"warning","message":"odd"}\n')
+            for time in ("2026-01-01T00:00:00", "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59"):
+                file.write(b'{"time":"%s","level":"warning","message":"of no known time"}\n' % time.encode())
         log.warning("after")
     assert [line.message for line in newest_lines(tmp_path)] == ["before", "after"]
     assert newest_lines(tmp_path / "no-such") == []
