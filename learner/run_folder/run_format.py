@@ -32,9 +32,9 @@ POLICY_JSON = "policy.json"
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
 HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
 END = "# end\n"
+"""The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 MOST_CONFIG_BYTES = 1 << 18
 MOST_NESTED = 1_000_000  # lines, times dots in one line: tomllib reads each line by the name of its table, part for part
-"""The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
