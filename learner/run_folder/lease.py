@@ -50,6 +50,8 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """Random: two locks never have the same."""
     network: Line = ""
     """Which network it is in: a container on the same machine may be in another one."""
+    numbers: Line = ""
+    """In which namespace `pid` is its number: a container has one of its own."""
     address: Line = ""
     """Where its learner listens, for other machines; empty if nobody can ask it, or it does not listen yet."""
     here: Line = ""

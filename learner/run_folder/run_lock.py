@@ -32,7 +32,7 @@ log = logging.getLogger("millrace.learner")
 
 LOCK_FILE = "run.lock"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-NETWORK = Path("/proc/self/ns/net")
+NETWORK, NUMBERS = Path("/proc/self/ns/net"), Path("/proc/self/ns/pid")
 
 
 class Pace(NamedTuple):
@@ -68,7 +68,12 @@ class RunLock:
         self._folder, self._path = folder, folder / LOCK_FILE
         self._pace, self._clock, self._sleep = pace, clock, sleep
         self._owner = Owner(
-            host=socket.gethostname(), pid=os.getpid(), boot=_boot(), token=secrets.token_hex(8), network=_network()
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            boot=_boot(),
+            token=secrets.token_hex(8),
+            network=_namespace(NETWORK),
+            numbers=_namespace(NUMBERS),
         )
         self._file = -1
         self._other: Owner | None = None
@@ -271,7 +276,7 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
     if not owner.address:
         why = "it has not begun yet; try again" if owner.closed is None else WHY_CLOSED[owner.closed]
         raise UsageError(f"run {folder}: {owner} trains it and cannot be asked: {why}")
-    here = owner.boot == _boot() and (not owner.address.startswith("tcp://") or owner.network == _network())
+    here = owner.boot == _boot() and (not owner.address.startswith("tcp://") or owner.network == _namespace(NETWORK))
     if not here and is_local(owner.address):
         raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
     return LearnerOfRun(owner.here if here else owner.address, Path(owner.keys) if owner.keys else None, here)
@@ -280,8 +285,8 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 def living_owner(folder: Path, now: float) -> Owner:
     """Who seems to train the run in this folder, for people to read; `now` is wall-clock time.
 
-    A process here is looked for by its number. Another one, perhaps in a container, rewrites the file every few seconds; if
-    the clocks of the two machines differ by much, this is wrong, so nothing that is written depends on it. Raises
+    A process here is looked for by its number. Another one, in a container too, rewrites the file every few seconds; if the
+    clocks of the two machines differ by much, this is wrong, so nothing that is written depends on it. Raises
     `UsageError`, with a one-line message, if nobody seems to.
     """
     path = folder / LOCK_FILE
@@ -293,7 +298,7 @@ def living_owner(folder: Path, now: float) -> Owner:
         raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {reason(error)}") from error
     if owner is None:
         raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
-    by_number = owner.boot == _boot() and not owner.address.startswith("tcp://")
+    by_number = owner.boot == _boot() and owner.numbers == _namespace(NUMBERS)
     if not (_is_alive(owner.pid) if by_number else age_s < PACE.dead_after):
         raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
     return owner
@@ -317,9 +322,9 @@ def _boot() -> str:
         return f"host {socket.gethostname()}"
 
 
-def _network() -> str:
-    """Which network of this machine this process is in; empty where that is not known."""
+def _namespace(kind: Path) -> str:
+    """In which one of this machine this process is; empty where that is not known."""
     try:
-        return os.readlink(NETWORK)
+        return os.readlink(kind)
     except OSError:
         return ""

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import pytest
 from msgspec.structs import replace
 
 from learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
-from learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run
+from learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run, living_owner
 from protocol.errors import RunError, RunTakenOver, UsageError
 
 ELSEWHERE = Owner(host="far", pid=77, boot="another kernel", token="theirs")
@@ -290,14 +291,17 @@ def test_a_learner_of_this_machine_is_asked_at_its_own_address(tmp_path: Path) -
         learner_of_run(tmp_path)
 
 
-def test_a_process_that_is_gone_trains_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("address", ["", "ipc:///tmp/x", "tcp://127.0.0.1:5555"])
+def test_a_process_that_is_gone_trains_nothing(tmp_path: Path, address: str) -> None:
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     with lock(tmp_path):
-        mine = owner_of(tmp_path)
-    (tmp_path / LOCK_FILE).write_bytes(replace(mine, pid=ended.pid, address="ipc:///tmp/x").encoded())
+        mine = replace(owner_of(tmp_path), pid=ended.pid, address=address)
+    (tmp_path / LOCK_FILE).write_bytes(mine.encoded())
     with pytest.raises(UsageError, match=rf"no process trains it now; process {ended.pid} on \S+ did, and is gone"):
         learner_of_run(tmp_path)
+    (tmp_path / LOCK_FILE).write_bytes(replace(mine, numbers="pid:[1]").encoded())
+    assert str(living_owner(tmp_path, time.time())).startswith(f"process {ended.pid}"), "a container has other numbers"
 
 
 @pytest.mark.parametrize(
