@@ -23,6 +23,7 @@ from learner.members.coordinator import Coordinator
 from learner.members.events import (
     EnvironmentRaised,
     Event,
+    Failed,
     PolicyRaised,
     RejoinRequested,
     WorkerJoined,
@@ -275,16 +276,20 @@ class MemberServer:
         return self._encoded[1]
 
     def _log_events(self, cause: bytes | None) -> None:
+        told = ""  # the worker of whose failure the log has just told
         for event in self._membership.take_events():
             line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested)
             match event:
                 case WorkerRefused(_, why):
                     self._last_turned_away = f"was refused: {one_line(why)}"
-                case WorkerLeft(_, why, _, on_purpose):
+                case WorkerLeft(worker, why, _, on_purpose):
                     expected = on_purpose and self._membership.draining is not None
                     self._last_turned_away = self._last_turned_away if expected else why
+                    expected = expected or worker == told
                 case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
                     line, expected = line.partition("\n")[0], True
+                case Failed(worker):
+                    told = worker
                 case _:
                     pass
             if self._settings.log_joins or not isinstance(event, WorkerJoined):
