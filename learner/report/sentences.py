@@ -1,7 +1,8 @@
 """What holds a run up, what went wrong in it, and how it ended, in sentences for people. Pure.
 
 Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
-the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits.
+the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits. If they add up
+to more, both wait for some workers.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
+BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once: for other workers
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -37,6 +39,9 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
     if not (training_s and collecting_s):
         return ""
     waits, idle = learner["wait"] / training_s, worker["wait"] / collecting_s
+    worker_s = sum(seconds or 0.0 for name, seconds in stages.items() if name.startswith("worker_"))
+    if learner["wait"] / all_s + worker["wait"] / worker_s > 1 + BOTH_WAIT:
+        return f"Workers wait for slower ones: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
     if abs(waits - idle) < ABOUT_EQUAL:
         return f"No part is the slowest: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
     if waits > idle:

@@ -21,6 +21,10 @@ IN_TURN = "Updates are the slowest part: the learner updates for 80% of the time
             {"wait": 5.0, "update": 5.0}, {"act": 2.0, "step": 3.0, "wait": 5.0},
             "No part is the slowest: the learner waits for 50% of the time, and workers for 50%.",
         ),
+        (  # half of the workers are done at once
+            {"wait": 8.0, "update": 2.0}, {"step": 4.0, "wait": 6.0},
+            "Workers wait for slower ones: the learner waits for 80% of the time, and workers for 60%.",
+        ),
         (  # at the same time: the learner updates for most of it, and yet it waits for the workers, which never wait
             {"wait": 4.0, "update": 6.0}, {"act": 2.0, "step": 8.0},
             "Collecting is the slowest part: the learner waits for 40% of the time, and workers for 0%.",
