@@ -19,6 +19,7 @@ DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 10, 40
 MOST_POINTS = 500
 LEAST_SPAN = 1e-300  # steps of less are no numbers
+ON_A_PHONE = 420, 300
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -87,6 +88,12 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     ordered = sorted(all_series, key=lambda series: ("band", "thin", "line", "dots").index(series.kind))
     parts += [_svg(series, x_pixels(series.x), y_pixels(series.y)) for series in ordered if series.x.size]
     return "\n".join([*parts, "</svg>"])
+
+
+def chart_for_all_widths(all_series: Sequence[Series], wide: tuple[int, int], x_label: str, describe: str) -> str:
+    """The same chart in two sizes, of which the style sheet shows one, because text must not shrink with its chart."""
+    sizes = {"for-wide": wide, "for-narrow": ON_A_PHONE}
+    return "".join(f'<div class="{css}">{chart(all_series, *size, x_label, describe)}</div>' for css, size in sizes.items())
 
 
 def key(color: int) -> str:

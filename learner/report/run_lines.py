@@ -65,8 +65,7 @@ class RunLine(NamedTuple):
     @property
     def done(self) -> str:
         """How much of it is done, or why it ended before."""
-        if self.summary is not None:
-            reason = self.summary.stop_reason
+        if self.summary is not None and (reason := self.summary.stop_reason) != self.state:
             return "100%" if reason == ALL_STEPS_DONE else one_line(reason, MOST_REASON)
         return f"{math.floor(100 * min(1.0, self.env_steps / self.total_steps)) if self.total_steps > 0 else 0}%"
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
 
-from learner.report.charts import chart, key
+from learner.report.charts import chart_for_all_widths, key
 from learner.report.html_parts import return_text, section
 from learner.report.panels import WHAT_IS_DRAWN, how_it_is_drawn, panels
 from learner.report.reported_runs import ReportData, RunGroup, differing_settings
@@ -44,7 +44,7 @@ def head(report: ReportData) -> str:
 def results(report: ReportData) -> str:
     """The table of results: a row for each run, under its group."""
     last = f"Last {WINDOW_EPISODES} episodes"
-    numbers = dict.fromkeys(("Greedy return", last, "Env steps", "Steps/s", "Wall time", "Versions"), "number")
+    numbers = dict.fromkeys(("Greedy return", last, "Env steps", "Steps/s", "Wall time", "Updates"), "number")
     columns = {"Run": "text", **numbers, "Ended": "text"}
     heads = "".join(f'<th scope="col" class="{css}">{name}</th>' for name, css in columns.items())
     bodies = "".join(_rows_of_group(group) for group in report.groups)
@@ -98,7 +98,8 @@ def curves(report: ReportData) -> str:
     figures = []
     for panel in panels(report):
         legend = "".join(f"<li>{sample}{escape(text)}</li>" for sample, text in panel.legend)
-        drawn = chart(panel.series, *size, "env steps", f"Learning curves of {panel.env}") if panel.series else ""
+        what = f"Learning curves of {panel.env}"
+        drawn = chart_for_all_widths(panel.series, size, "env steps", what) if panel.series else ""
         figures.append(f'<figure><h3>{escape(panel.env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
     about = f"{WHAT_IS_DRAWN}. {how_it_is_drawn(report)}"
     return section("Learning curves", about, f'<div class="panels n{min(len(report.envs), 2)}">{"".join(figures)}</div>')

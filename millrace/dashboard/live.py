@@ -1,4 +1,4 @@
-"""Asks the learners of the runs that somebody looks at, once a second, and remembers the answers of the last minutes.
+"""Asks the learners of the runs that somebody looks at, twice a second, and remembers the answers of the last minutes.
 
 Rule: a learner is asked as `millrace status` asks it, with the same rights, and only while a page of its run is open. What
 is remembered of a run is bounded, and forgotten when nobody looks.
@@ -24,10 +24,10 @@ from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
 
-ASK_EVERY_S = 1.0
+ASK_EVERY_S = 0.5
 LOOKED_AT_S = 10.0  # a page that is open asks each second
 FORGOTTEN_S = 300.0
-SAMPLES = 300
+SAMPLES = 400
 MOST_LANES = 64  # that are shown
 ANSWER_WITHIN_S = 0.5
 MOST_ANSWERS = 4  # that are read each second: a learner may send more than it is asked for

@@ -15,19 +15,22 @@ import numpy as np
 
 from learner.members.held_up import in_words
 from learner.metric_names import METRICS, NONE, described, label
-from learner.report.charts import DOT_KEY, Segment, Series, bar, chart
+from learner.report.charts import DOT_KEY, Segment, Series, bar, chart_for_all_widths
 from learner.report.curve import points
+from learner.report.history import clock_time
 from learner.report.html_parts import return_text, section
-from learner.report.reported_runs import RunResults
+from learner.report.reported_runs import ReportedRun, RunResults
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
 from learner.report.sentences import bottleneck, went_wrong
+from learner.run_folder.json_log import LoggedLine
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY
 from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
+from protocol.bounds import escaped
 from protocol.messages import Status, WorkerStatus
 
-WIDE, NARROW = (1080, 360), (420, 300)
+WIDE = 1080, 360
 SHOWN_S, LEAST_SHOWN_S = 180.0, 30.0  # of who waits for whom
 COLORS = {
     "collecting": "b1",
@@ -39,6 +42,9 @@ COLORS = {
     "no worker": "gone",
 }
 """Class in the style sheet of what a lane or the learner does"""
+COLUMNS = {"Worker": "", "Process": "late", "Doing": "", "Lanes": "", "Steps/s": "number", "Weights": "",
+           "Heard": "number", "Memory": "number"}  # fmt: skip
+"""Of the table of workers, with their classes in the style sheet"""
 MOST_SMOOTHED = 100
 MOST_LINES = 10  # of evaluations
 MIB = 2**20
@@ -64,13 +70,17 @@ class Choice(NamedTuple):
         return Choice(first("metric", RETURN_KEY), first("over", "") == "time", min(max(rows, 1), MOST_SMOOTHED))
 
 
-def head(line: RunLine, seen: Seen, results: RunResults | None, home: str) -> str:
-    """Which run it is, and in one sentence what it does, or how it ended. `home`: of all runs, if it shows others."""
+def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
+    """Which run it is, in one sentence what it does, or how it ended, and its newest warning.
+
+    `home`: the page of all runs, if it shows others.
+    """
+    results, warned = (report.results, last_warning(report.log)) if report is not None else (None, "")
     kicker = f'<a href="{home}">millrace: all runs</a>' if home else "millrace"
     title = f"{escape(line.env or line.name)} <small>{escape(algorithm_label(line.algo))}, seed {line.seed}</small>"
     return (
         f'<header><p class="kicker">{kicker}</p><h1>{title}</h1>'
-        f'<p class="now {line.state}">{escape(now_sentence(line, seen, results))}</p>'
+        f'<p class="now {line.state}">{escape(now_sentence(line, seen, results))}</p>{warned}'
         f'<p class="kicker">{escape(line.name)}</p></header>'
     )
 
@@ -89,12 +99,22 @@ def now_sentence(line: RunLine, seen: Seen, results: RunResults | None) -> str:
     return " ".join(filter(None, text))
 
 
+def last_warning(log: Sequence[LoggedLine]) -> str:
+    """The newest warning; empty if there was none."""
+    warnings = [line for line in log if line.level != "info"]
+    if not warnings:
+        return ""
+    newest, count = warnings[-1], f"newest of {len(warnings)} warnings" if len(warnings) > 1 else "warning"
+    said = escape(escaped(newest.message).partition("\n")[0])
+    return f'<p class="warned"><a href="#history">{count.capitalize()}</a>, {clock_time(newest)}: {said}</p>'
+
+
 def facts(line: RunLine) -> str:
     """The most important numbers."""
     evaluation = line.summary.evaluation if line.summary else None
     cells = {
         "Return, last 100 episodes": "none yet" if line.return_mean is None else return_text(line.return_mean),
-        "Env steps": f"{line.env_steps:,.0f} of {line.total_steps:,.0f}",
+        f"Env steps of {line.total_steps:,.0f}": f"{line.env_steps:,.0f}",
         "Env steps per second": f"{line.steps_per_s:,.0f}",
         "Updates": f"{line.updates:,.0f}",
         "Time of training": duration(line.wall_s),
@@ -123,9 +143,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
         series += [Series("dots", 1, at, returns, "greedy evaluations")] if at.size else []
     x_label = "minutes of training" if choice.over_time else "env steps"
     what = f"{meaning.label} over {x_label}"
-    sizes = {"for-wide": WIDE, "for-narrow": NARROW}
-    drawn = "".join(f'<div class="{css}">{chart(series, *size, x_label, what)}</div>' for css, size in sizes.items())
-    drawn = drawn if series else "<p>No value yet.</p>"
+    drawn = chart_for_all_widths(series, WIDE, x_label, what) if series else "<p>No value yet.</p>"
     has_dots = any(each.kind == "dots" for each in series)
     legend = f'<ul class="legend"><li>{DOT_KEY}greedy evaluations</li></ul>' if has_dots else ""
     about = meaning.text + f" Unit: {meaning.unit}." * (meaning.unit != NONE)
@@ -176,8 +194,7 @@ def workers(seen: Seen) -> str:
     hosts: dict[str, list[WorkerStatus]] = {}
     for worker in seen.status.workers:
         hosts.setdefault(worker.host, []).append(worker)
-    columns = ("Worker", "Doing", "Lanes", "Steps/s", "Weights", "Heard", "Memory")
-    heads = "".join(f'<th scope="col"{_numeric(name)}>{name}</th>' for name in columns)
+    heads = "".join(f'<th scope="col" class="{css}">{name}</th>' for name, css in COLUMNS.items())
     bodies = []
     for host, members in hosts.items():
         speed = sum(worker.steps_per_s for worker in members)
@@ -185,16 +202,12 @@ def workers(seen: Seen) -> str:
         title = f"<b>{escape(host)}</b><span>{count}, {speed:,.0f} env steps per second</span>"
         rows = "".join(_worker(worker, seen.status) for worker in members)
         bodies.append(
-            f'<tbody><tr class="line"><th scope="rowgroup" colspan="{len(columns)}">{title}</th></tr>{rows}</tbody>'
+            f'<tbody><tr class="line"><th scope="rowgroup" colspan="{len(COLUMNS)}">{title}</th></tr>{rows}</tbody>'
         )
     here, wanted = len(seen.status.workers) + seen.status.workers_left_out, seen.status.workers_wanted
     about = f"{here} here; {wanted} can have a lane each." if wanted else f"{here} here."
     table = f'<table class="runs workers"><thead><tr>{heads}</tr></thead>{"".join(bodies)}</table>'
     return section("Workers", about, f'<div class="scroll">{table}</div>', "workers")
-
-
-def _numeric(column: str) -> str:
-    return ' class="number"' if column in ("Steps/s", "Heard", "Memory") else ""
 
 
 def _worker(worker: WorkerStatus, status: Status) -> str:
@@ -211,6 +224,7 @@ def _worker(worker: WorkerStatus, status: Status) -> str:
         f"{worker.resident_bytes / MIB:,.0f} MB" if worker.resident_bytes else "–",
     )
     speed, heard, memory = (f'<td class="number">{text}</td>' for text in numbers)
+    name += f'<td class="late">{worker.pid}</td>'
     return f"<tr>{name}{doing}<td>{escape(lanes)}</td>{speed}<td>{weights}</td>{heard}{memory}</tr>"
 
 
@@ -226,7 +240,7 @@ def who_waits(seen: Seen) -> str:
     kinds = [kind for kind in COLORS if any(kind in (each.learner, *each.lanes.values()) for each in samples)]
     legend = "".join(f'<li><i class="{COLORS[kind]}"></i>{kind}</li>' for kind in kinds)
     bars = "".join(f'<span class="who">{name}</span>{bar(segments)}<span></span>' for name, segments in rows.items())
-    about = "Looked at once a second since you opened this page, for the last three minutes at most. Now is at the right."
+    about = "Looked at twice a second since you opened this page, for the last three minutes at most. Now is at the right."
     content = f'<div class="stages lanes"><ul class="legend">{legend}</ul><div class="rows">{bars}</div></div>'
     return section("Who waits for whom", about, content, "lanes")
 
@@ -257,13 +271,12 @@ def evaluations(rows: Sequence[Mapping[str, Any]]) -> str:
     length_at = dict(lengths.tolist())
     about = f"The best of {len(returns)} was at {at:,.0f} env steps, with a mean return of {return_text(highest)}."
     lines = [
-        f'<tr><th scope="row" class="number">{steps:,.0f}</th><td class="number">{return_text(value)}'
-        f"{' <small>the best</small>' * (i == best)}</td>"
-        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td></tr>'
+        f'<tr><th scope="row" class="number">{steps:,.0f}</th><td class="number">{return_text(value)}</td>'
+        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td><td>{"the best" * (i == best)}</td></tr>'
         for i, (steps, value) in enumerate(returns)
     ]
     heads = "".join(f'<th scope="col" class="number">{name}</th>' for name in ("Env steps", "Return", "Episode length"))
-    table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(lines[: -MOST_LINES - 1 : -1])}</tbody></table>"
+    table = f"<table><thead><tr>{heads}<th></th></tr></thead><tbody>{''.join(lines[: -MOST_LINES - 1 : -1])}</tbody></table>"
     return section("Evaluations", about, f'<div class="scroll">{table}</div>', "evaluations")
 
 

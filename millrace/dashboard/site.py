@@ -84,7 +84,7 @@ class Site:
             return run_page.head(line, Seen(problem=str(error)), None, back)
         report = group_runs([content.report])
         parts = [
-            run_page.head(line, seen, content.report.results, back),
+            run_page.head(line, seen, content.report, back),
             run_page.facts(line),
             run_page.curve(content.rows, Choice.of(request.query)),
             run_page.who_waits(seen),

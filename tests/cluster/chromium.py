@@ -13,10 +13,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from tests.system.stage.processes import wait_for
+
 ANSWER_S = 60.0
 PROGRAM = ("chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run")
 OWN = ("about:", "chrome:", "data:", "blob:", "devtools:")
 """Addresses that reach no host."""
+ASKED_AGAIN = "performance.getEntriesByType('resource').some(each => each.name.includes('part=main') && each.responseEnd)"
 
 
 class Page:
@@ -26,7 +29,7 @@ class Page:
         self.requests: list[str] = []
         """every address that was asked for, of pages, scripts, films and the like"""
         self.errors: list[str] = []
-        """what the console shows as an error: exceptions, broken rules, answers that are failures"""
+        """what the console shows as an error: exceptions, broken rules, answers that are failures; and dialogs"""
         self._folder = tempfile.TemporaryDirectory(dir="/tmp", prefix="page-")  # Chromium's socket needs a short path
         folder = Path(self._folder.name)
         commands, self._commands = os.pipe()
@@ -82,6 +85,16 @@ class Page:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
+    def open(self, address: str) -> None:
+        """Go to an address, and wait until the page has asked for its main part once more."""
+        self.ask("Page.navigate", url=address)
+        wait_for(lambda: self.value(ASKED_AGAIN), ANSWER_S, f"{address} asks again")
+
+    def press(self, key: str, code: int) -> None:
+        """Press a key that types nothing. `code`: its Windows virtual key code."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
     def _messages(self, timeout_s: float) -> list[dict[str, Any]]:
         assert select.select([self._answers], [], [], max(0.0, timeout_s))[0], "Chromium does not answer"
         content = os.read(self._answers, 1 << 20)
@@ -97,5 +110,7 @@ class Page:
                 self.errors.append(str(details))
             case {"method": "Log.entryAdded", "params": {"entry": {"level": "error"} as entry}}:
                 self.errors.append(str(entry))
+            case {"method": "Page.javascriptDialogOpening", "params": details}:
+                self.errors.append(str(details))
             case {"method": "Runtime.consoleAPICalled", "params": {"type": "error" | "assert"} as details}:
                 self.errors.append(str(details))

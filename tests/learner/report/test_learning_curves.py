@@ -66,8 +66,9 @@ def share_of(image: np.ndarray[Any, Any], rgb: tuple[int, int, int]) -> float:
 
 
 def looks(drawn: str) -> list[str]:
-    """Class and dashes of everything that is drawn of a group, in its order."""
-    return re.findall(r'class="((?:line|thin|band|dots) c[^>]*?")(?= d=|>)', drawn)
+    """Class and dashes of everything that is drawn of a group on a wide page, in its order."""
+    wide = re.sub(r'<div class="for-narrow">.*?</div>', "", drawn, flags=re.DOTALL)
+    return re.findall(r'class="((?:line|thin|band|dots) c[^>]*?")(?= d=|>)', wide)
 
 
 def test_the_picture_shows_what_the_report_shows(tmp_path: Path) -> None:
