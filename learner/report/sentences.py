@@ -34,7 +34,7 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
     worker = {name: stages.get(f"worker_{name}") or 0.0 for name in COLLECTING}
     all_s, collecting_s = sum(learner.values()), sum(worker.values())
     training_s = all_s - learner["evaluate"]
-    if learner["evaluate"] > all_s / 2:
+    if learner["evaluate"] > all_s / 2 > 0:
         return f"Evaluations are the slowest part: they take {learner['evaluate'] / all_s:.0%} of the time."
     if not (training_s and collecting_s):
         return ""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -38,6 +38,7 @@ REASONS = {
     500: "Internal Server Error",
 }
 MOST_FIELDS = 100  # of a query
+PART_BYTES = 1 << 18
 RANGE = re.compile(r"bytes=([0-9]{0,15})-([0-9]{0,15})")  # one part; of several, the whole is sent
 
 
@@ -107,8 +108,11 @@ def why_refused(request: PageRequest | None, token: str, hosts: Collection[str])
     return 0 if hmac.compare_digest(request.path[0].encode(), token.encode()) else 404
 
 
-def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
-    """The answer as it is sent. If the browser has the same already, or asked for the head only, it gets no body."""
+def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[bytes]:
+    """The answer as it is sent, part by part. The first has the head, and a body is read as far as it is sent.
+
+    If the browser has the same already, or asked for the head only, it gets no body.
+    """
     headers, whole, status = dict(HEADERS), _stored(answer.body), answer.status
     part = range(whole.size)
     if request is not None and status == 200:
@@ -124,7 +128,10 @@ def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
         headers |= {"Content-Type": answer.content_type, "Content-Length": str(len(part))}
     has_body = status != 304 and not (request is not None and request.method == "HEAD")
     lines = [f"HTTP/1.1 {status} {REASONS[status]}", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
-    return "\r\n".join(lines).encode() + (whole.read(part.start, part.stop) if has_body else b"")
+    first, end = "\r\n".join(lines).encode(), part.stop if has_body else part.start
+    yield first + whole.read(part.start, min(part.start + PART_BYTES, end))
+    for begin in range(part.start + PART_BYTES, end, PART_BYTES):
+        yield whole.read(begin, min(begin + PART_BYTES, end))
 
 
 def _stored(body: bytes | StoredBody) -> StoredBody:

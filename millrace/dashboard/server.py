@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
-from millrace.dashboard.http import PageAnswer, PageRequest, answer_bytes, parsed, refusal, why_refused
+from millrace.dashboard.http import PageAnswer, PageRequest, answer_parts, parsed, refusal, why_refused
 from protocol.address import WILDCARDS
 from protocol.errors import UsageError
 
@@ -23,7 +23,6 @@ MOST_CONNECTIONS = 128
 MOST_HEAD_BYTES = 16_384
 HEAD_WITHIN_S = 10.0
 PART_WITHIN_S = 10.0
-PART_BYTES = 1 << 18
 
 MakePage = Callable[[PageRequest], PageAnswer]
 
@@ -76,17 +75,18 @@ class DashboardServer:
         head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_WITHIN_S)
         request = parsed(head.removesuffix(b"\r\n\r\n"))
         if status := why_refused(request, self.token, self._hosts):
-            content = answer_bytes(request, refusal(status))
-        else:
-            assert request is not None
-            content = await asyncio.get_running_loop().run_in_executor(self._pages, self._made, request)
-        for begin in range(0, len(content), PART_BYTES):
-            writer.write(content[begin : begin + PART_BYTES])
+            writer.writelines(answer_parts(request, refusal(status)))
+            return
+        assert request is not None
+        loop, parts = asyncio.get_running_loop(), self._made(request)
+        while part := await loop.run_in_executor(self._pages, next, parts, b""):
+            writer.write(part)
             await asyncio.wait_for(writer.drain(), PART_WITHIN_S)
 
-    def _made(self, request: PageRequest) -> bytes:
+    def _made(self, request: PageRequest) -> Iterator[bytes]:
         try:
-            return answer_bytes(request, self._make(request))
+            answer = self._make(request)
         except Exception:
             log.exception("a page could not be made")
-            return answer_bytes(request, refusal(500))
+            answer = refusal(500)
+        yield from answer_parts(request, answer)

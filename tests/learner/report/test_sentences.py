@@ -12,6 +12,7 @@ IN_TURN = "Updates are the slowest part: the learner updates for 80% of the time
     [
         ({}, {}, ""),
         ({"wait": 3.0}, {}, ""),  # no heartbeat has come
+        ({"wait": -1.0, "evaluate": 1.0}, {}, ""),  # a learner of somebody else says anything
         ({"wait": 2.0, "update": 8.0}, {"act": 1.0, "step": 1.0, "wait": 8.0}, IN_TURN),
         (
             {"wait": 8.0, "update": 2.0}, {"act": 4.0, "step": 4.0, "wait": 2.0},

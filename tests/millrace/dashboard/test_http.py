@@ -2,7 +2,16 @@
 
 import pytest
 
-from millrace.dashboard.http import PageAnswer, StoredBody, answer_bytes, parsed, refusal, why_refused
+from millrace.dashboard.http import (
+    PART_BYTES,
+    PageAnswer,
+    PageRequest,
+    StoredBody,
+    answer_parts,
+    parsed,
+    refusal,
+    why_refused,
+)
 
 TOKEN = "the-token"
 HOSTS = ("127.0.0.1:8080",)
@@ -51,6 +60,10 @@ def test_what_a_path_and_a_query_say() -> None:
     assert request is not None
     assert request.path == (TOKEN, "run", "a/b")
     assert request.query == {"metric": ["x y"], "run": ["1", "2"]}
+
+
+def answer_bytes(request: PageRequest | None, answer: PageAnswer) -> bytes:
+    return b"".join(answer_parts(request, answer))
 
 
 def test_every_answer_forbids_what_its_page_does_not_need() -> None:
@@ -120,9 +133,14 @@ def test_of_a_film_no_more_is_read_than_is_wanted() -> None:
         return b"0123456789"[begin:end]
 
     film = PageAnswer(StoredBody("tag", 10, part), "video/mp4")
-    asked = {"Range: bytes=2-4": [(2, 5)], 'If-None-Match: "tag"': [], "Accept: video/mp4": [(0, 10)]}
+    asked = {"Range: bytes=2-4": [(2, 5)], 'If-None-Match: "tag"': [(0, 0)], "Accept: video/mp4": [(0, 10)]}
     for line, wanted in asked.items():
         read.clear()
         answer = answer_bytes(parsed(head("GET", f"/{TOKEN}/", HOSTS[0], line)), film)
         assert read == wanted
         assert answer.partition(b"\r\n\r\n")[2] == b"".join(b"0123456789"[begin:end] for begin, end in wanted)
+    parts = answer_parts(parsed(head()), PageAnswer(StoredBody("tag", 3 * PART_BYTES, part)))
+    read.clear()
+    next(parts)
+    assert read == [(0, PART_BYTES)], "the next is read when this one is sent"
+    assert [*parts, *read[1:]] == [b"", b"", (PART_BYTES, 2 * PART_BYTES), (2 * PART_BYTES, 3 * PART_BYTES)]

@@ -14,7 +14,7 @@ from learner.run_folder.json_log import kept_log
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
-from millrace.dashboard.http import PageAnswer, answer_bytes, parsed
+from millrace.dashboard.http import PageAnswer, answer_parts, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import LaneSample, Seen, sample
 from millrace.dashboard.run_page import Choice, smoothed
@@ -264,7 +264,7 @@ def test_only_films_and_pictures_of_a_run_are_served(tmp_path: Path) -> None:
     os.mkfifo(run / "videos" / "fifo.mp4")
     pages, of_run = Pages(tmp_path), f"file/{key_of(run)}"
     film = pages.answer(f"{of_run}/videos/a.mp4")
-    assert answer_bytes(None, film).endswith(b"\r\n\r\nfilm")
+    assert b"".join(answer_parts(None, film)).endswith(b"\r\n\r\nfilm")
     assert film.content_type == "video/mp4"
     assert f"/token/{of_run}/videos/a.mp4" in pages.text(f"run/{key_of(run)}")
     for path in (
