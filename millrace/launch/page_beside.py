@@ -8,8 +8,7 @@ import select
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from html import escape
 from pathlib import Path
 from types import TracebackType
@@ -84,26 +83,21 @@ def opened_folder(config: Config, resume: Resumption | None, stack: ExitStack) -
     """
     folder = stack.enter_context(run_folder(config, resume))
     if config.dashboard:
-        stack.enter_context(page_beside(folder.path))
+        _show_page(folder.path, stack)
     return folder
 
 
-@contextmanager
-def page_beside(run: Path) -> Iterator[None]:
-    """Serve the page of a run while it trains, and say where. A run goes on without it if it does not start."""
+def _show_page(run: Path, stack: ExitStack) -> None:
+    """Serve the page of a run until the stack ends, and say where. A run goes on without it if it does not start."""
     try:
         page = Dashboard(run)
     except (RunError, OSError) as error:
         log.warning("%s", error)
-        yield
         return
-    try:
-        if in_notebook():
-            from IPython.display import display
+    stack.callback(page.let_end)
+    if in_notebook():
+        from IPython.display import display
 
-            display(page)
-        else:
-            log_notice(log, f"page of this run: {page.address}", kept=False)
-        yield
-    finally:
-        page.let_end()
+        display(page)
+    else:
+        log_notice(log, f"page of this run: {page.address}", kept=False)
