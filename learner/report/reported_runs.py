@@ -39,7 +39,7 @@ MAY_DIFFER_IN_A_GROUP = frozenset({
     # what is done about failures
     "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
     # what is written, and where
-    "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind",
+    "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind", "dashboard",
 })  # fmt: skip
 """Settings on which it does not depend what is learned from an env step"""
 MOST_IMAGES = 16  # of one observation

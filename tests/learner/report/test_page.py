@@ -275,7 +275,7 @@ def test_workers_that_came_from_elsewhere_are_not_a_number(tmp_path: Path) -> No
 
 def test_a_group_may_differ_in_what_changes_nothing_of_what_is_learned(tmp_path: Path) -> None:
     alike = [
-        a_run(tmp_path, "Pendulum-v1", seed=1, steps=500, workers=2),
+        a_run(tmp_path, "Pendulum-v1", seed=1, steps=500, workers=2, dashboard=True),
         a_run(tmp_path, "Pendulum-v1", seed=2, steps=1_000, eval_every=500, workers=3, torch_threads=2),
     ]
     differ = sections.settings(report_data(*alike))
