@@ -174,8 +174,6 @@ class SendRecv:
             while not sent.all_ready:
                 hub.wait(timeout_s, together=True)
                 self.look(timeout_s)
-            hub.listen_if_due()
-            hub.coordinator.raise_failures()
             self._raise_losses()
         except BaseException:
             self.abandon()
@@ -253,12 +251,8 @@ class SendRecv:
 
     def _take_results(self) -> None:
         """Note which lanes are done."""
-        self._sent.ready(
-            {
-                lane: self._stored(lane, result) if isinstance(result, Stepped) else result
-                for lane, result in self._parts.hub.take().items()
-            }
-        )
+        came = self._parts.hub.take()
+        self._sent.ready({lane: self._stored(lane, one) if isinstance(one, Stepped) else one for lane, one in came.items()})
 
     def _stored(self, lane: int, answer: Stepped) -> bytes:
         """Write results that came as a message to the batch. Packed infos."""

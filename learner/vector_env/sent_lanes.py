@@ -111,7 +111,7 @@ class SentLanes:
     @property
     def copies(self) -> list[int]:
         """The copies that have not come back, in ascending order."""
-        return self._copies(sorted(self.sent))
+        return self._copies(sorted(self.sent)) if self.sent else []
 
     @property
     def ready_copies(self) -> list[int]:
@@ -120,7 +120,7 @@ class SentLanes:
 
     def among(self, lanes: Iterable[int]) -> list[int]:
         """Those of these lanes that have not come back."""
-        return [lane for lane in lanes if lane in self.sent]
+        return [lane for lane in lanes if lane in self.sent] if self.sent else []
 
     def send(self, lanes: Iterable[int], sent: Sent) -> None:
         """These lanes were sent an order. Raises `ValueError` if an earlier one of theirs has not come back."""
@@ -166,11 +166,10 @@ class SentLanes:
 
     def take(self) -> Ready:
         """The lanes that are ready. They have come back now."""
-        ready = Ready({lane: self._results[lane] for lane in sorted(self._results)}, self._losses)
+        results, losses, all_ready = dict(sorted(self._results.items())), self._losses, self.all_ready
         self._results, self._losses = {}, {}
-        for lane in ready.results:
-            del self.sent[lane]
-        return ready
+        self.sent = {} if all_ready else {lane: sent for lane, sent in self.sent.items() if lane not in results}
+        return Ready(results, losses)
 
     def _copies(self, lanes: Iterable[int]) -> list[int]:
         found: list[int] = []

@@ -64,6 +64,8 @@ class SharedSteps:
 
     def spin(self, *, together: bool) -> bool:
         """Wait awake, for a short time, until all lanes that are under way are done, or else one of them. False: in vain."""
+        if not self._spin_s:
+            return False
         waiting = list(self.under_way)
 
         def all_done() -> bool:

@@ -192,15 +192,14 @@ class StepHub:
         """
         self._patience_s = min(PATIENCE_S, timeout_s / 2)
         self._send_waiting_orders()
-        shared = self.shared
+        shared, due = self.shared, self.now() > self._listen_due_s
         if shared is None or not self._under_way or self._infos_to_come:
             self._turn(POLL_S)
             return
         only_shared = not self._waiting_orders and not self.coordinator.orders
-        if only_shared and shared.spin(together=together):
-            return
-        arrived = shared.sleep(self._link, POLL_S, together=together and only_shared)
-        if arrived or not only_shared or self.now() > self._listen_due_s:
+        seen = only_shared and shared.spin(together=together)
+        arrived = not seen and shared.sleep(self._link, POLL_S, together=together and only_shared)
+        if arrived or due or not only_shared:
             self._turn(0.0)
 
     def give_up(self, lane: int, timeout_s: float) -> None:
