@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from functools import cache
 from typing import NamedTuple
 
@@ -60,7 +61,8 @@ def blocks(text: str) -> list[Block]:
             assert mark is not None, line
             opened = number, line.strip().lstrip("`~").strip()
         elif FENCE.match(line) and line.strip().strip("`~") == "":
-            found.append(Block(opened[0] + 1, opened[1], "\n".join(lines[opened[0] : number - 1])))
+            text_of_it = textwrap.dedent("\n".join(lines[opened[0] : number - 1]))  # of a tab or a list, they are indented
+            found.append(Block(opened[0] + 1, opened[1], text_of_it))
             opened = None
     return found
 

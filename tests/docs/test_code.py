@@ -103,6 +103,7 @@ def test_blocks_share_names_and_files(tmp_path: Path) -> None:
     text = (
         "```python\n# own.py\nx = 1\n```\n```python\nimport own\nassert own.x == x\n```\n"
         "```python\n# fragment\nno_such_name\n```\n```text\nnothing\n```\n"
+        '=== "In a tab"\n\n    ```python\n    if x:\n        x = 2\n    ```\n'
     )
     assert run_page("docs/page.md", text, tmp_path) == ""
 
