@@ -20,6 +20,7 @@ import time
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 from rich.console import Console
@@ -29,12 +30,17 @@ import millrace
 from benchmarks import programs
 from benchmarks.programs import CONTENDERS, Contender, contenders
 from benchmarks.slow_env import STEPS_PER_S, TIMELINE, Lognormal
-from benchmarks.writing import COLORS, DPI, GREY, write
+from benchmarks.writing import write
 
 COPIES = 16
 IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time
 NEVER_WAIT, NEVER_WAIT_S = "copies that never wait", 12.0
 WARM_UP = 3  # updates
+WIDTH, ROW = 640, 9  # of the picture, and the height of a copy: letters are large enough on a phone
+STYLE = (
+    "text{fill:#2b3a42}.name{font-weight:600}.rows{fill:#8f9ba3;opacity:.16}.step{fill:#0072b2}.reset{fill:#e69f00}"
+    "@media(prefers-color-scheme:dark){text{fill:#dde5ea}.step{fill:#4aa8e0}.reset{fill:#f0b440}}"
+)
 LOOPS_WARM_UP_S = 2.0
 BY_STEP, BY_RECV = "make_vec, step", "make_vec, send and recv"
 SETTINGS: dict[str, Any] = {
@@ -130,51 +136,54 @@ def timelines(name: str, contender: Contender, seed: int) -> list[np.ndarray[Any
     return sorted(found, key=len)[-COPIES:]  # an evaluation has copies of its own, with fewer calls
 
 
-def draw(found: dict[str, list[np.ndarray[Any, Any]]], out: Path, seconds: float = 1.5) -> None:
-    """A row for each env copy: steps and resets; white is waiting."""
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
+def draw(found: dict[str, list[np.ndarray[Any, Any]]], seconds: float = 1.2) -> str:
+    """An SVG for light and dark pages, with a row for each env copy: steps, resets, and nothing where it waits."""
+    panels = [_panel(title, copies, seconds) for title, copies in found.items()]
+    height = 34 + ROW * COPIES + 16
+    about = f"{', '.join(found)}: what {COPIES} env copies do in {seconds:g} seconds"
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height * len(panels) + 24}" '
+        f'font-family="system-ui, sans-serif" font-size="18"><title>{escape(about)}</title><style>{STYLE}</style>'
+        + "".join(f'<g transform="translate(0 {height * n})">{panel}</g>' for n, panel in enumerate(panels))
+        + f'<text y="{height * len(panels) + 14}"><tspan class="step">\u25a0</tspan> a step'
+        ' <tspan class="reset" dx="12">\u25a0</tspan> a reset <tspan dx="12">empty: the copy waits</tspan>'
+        f'<tspan x="{WIDTH}" text-anchor="end">{seconds:g} seconds</tspan></text></svg>\n'
+    )
 
-    figure = Figure(figsize=(10.0, 1.9 * len(found)), layout=ConstrainedLayoutEngine())
-    panels = figure.subplots(len(found), 1, sharex=True, squeeze=False)[:, 0]
-    for panel, (title, copies) in zip(panels, found.items(), strict=True):
-        last_s = min(calls[-1, 1] for calls in copies)
-        began_s = last_s - seconds - 0.5
-        busy = 0.0
-        for row, calls in enumerate(copies):
-            shown = calls[(calls[:, 1] > began_s) & (calls[:, 0] < began_s + seconds)]
-            spans = np.clip(shown[:, :2], began_s, began_s + seconds) - began_s
-            busy += float((spans[:, 1] - spans[:, 0]).sum())
-            for is_reset, color in ((0, COLORS[0]), (1, "#e0a030")):
-                chosen = spans[shown[:, 2] == is_reset]
-                panel.broken_barh(
-                    [(start, end - start) for start, end in chosen], (row + 0.1, 0.8), color=color, linewidth=0
-                )
-        share = busy / (seconds * len(copies))
-        panel.set_title(f"{title}: {share:.0%} of the time in the environment", fontsize=9, fontweight="bold", loc="left")
-        panel.set_xlim(0, seconds)
-        panel.set_ylim(0, len(copies))
-        panel.set_yticks([])
-        panel.set_ylabel(f"{len(copies)} copies", fontsize=8, color=GREY)
-        panel.tick_params(labelsize=8, colors=GREY, length=2)
-        for side in ("top", "right", "left"):
-            panel.spines[side].set_visible(False)
-    panels[-1].set_xlabel("seconds; blue: a step, orange: a reset, white: the copy waits", fontsize=8, color=GREY)
-    figure.savefig(out, dpi=DPI)
+
+def _panel(title: str, copies: list[np.ndarray[Any, Any]], seconds: float) -> str:
+    began_s = min(calls[-1, 1] for calls in copies) - seconds - 0.5
+    paths, busy_s = {False: "", True: ""}, 0.0  # by whether it is a reset
+    for row, calls in enumerate(copies):
+        for start_s, end_s, is_reset in calls[(calls[:, 1] > began_s) & (calls[:, 0] < began_s + seconds)]:
+            start, end = np.clip(np.array([start_s, end_s]) - began_s, 0.0, seconds)
+            busy_s += end - start
+            width = max((end - start) * WIDTH / seconds - 0.3, 0.3)  # the gap shows where one step ends
+            paths[bool(is_reset)] += f"M{start * WIDTH / seconds:.1f} {ROW * row + 34}h{width:.1f}v{ROW - 2}h{-width:.1f}z"
+    return (
+        f'<text y="20"><tspan class="name">{escape(title)}</tspan>: {busy_s / seconds / len(copies):.0%} of the time in '
+        f'the environment</text><rect class="rows" y="32" width="{WIDTH}" height="{ROW * len(copies) + 2}"/>'
+        f'<path class="step" d="{paths[False]}"/><path class="reset" d="{paths[True]}"/>'
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="compare training on a slow environment with Stable-Baselines3")
     parser.add_argument("--rounds", type=int, default=3, help="number of turns, each with another seed")
     parser.add_argument("--peers", action="store_true", help="compare with all installed systems that run 16 processes")
-    parser.add_argument("--picture", type=Path, help="draw who waits for whom into this PNG, and measure nothing else")
+    parser.add_argument("--picture", type=Path, help="draw who waits for whom into this SVG, and measure nothing else")
     parser.add_argument("--only-loops", action="store_true", help="measure the two loops and the ideal only")
     arguments = parser.parse_args()
     here = contenders(arguments.peers)
     others = {name: CONTENDERS[name] for name in (SUBPROC, *(PEERS if arguments.peers else ())) if name in here}
     if arguments.picture is not None:
-        chosen = {name: each for name, each in (others | OURS).items() if name in (SUBPROC, *list(OURS)[:2])}
-        draw({name: timelines(name, each, 1) for name, each in chosen.items()}, arguments.picture)
+        titles = {
+            "Stable-Baselines3": SUBPROC,
+            "millrace": "millrace, --max-lag 0",
+            "millrace --max-lag 1": "millrace, --max-lag 1",
+        }
+        chosen = {title: timelines(name, (others | OURS)[name], 1) for title, name in titles.items()}
+        arguments.picture.write_text(draw(chosen), encoding="utf-8")
         print(arguments.picture)
         return
     trained = {} if arguments.only_loops else others | OURS
