@@ -26,7 +26,10 @@ class Block(NamedTuple):
 @cache
 def written() -> dict[str, str]:
     """The text of each page that someone wrote, by its path in the repository."""
-    paths = [*ROOT.glob("docs/**/*.md"), *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md"))]
+    paths = [
+        *ROOT.glob("docs/**/*.md"),
+        *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")),
+    ]
     paths += [ROOT / "protocol" / "README.md"]
     return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in sorted(paths)}
 

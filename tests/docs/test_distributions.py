@@ -1,4 +1,4 @@
-"""What `make dist` finds wrong with the files of a distribution, and that the changelog has the version."""
+"""What `make dist` finds wrong with the files of a distribution, and that changelog and citation have the version."""
 
 from __future__ import annotations
 
@@ -27,9 +27,17 @@ def test_tests_in_a_distribution_are_named() -> None:
     assert line.startswith("tests/conftest.py: expected no tests")
 
 
+def version() -> str:
+    found: str = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    return found
+
+
+def test_the_citation_has_this_version() -> None:
+    assert f"\nversion: {version()}\n" in (ROOT / "CITATION.cff").read_text()
+
+
 def test_the_changelog_has_this_version_below_what_is_unreleased() -> None:
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     headings = re.findall(r"^## \[(.+?)\](.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert headings[0] == ("Unreleased", "")
-    assert headings[1][0] == version
+    assert headings[1][0] == version()
     assert re.fullmatch(r" - \d{4}-\d{2}-\d{2}", headings[1][1])
