@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import textwrap
 from functools import cache
 from typing import NamedTuple
 
@@ -64,8 +63,9 @@ def blocks(text: str) -> list[Block]:
             assert mark is not None, line
             opened = number, line.strip().lstrip("`~").strip()
         elif FENCE.match(line) and line.strip().strip("`~") == "":
-            text_of_it = textwrap.dedent("\n".join(lines[opened[0] : number - 1]))  # of a tab or a list, they are indented
-            found.append(Block(opened[0] + 1, opened[1], text_of_it))
+            indent = " " * (len(line) - len(line.lstrip()))  # of a tab or a list
+            inside = [text.removeprefix(indent) for text in lines[opened[0] : number - 1]]
+            found.append(Block(opened[0] + 1, opened[1], "\n".join(inside)))
             opened = None
     return found
 
