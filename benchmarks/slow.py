@@ -36,7 +36,7 @@ COPIES = 16
 IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time
 NEVER_WAIT, NEVER_WAIT_S = "copies that never wait", 12.0
 WARM_UP = 3  # updates
-WIDTH, ROW = 640, 9  # of the picture, and the height of a copy: letters are large enough on a phone
+WIDTH, ROW = 640, 7  # of the picture, and the height of a copy: letters are large enough on a phone
 STYLE = (
     "text{fill:#2b3a42}.name{font-weight:600}.rows{fill:#8f9ba3;opacity:.16}.step{fill:#0072b2}.reset{fill:#e69f00}"
     "@media(prefers-color-scheme:dark){text{fill:#dde5ea}.step{fill:#4aa8e0}.reset{fill:#f0b440}}"

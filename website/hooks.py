@@ -8,6 +8,10 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from website.pages import FROM_ELSEWHERE, MADE, ROOT, DeadLink, for_site, written_pages
+from website.tables import as_cards
+
+LOOKED_UP = ("reference/", "project/")
+"""Pages that a search shows after the others: their many names would hide the page that answers the question."""
 
 
 def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
@@ -22,7 +26,14 @@ def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Rewrite the links of a page. Raises PluginError for a link to a file that does not exist."""
     path = page.file.src_uri
+    if path.startswith(LOOKED_UP):
+        page.meta["search"] = {"boost": 0.2}
     try:
         return for_site(path, written_pages().get(path, f"docs/{path}"), markdown)
     except DeadLink as error:
         raise PluginError(str(error)) from None
+
+
+def on_page_content(html: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Name the column of each cell, for narrow screens."""
+    return as_cards(html)
