@@ -15,7 +15,7 @@ from website import python_page
 from website.links import anchors, elsewhere, links, resolved, slug
 from website.pages import FROM_ELSEWHERE, MADE, ROOT, DeadLink, as_code, for_site
 
-NAV_PAGE = re.compile(r"^ +- [^:\n]+: (\S+\.md)$", re.MULTILINE)
+NAV_PAGE = re.compile(r"^ *- (?:.*: )?([\w/-]+\.md)$", re.MULTILINE)
 
 
 def dead_links(path: str, text: str, every: Mapping[str, str]) -> Iterator[str]:
