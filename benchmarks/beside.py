@@ -48,7 +48,7 @@ def rate(algo: str, contender: str, steps: int, seed: int) -> float:
 
     with tempfile.TemporaryDirectory() as folder:
         settings = {**SETTINGS, **ALGORITHMS[algo], **CONTENDERS[contender], "algo": algo, "steps": steps, "seed": seed}
-        millrace.train(**settings, run_dir=folder, watch=watch)
+        millrace.train(**settings, run_dir=folder, callbacks=[watch])
     (first, began_s), (last, ended_s) = moments[0], moments[-1]
     return (last - first) / (ended_s - began_s)
 

@@ -46,13 +46,13 @@ class Case(NamedTuple):
     """package without which it is left out"""
 
 
-MINIGRID = "--wrapper minigrid.wrappers:ImgObsWrapper --wrapper gymnasium.wrappers:FlattenObservation"
+MINIGRID = "--wrappers minigrid.wrappers:ImgObsWrapper gymnasium.wrappers:FlattenObservation"
 CASES = (
     Case("CartPole-v1"),
     Case("Acrobot-v1"),
     Case("MountainCar-v0"),
     Case("FrozenLake-v1"),
-    Case("CliffWalking-v1", "--wrapper gymnasium.wrappers:TimeLimit(max_episode_steps=200)"),
+    Case("CliffWalking-v1", "--wrappers gymnasium.wrappers:TimeLimit(max_episode_steps=200)"),
     Case("Taxi-v4"),
     Case("LunarLander-v3", needs="Box2D"),
     Case("minigrid:MiniGrid-Empty-8x8-v0", MINIGRID, needs="minigrid"),

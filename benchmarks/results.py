@@ -30,7 +30,6 @@ PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 TABLES_OF_PAGE = re.compile(r"^\| environment \| algorithm \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
 OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
 NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
-REPEATED = ("wrapper", "callback")  # flags with one value each
 EVALUATION = ("eval_every", "eval_episodes")
 
 
@@ -90,8 +89,6 @@ def _words(name: str, value: object, default: object) -> list[str]:
     match value:
         case dict():
             return [*flag(name, True), *added(value, default if isinstance(default, dict) else {})]
-        case list() | tuple() if name in REPEATED:
-            return [word for one in value for word in flag(name, one)]
         case _:
             return flag(name, value)
 

@@ -122,7 +122,7 @@ def trainer(max_lag: int, envs: int, seconds: float) -> float:
     with tempfile.TemporaryDirectory() as folder:
         millrace.train(
             "CartPole-v1", algo=Unchanged, preset="none", workers=PROCESSES, envs=envs, lanes=LANES, max_lag=max_lag, seed=1,
-            rollout_steps=STEPS, steps=1_000_000_000, eval_episodes=1, run_dir=folder, watch=watch, progress=False,
+            rollout_steps=STEPS, steps=1_000_000_000, eval_episodes=1, run_dir=folder, callbacks=[watch], progress=False,
         )  # fmt: skip
     assert clock is not None
     return clock.rate

@@ -58,7 +58,7 @@ OURS = {
     for lag in (0, 1, 2)
 }
 OURS |= {
-    f"{name}, ResetAhead": each._replace(flags=(*each.flags, "--wrapper", "millrace:ResetAhead"))
+    f"{name}, ResetAhead": each._replace(flags=(*each.flags, "--wrappers", "millrace:ResetAhead"))
     for name, each in list(OURS.items())[:2]
 }
 PEERS = ("TorchRL, 2 workers", "RLlib, 2 runners", "Sample Factory, 2 workers")

@@ -56,7 +56,7 @@ def rate(name: str, seed: int, *, page: bool) -> float:
 
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         settings = {"eval_every": 0, "eval_episodes": 1, "progress": False, **SETTINGS[name], "steps": last}
-        millrace.train(**settings, seed=seed, run_dir=folder, watch=watch)
+        millrace.train(**settings, seed=seed, run_dir=folder, callbacks=[watch])
     (first, began_s), (last, ended_s) = moments[0], moments[-1]
     return (last - first) / (ended_s - began_s)
 

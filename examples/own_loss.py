@@ -3,6 +3,8 @@
 Either `python -m examples.own_loss`, or `millrace train CartPole-v1 --algo examples.own_loss:ClippedPlus --penalty 0.2`.
 """
 
+from typing import Any
+
 import torch
 
 import millrace
@@ -49,4 +51,5 @@ class Conservative(SAC):
 
 
 if __name__ == "__main__":
-    print(millrace.train("CartPole-v1", algo=ClippedPlus, penalty=0.2, learning_rate=1e-3, steps=100_000))
+    own: dict[str, Any] = {"penalty": 0.2}  # so that type checkers, which know our settings only, have nothing to say
+    print(millrace.train("CartPole-v1", algo=ClippedPlus, learning_rate=1e-3, steps=100_000, **own))

@@ -91,11 +91,11 @@ def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple
 
 def _with_present_names(before: Config, now: Config) -> Config:
     """The settings of a run, with the names that its environment and wrappers have now, if they were moved to a module."""
-    wrappers_moved = len(before.wrapper) == len(now.wrapper) and all(map(moved, before.wrapper, now.wrapper))
+    wrappers_moved = len(before.wrappers) == len(now.wrappers) and all(map(moved, before.wrappers, now.wrappers))
     return msgspec.structs.replace(
         before,
         env=now.env if moved(before.env, now.env) else before.env,
-        wrapper=now.wrapper if wrappers_moved else before.wrapper,
+        wrappers=now.wrappers if wrappers_moved else before.wrappers,
     )
 
 

@@ -133,7 +133,7 @@ def open_run(
     listened. `processes` are the worker processes that this program started. Nothing of a resumed run is written before
     everything fits.
     """
-    callbacks = Callbacks.of(watch).with_named(setup.config.callback)
+    callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
     if line := unused_setting(setup.config):
         log.warning("%s", line)
     spec = run_spec(setup.config, setup.known.env, setup.known.spaces)

@@ -32,7 +32,7 @@ from protocol.errors import (  # noqa: E402
 )
 
 if TYPE_CHECKING:
-    from learner.algorithms.moments import Moments
+    from learner.algorithms.normalizer import Normalizer
     from learner.callbacks.callback import Callback
     from learner.recording.record import RecordedDataset
     from learner.run_folder.progress import Progress
@@ -61,8 +61,8 @@ __all__ = [
     "LoadedPolicy",
     "Metrics",
     "MillraceError",
-    "Moments",
     "NoWorkers",
+    "Normalizer",
     "OwnPolicy",
     "Piece",
     "PolicyFailed",
@@ -100,7 +100,7 @@ _IMPORTED_WHEN_USED = {
     "Evaluation": "learner.run_folder.results",
     "LoadedPolicy": "millrace.loaded_policy",
     "MLP": "millrace.policies",
-    "Moments": "learner.algorithms.moments",
+    "Normalizer": "learner.algorithms.normalizer",
     "OwnPolicy": "millrace.own_policy",
     "Metrics": "millrace.runs",
     "Piece": "millrace.policies",

@@ -3,6 +3,8 @@
 Rule: what comes in is plain. numpy's scalars and members of enums become Python's numbers and text; a whole number has at
 most 64 bits, and text can be written to a file; True and False are no numbers. What is otherwise is refused in one line, in
 the function's name. Only what is annotated as `object` is the user's own, and goes through as it is.
+
+Keywords that a function takes as `**name: Unpack[ATypedDict]` stand in its signature by name, for `help` and notebooks.
 """
 
 from __future__ import annotations
@@ -21,12 +23,15 @@ from protocol.errors import UsageError, usage_error
 WORDS: dict[Any, str] = {
     str: "text",
     type(None): "None",
+    type: "a class",
     Callable: "a function",
     os.PathLike: "a path",
     tuple: "a tuple",
     Sequence: "a list",
     Mapping: "a dict",
 }
+UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
+"""Shown as the default of a keyword whose default depends on others"""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
@@ -73,7 +78,19 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
                 raise
             raise UsageError(f"{who}: {ours}") from error
 
+    door.__signature__ = signature.replace(parameters=list(_by_name(function, signature)))  # type: ignore[attr-defined]
     return door
+
+
+def _by_name(function: Callable[..., Any], signature: inspect.Signature) -> Iterator[inspect.Parameter]:
+    """The parameters of a function, with the keys of a TypedDict in place of the dict."""
+    for parameter in signature.parameters.values():
+        if str(parameter.annotation).startswith("Unpack["):
+            keys = get_args(eval(parameter.annotation, function.__globals__))[0].__annotations__
+            for name, hint in keys.items():
+                yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=UNSET, annotation=hint.__forward_arg__)
+        else:
+            yield parameter
 
 
 def plain(value: Any) -> Any:

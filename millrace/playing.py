@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack
+from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
 from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy, saved_policy, useful_workers
@@ -19,6 +19,7 @@ from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation
 from millrace.arguments import checked
 from millrace.cli.flags import EvaluateFlags, RecordFlags
+from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.terminal import count_line
 from protocol.env_spec import EnvLike
@@ -27,7 +28,7 @@ from protocol.errors import UsageError, did_you_mean
 from protocol.flags.fields import fields_of
 from protocol.flags.values import read_value
 
-NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
+NOT_KEYWORDS = ("wrappers",)  # in Python they are `wrappers`
 ShowPlayed = Callable[[str], None]
 """Gets how far it is, as text."""
 _Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
@@ -38,33 +39,6 @@ class Given(NamedTuple):
 
     env: EnvLike | None = None
     wrappers: Sequence[WrapperLike] | None = None
-
-
-class PlayKeywords(TypedDict, total=False):
-    """Keywords that `evaluate` and `record` have in common."""
-
-    seed: int
-    best: bool
-    workers: int
-    transport: Literal["inproc", "ipc", "tcp"]
-    bind: str
-    inference: Literal["workers", "learner"]
-    max_env_failures: int
-
-
-class EvaluateKeywords(PlayKeywords, total=False):
-    """Keywords of `millrace.evaluate`. `EvaluateFlags` says what they mean."""
-
-    copies: int
-    max_steps: int
-    video: bool
-
-
-class RecordKeywords(PlayKeywords, total=False):
-    """Keywords of `millrace.record`. `RecordFlags` says what they mean."""
-
-    npy: str | os.PathLike[str] | None
-    stochastic: bool
 
 
 class ShownKeywords(TypedDict, total=False):
@@ -202,5 +176,5 @@ def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> Pla
 
 
 def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
-    env, wrappers = given or Given(flags.env or None, flags.wrapper or None)
+    env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
     return saved_policy(flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import gymnasium
 import numpy as np
@@ -35,6 +35,7 @@ from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.progress import Progress, steps_per_second
 from learner.run_folder.results import Evaluation
 from millrace.arguments import checked
+from millrace.keywords import RolloutKeywords
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from millrace.saved_state import ServiceState, digest, read, write
@@ -46,7 +47,7 @@ from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 
 if TYPE_CHECKING:
-    from learner.algorithms.moments import Moments
+    from learner.algorithms.normalizer import Normalizer
 
 PULSE_S = 0.005  # how often messages are answered while the user computes
 EVALUATION_COPIES = 4  # episodes that a worker plays side by side
@@ -113,7 +114,7 @@ class RolloutService:
         wrappers: Sequence[WrapperLike] = (),
         rollout_steps: int = 128,
         restore: str | os.PathLike[str] | None = None,
-        **settings: Any,
+        **settings: Unpack[RolloutKeywords],
     ) -> None:
         """Start the workers and wait until they have joined.
 
@@ -134,7 +135,7 @@ class RolloutService:
         environment cannot be made, and `PolicyFailed` if your `OwnPolicy` cannot.
         """
         listens = bool(settings.get("bind"))
-        config = _config(env, wrappers, settings)
+        config = _config(env, wrappers, dict(settings))
         policy = MLP() if policy is None else policy
         if isinstance(policy, type) or not hasattr(policy, "spec"):
             raise UsageError(f"policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got {policy!r}")
@@ -157,7 +158,7 @@ class RolloutService:
         self._owner = threading.get_ident()
         self._published = False
         self._window, self._steps_before, self._began_s = EpisodeWindow(), self.env_steps, time.monotonic()
-        self._moments: Moments | None = None
+        self._normalizer: Normalizer | None = None
         self._resources = ExitStack()
         spec = EnvSpec.of(env, config.env_kwargs, wrappers, config.eval_env_kwargs)
         try:
@@ -174,8 +175,8 @@ class RolloutService:
                 )
             if state is not None:
                 _check_restored(state, spec.id, self.run.policy, str(restore))
-                if state.moments is not None:
-                    self.moments.restore(state.moments)
+                if state.normalizer is not None:
+                    self.normalizer.restore(state.normalizer)
         except BaseException:
             self._resources.close()
             raise
@@ -204,7 +205,7 @@ class RolloutService:
         """Set the newest weights, under which rollouts are collected from the next `gather` on. Returns their version.
 
         `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
-        that normalizes observations; by default those of `moments`. They are copied.
+        that normalizes observations; by default those of `normalizer`. They are copied.
         Raises `UsageError` for wrong shapes, or numbers that are not finite.
 
         >>> import millrace
@@ -213,8 +214,8 @@ class RolloutService:
         0
         """
         self._check_open()
-        if buffers is None and self._moments is not None and self.run.policy.normalize_observations:
-            buffers = self._moments.buffers()
+        if buffers is None and self._normalizer is not None and self.run.policy.normalize_observations:
+            buffers = self._normalizer.buffers()
         flat, flat_buffers = self.policy.flat(parameters), self.policy.flat_buffers(buffers)
         with self._lock:
             self._hub.publish(self._version + 1, flat, flat_buffers, deal=False)
@@ -223,21 +224,21 @@ class RolloutService:
         return self._version
 
     @property
-    def moments(self) -> Moments:
+    def normalizer(self) -> Normalizer:
         """Running mean and standard deviation of observations and returns, as in the built-in trainer. Imports torch.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
         ...     _ = service.publish(service.policy.initial())
-        ...     service.moments.update(service.gather())
-        ...     service.moments.mean.shape
+        ...     service.normalizer.update(service.gather())
+        ...     service.normalizer.mean.shape
         (4,)
         """
-        if self._moments is None:
-            from learner.algorithms.moments import Moments
+        if self._normalizer is None:
+            from learner.algorithms.normalizer import Normalizer
 
-            self._moments = Moments(self.run.policy)
-        return self._moments
+            self._normalizer = Normalizer(self.run.policy)
+        return self._normalizer
 
     def gather(self) -> RolloutBatch:
         """Wait for the next batch. Raises `RunError` when no worker is left, or the environment failed too often.
@@ -295,7 +296,7 @@ class RolloutService:
         """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
 
         Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes
-        and moments continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
+        and normalizer continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
 
         Raises `UsageError` for arrays that are not of numbers, and `RunError` if the file cannot be written.
 
@@ -317,7 +318,7 @@ class RolloutService:
             env_steps=self.env_steps,
             ledger=snapshot.ledger,
             incarnations=snapshot.incarnations,
-            moments=None if self._moments is None else self._moments.state(),
+            normalizer=None if self._normalizer is None else self._normalizer.state(),
         )
         write(Path(path), state, arrays)
 
@@ -434,9 +435,10 @@ class RolloutService:
 def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, Any]) -> RolloutConfig:
     """The settings as a record, checked. Raises `UsageError`."""
     known = RolloutConfig.__struct_fields__
-    if unknown := [name for name in settings if name not in known or name in ("env", "wrapper")]:
+    if unknown := [name for name in settings if name not in known]:
         raise UsageError(f"rollout service: unknown setting {unknown[0]}{did_you_mean(unknown[0], known)}")
-    given = {**settings, "env": remembered_name(env), "wrapper": wrapper_names(wrappers)}
+    plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in settings.items()}
+    given = {**plain, "env": remembered_name(env), "wrappers": wrapper_names(wrappers)}
     if not given.get("bind"):
         given.pop("bind", None)
     return convert_rollout_settings(given)

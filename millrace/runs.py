@@ -6,7 +6,8 @@ Rule: what a run folder lacks is None or empty, and what cannot be read is said 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
@@ -19,12 +20,13 @@ from learner.config.layers import config_of_run, resolve
 from learner.recording.record import RecordedDataset
 from learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
 from learner.run_folder.newest_run import AUTO, newest_run
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, Progress
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder
 from millrace.arguments import checked
+from millrace.keywords import TrainKeywords
 from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
-from millrace.terminal import shown_progress
+from millrace.terminal import progress_view
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
@@ -34,6 +36,16 @@ if TYPE_CHECKING:
     from learner.report.picture import Picture
 
 NOT_FINISHED = "not finished"
+
+
+class ResumeKeywords(TrainKeywords, total=False):
+    """Keywords of `Run.resume`."""
+
+    env: EnvLike
+    wrappers: Sequence[WrapperLike] | None
+    callbacks: Sequence[object]
+    progress: bool
+
 
 _Played = TypeVar("_Played", RunEvaluateKeywords, RunRecordKeywords)
 
@@ -126,6 +138,7 @@ class Run(os.PathLike[str]):
         except OSError as error:
             raise UsageError(f"{self.path / METRICS_FILE} cannot be read: {error.strerror}") from error
 
+    @checked
     def evaluate(self, episodes: int | None = None, **keywords: Unpack[RunEvaluateKeywords]) -> Evaluation:
         """Play greedy episodes of the newest policy: `millrace.evaluate` of this run, with the same keywords.
 
@@ -136,6 +149,7 @@ class Run(os.PathLike[str]):
         """
         return evaluate(self, episodes, **self._with_given(keywords))
 
+    @checked
     def record(self, out: str, steps: int = 50_000, **keywords: Unpack[RunRecordKeywords]) -> RecordedDataset:
         """Write episodes of the newest policy as a Minari dataset: `millrace.record` of this run, with the same keywords.
 
@@ -145,7 +159,8 @@ class Run(os.PathLike[str]):
         """
         return record(self, out, steps, **self._with_given(keywords))
 
-    def resume(self, **keywords: Any) -> Run:
+    @checked
+    def resume(self, **keywords: Unpack[ResumeKeywords]) -> Run:
         """Continue the run from its newest checkpoint: `millrace.train(resume=run)`, with the same keywords.
 
         An environment or algorithm that was given to `train` as an object is given again. Returns the run, which has the
@@ -227,9 +242,8 @@ def train(
     resume: str | os.PathLike[str] | None = None,
     preset: str = "auto",
     callbacks: Sequence[object] = (),
-    watch: Callable[[Progress], object] | None = None,
     progress: bool = True,
-    **keywords: Any,
+    **settings: Unpack[TrainKeywords],
 ) -> Run:
     """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
 
@@ -243,12 +257,14 @@ def train(
         resume: A run, or its folder, to continue from its newest checkpoint; or "auto": the newest run of this environment,
             algorithm and seed if there is one, else a new run.
         preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
-        callbacks: Objects with some of the methods of `Callback`. They are called between updates, and may end the run.
-        watch: Called with a `Progress` after each update, and several times a second during an evaluation or a long wait.
+        callbacks: What the run calls between updates, and what may end it: objects with some of the methods of `Callback`;
+            names as "my_module:factory", which a resumed run finds again; and functions, which get a `Progress` after each
+            update, and several times a second during an evaluation or a long wait.
         progress: Show how far the run is: in one display in a notebook, in place on a terminal, else in a line every 5 s.
-        **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
-            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume. `start_from`
-            may be a `Run`: the new run begins with its policy (`--from`).
+        **settings: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
+            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume. Settings that
+            only your class has are known to no type checker: pass them as `**own`, a `dict[str, Any]`. `start_from` may be a
+            `Run`: the new run begins with its policy (`--from`).
 
     Returns the `Run`. Raises `UserFacingError` with a message of one line. In a script, guard the call with
     `if __name__ == "__main__":`.
@@ -260,25 +276,29 @@ def train(
     """
     from millrace.launch import training
 
-    name = remembered_name(env)
+    name, given = remembered_name(env), dict[str, Any](settings)
+    if named := [each for each in callbacks if isinstance(each, str)]:
+        given["callbacks"] = named
     if wrappers is not None:
-        keywords["wrapper"] = list(wrapper_names(wrappers))
+        given["wrappers"] = list(wrapper_names(wrappers))
     file, run = (None if path is None else Path(path) for path in (config, resume))
     if run == AUTO:
-        run = newest_run(resolve(name, file=file, preset=preset, **keywords))
+        run = newest_run(resolve(name, file=file, preset=preset, **given))
         file, preset = (None, "none") if run else (file, preset)
-    settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
-    objects = {name: made for name, made in keywords.items() if callable(made)}
+    resolved = resolve(name, file=file, resume=run, preset=preset, **given)
+    objects = {name: made for name, made in given.items() if callable(made)}
     objects |= {} if isinstance(env, str) else {"env": env}
     objects |= {} if wrappers is None else {"wrappers": wrappers}
-    given = None
+    spec = None
     if not isinstance(env, str) or wrappers is not None:
-        outer = settings.wrapper if wrappers is None else wrappers
-        given = EnvSpec.of(
-            settings.env if isinstance(env, str) else env, settings.env_kwargs, outer, settings.eval_env_kwargs
+        outer = resolved.wrappers if wrappers is None else wrappers
+        spec = EnvSpec.of(
+            resolved.env if isinstance(env, str) else env, resolved.env_kwargs, outer, resolved.eval_env_kwargs
         )
-    with shown_progress(watch, show=progress) as both:
-        folder = training.train(settings, run, Callbacks(callbacks, both), given)
+    with progress_view(may_fail=False) if progress else nullcontext() as view:
+        shown = [] if view is None else [view]
+        objects_alone = [each for each in callbacks if not isinstance(each, str)]
+        folder = training.train(resolved, run, Callbacks([*shown, *objects_alone]), spec)
     return Run._trained(folder, objects)
 
 

@@ -35,8 +35,8 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     ledger: Ledger
     incarnations: list[int]
     """the next incarnation of each lane"""
-    moments: dict[str, Any] | None = None
-    """the running moments as plain data; None if they were not used"""
+    normalizer: dict[str, Any] | None = None
+    """the state of the normalizer, as plain data; None if it was not used"""
     format: int = FORMAT
 
 

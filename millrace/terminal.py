@@ -79,26 +79,6 @@ def progress_view(
 
 
 @contextmanager
-def shown_progress(
-    watch: Callable[[Progress], object] | None, *, show: bool
-) -> Iterator[Callable[[Progress], object] | None]:
-    """Gives the function to call with each progress of a run that a user's program trains, if any. It calls `watch`, too.
-
-    `show`: show the progress. An output that is closed or full does not end the run.
-    """
-    if not show:
-        yield watch
-        return
-    with progress_view(may_fail=False) as view:
-
-        def both(progress: Progress) -> object:
-            view(progress)
-            return None if watch is None else watch(progress)
-
-        yield both
-
-
-@contextmanager
 def count_line(
     doing: str, clock: Callable[[], float] = time.monotonic, *, show: bool = True
 ) -> Iterator[Callable[[str], None]]:

@@ -19,7 +19,7 @@ GROUPS = {
     "Vector environment": ("make_vec",),
     "Env copies": ("EnvCopy", "env_copy"),
     "Wrappers": ("ResetAhead",),
-    "Rollouts for a learner of your own": ("RolloutService", "RolloutBatch", "Moments"),
+    "Rollouts for a learner of your own": ("RolloutService", "RolloutBatch", "Normalizer"),
     "Policies that act in workers": ("MLP", "CNN", "Recurrent", "OwnPolicy", "PolicyParameters", "Piece"),
     "Errors": (
         "MillraceError", "UserFacingError", "UsageError", "RunError", "CheckpointError", "NoWorkers", "WorkerLost",

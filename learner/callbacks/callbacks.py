@@ -1,7 +1,8 @@
 """All callbacks of a run as one: it calls them in order, and remembers whether one of them ended the run.
 
 Rule: what a callback raises passes through, with a note that names the callback. `on_end` is called for every callback that
-was started, also if an earlier one raised.
+was started, also if an earlier one raised. A function among the callbacks is called to show how far the run is: after each
+update and evaluation, several times a second during an evaluation or a long wait, and at the end.
 """
 
 from __future__ import annotations
@@ -20,26 +21,22 @@ log = logging.getLogger("millrace.learner")
 
 MOMENTS = ("on_start", "on_rollouts", "on_update", "on_evaluation", "on_checkpoint", "on_end")
 Show = Callable[[Progress], object]
-"""Called with the progress of the run after each update and evaluation, several times a second during an evaluation or a
-long wait, and at the end. It is a callback like any other: it may end the run.
-"""
 
 
 class Callbacks:
     """The callbacks of one run."""
 
-    def __init__(self, callbacks: Sequence[object] = (), watch: Show | None = None) -> None:
-        """`callbacks`: objects with some of the methods of `Callback`. Raises `UsageError` for an object without any."""
+    def __init__(self, callbacks: Sequence[object] = ()) -> None:
+        """`callbacks`: objects with some of the methods of `Callback`, and functions. Raises `UsageError` for any other."""
         self.stop_reason: str | None = None
         """Why a callback ended the run, or None."""
         self._callbacks = [_checked(callback) for callback in callbacks]
-        self._watch = watch
         self._started: list[object] = []  # those whose `on_start` was called, also if it raised
 
     @staticmethod
     def of(watch: Watch) -> Callbacks:
-        """The callbacks of a run that was given its callbacks, or a function to call."""
-        return watch if isinstance(watch, Callbacks) else Callbacks(watch=watch)
+        """The callbacks of a run that was given its callbacks, or one function."""
+        return watch if isinstance(watch, Callbacks) else Callbacks([watch])
 
     def with_named(self, names: Sequence[str]) -> Self:
         """Add the callbacks of these names, `module:factory`. Raises `UsageError` if one cannot be made."""
@@ -96,20 +93,15 @@ class Callbacks:
             raise raised
 
     def _show(self, progress: Progress) -> None:
-        if self._watch is not None and _ends_the_run(self._watch(progress)):
-            self._stop("watch")
+        self._call("__call__", progress)
 
     def _call(self, moment: str, progress: Progress) -> None:
         for callback in self._callbacks:
             self._call_one(callback, moment, progress)
 
     def _call_one(self, callback: object, moment: str, progress: Progress) -> None:
-        if _ends_the_run(_call(callback, moment, progress)):
-            self._stop(f"{_name(callback)}.{moment}")
-
-    def _stop(self, who: str) -> None:
-        if self.stop_reason is None:
-            self.stop_reason = one_line(f"ended by {who}", 300)
+        if _ends_the_run(_call(callback, moment, progress)) and self.stop_reason is None:
+            self.stop_reason = one_line(f"ended by {_name(callback, moment)}", 300)
 
 
 Watch = Callbacks | Show
@@ -126,18 +118,21 @@ def _call(callback: object, moment: str, progress: Progress) -> object:
     try:
         return method(progress)
     except BaseException as error:
-        error.add_note(one_line(f"raised in {_name(callback)}.{moment}", 300))
+        error.add_note(one_line(f"raised in {_name(callback, moment)}", 300))
         raise
 
 
 def _method(callback: object, moment: str) -> Callable[[Progress], object] | None:
-    """The method of this callback, unless it is that of `Callback`, which does nothing."""
+    """The method of this callback, unless it is that of `Callback`, which does nothing; of a function, `__call__`."""
+    if moment == "__call__":
+        return None if not callable(callback) or any(hasattr(callback, each) for each in MOMENTS) else callback
     found: Any = getattr(callback, moment, None)
     return None if getattr(found, "__func__", None) is getattr(Callback, moment) else found
 
 
-def _name(callback: object) -> str:
-    return type(callback).__qualname__.rpartition("<locals>.")[2]
+def _name(callback: object, moment: str) -> str:
+    name = getattr(callback, "__qualname__", type(callback).__qualname__).rpartition("<locals>.")[2]
+    return name if moment == "__call__" else f"{name}.{moment}"
 
 
 def _checked(callback: object, name: str = "") -> object:
@@ -149,8 +144,8 @@ def _checked(callback: object, name: str = "") -> object:
             hint = did_you_mean(attribute, MOMENTS)
             raise UsageError(f"{who}: a run never calls {attribute}{hint}; expected {', '.join(MOMENTS)}")
     methods = [getattr(callback, moment, None) for moment in MOMENTS]
-    if not any(map(callable, methods)):
-        raise UsageError(f"{who}: expected an object with some of the methods {', '.join(MOMENTS)}")
+    if not any(map(callable, methods)) and _method(callback, "__call__") is None:
+        raise UsageError(f"{who}: expected a function, or an object with some of the methods {', '.join(MOMENTS)}")
     if wrong := next((m for m, f in zip(MOMENTS, methods, strict=True) if f is not None and not callable(f)), None):
         raise UsageError(f"{who}: {wrong}: expected a method, got {type(getattr(callback, wrong)).__name__}")
     return callback

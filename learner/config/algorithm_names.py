@@ -42,7 +42,7 @@ NEEDED = (
 FOR_PRIOR = ("add_prior", "learn_from_prior")
 """The methods that an algorithm needs besides, in a run with prior data"""
 
-NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "watch", "callbacks", "wrappers", "progress"}
+NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings"""
 
 _given: dict[str, type] = {}

@@ -33,7 +33,7 @@ class RunFlags(Config, frozen=True, kw_only=True):
 
 
 BASIC = (
-    "env", "algo", "steps", "seed", "workers", "envs", "env_kwargs", "wrapper", "start_from", "from_parts", "device",
+    "env", "algo", "steps", "seed", "workers", "envs", "env_kwargs", "wrappers", "start_from", "from_parts", "device",
     "preset", "config", "resume", "run_dir", "eval_episodes", "eval_every", "target_return", "target_mean_return",
 )  # fmt: skip
 GROUPS = {
@@ -47,7 +47,7 @@ GROUPS = {
         "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
     ),
     "files and logs": (
-        "checkpoint_every_s", "keep_checkpoints", "record", "prior", "callback", "metrics_bind", "dashboard", "log_json",
+        "checkpoint_every_s", "keep_checkpoints", "record", "prior", "callbacks", "metrics_bind", "dashboard", "log_json",
     ),
 }  # fmt: skip
 """The settings of each group, by its title. Before them come `BASIC` and the settings of the algorithm."""

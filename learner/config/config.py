@@ -96,9 +96,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     it is undone, and the state before it is saved. 0: wait until the update has ended.
     """
 
-    callback: Annotated[Free[tuple[str, ...]], Flag("MODULE:FACTORY", repeated=True)] = ()
-    """A callback of your own, such as my_module:factory. The learner calls it between updates. Repeat the flag to add more
-    callbacks. docs/how-to/callbacks.md describes them.
+    callbacks: Annotated[Free[tuple[str, ...]], Flag("MODULE:FACTORY ...")] = ()
+    """Callbacks of your own, such as my_module:factory. The learner calls them between updates.
+    docs/how-to/callbacks.md describes them.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files

@@ -35,9 +35,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     eval_env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
-    wrapper: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:CLASS", repeated=True)] = ()
-    """Wrapper of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
-    literals: "my_module:Scale(by=0.5)". Repeat the flag to add more wrappers. The first one is the innermost.
+    wrappers: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:CLASS ...")] = ()
+    """Wrappers of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
+    literals: "my_module:Scale(by=0.5)". The first one is the innermost.
     """
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""

@@ -146,12 +146,12 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
         raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(repr(wrong[0]), MAX_NAME)}")
-    if config.wrapper and config.vector != "loop":
+    if config.wrappers and config.vector != "loop":
         raise UsageError(
             f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
         )
     try:
-        for wrapper in config.wrapper:
+        for wrapper in config.wrappers:
             wrapper_name(wrapper)
         check_address(config.bind)
     except UsageError as error:

@@ -30,7 +30,7 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     >>> seen = []
     >>> def watch(progress: millrace.Progress) -> None:
     ...     seen.append((progress.env_steps, progress.return_mean, progress.metrics.get("train/value_loss")))
-    >>> run = millrace.train("CartPole-v1", watch=watch, steps=500, workers=1, eval_episodes=2, progress=False)
+    >>> run = millrace.train("CartPole-v1", callbacks=[watch], steps=500, workers=1, eval_episodes=2, progress=False)
     >>> seen[-1][0] == run.summary.env_steps
     True
     """

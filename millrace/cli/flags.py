@@ -22,7 +22,7 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     env: str = ""
     """the environment, if the run does not find it by itself, such as my_module:make_env or my_module:MyEnv-v0"""
-    wrapper: Annotated[tuple[str, ...], Flag("MODULE:CLASS", repeated=True)] = ()
+    wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
     """the wrappers, innermost first, if the run does not find them by itself"""
     workers: Count = 2
     """number of worker processes that play the episodes; the result does not depend on it"""

@@ -18,21 +18,21 @@ def observation_advice(env: gymnasium.Env[Any, Any]) -> str:
     """How to wrap an environment whose observation space is not supported, as the end of a line."""
     space = env.observation_space
     package = type(env.unwrapped).__module__.partition(".")[0]
-    own = "--wrapper my_module:MyWrapper, a gymnasium.ObservationWrapper of yours that returns arrays"
+    own = "--wrappers my_module:MyWrapper, a gymnasium.ObservationWrapper of yours that returns arrays"
     match space:
         case spaces.Dict():
             kept: list[str | int] = [key for key, inner in space.spaces.items() if _is_supported(inner)]
         case spaces.Tuple():
             kept = [index for index, inner in enumerate(space.spaces) if _is_supported(inner)]
         case spaces.Text():
-            return "wrap it: --wrapper gymnasium.wrappers:FlattenObservation makes it an array"
+            return "wrap it: --wrappers gymnasium.wrappers:FlattenObservation makes it an array"
         case _:
             return f"wrap it: {own}"
     if package in IMAGES_ONLY and "image" in kept:
-        return f"wrap it: --wrapper {IMAGES_ONLY[package]} leaves the image"
+        return f"wrap it: --wrappers {IMAGES_ONLY[package]} leaves the image"
     if not kept:
         return f"wrap it: {own}"
-    return f'wrap it: --wrapper "gymnasium.wrappers:FilterObservation(filter_keys={kept!r})" leaves what is supported'
+    return f'wrap it: --wrappers "gymnasium.wrappers:FilterObservation(filter_keys={kept!r})" leaves what is supported'
 
 
 def _is_supported(space: gymnasium.Space[Any]) -> bool:

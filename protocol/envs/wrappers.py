@@ -98,7 +98,7 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
         last = "my_wrapper" if "lambda" in name else last_part(name)
         raise UsageError(
             f"wrapper {name} was made in a script, a notebook or a function, and cannot be found here; pass it again: "
-            f"wrappers=[{last}] there, or --wrapper my_module:{last} from a module"
+            f"wrappers=[{last}] there, or --wrappers my_module:{last} from a module"
         )
     return found
 
@@ -114,7 +114,7 @@ def wrap(env: gymnasium.Env[Any, Any], wrapper: WrapperLike) -> gymnasium.Env[An
         line = f"wrapper {name}: {first_line(error)}"
         if isinstance(wrapper, str) and "argument" in line:
             module, qualname, _, _ = read_wrapper(wrapper)
-            raise UsageError(f'{line}; give its arguments, as in --wrapper "{module}:{qualname}(name=value)"') from error
+            raise UsageError(f'{line}; give its arguments, as in --wrappers "{module}:{qualname}(name=value)"') from error
         raise UsageError(line, traceback.format_exc()) from error
     except Exception as error:
         raise UsageError(f"wrapper {name}: {type(error).__name__}: {first_line(error)}", traceback.format_exc()) from error

@@ -28,8 +28,6 @@ class Flag:
     """another name"""
     positional: bool = False
     """an argument without a flag"""
-    repeated: bool = False
-    """for a tuple: one value each time that the flag is given"""
     hidden: bool = False
     """a process of millrace gives it to another one; the help does not show it"""
 
@@ -54,7 +52,7 @@ class FlagField(NamedTuple):
     @property
     def many(self) -> bool:
         """Whether several words follow the flag."""
-        return get_origin(self.kind) in (tuple, list, dict) and not self.flag.repeated
+        return get_origin(self.kind) in (tuple, list, dict)
 
     @property
     def metavar(self) -> str:

@@ -92,8 +92,7 @@ def given_values(
         values = [value] if sign else _taken(words, len(words) if field.many else 1)
         if not values and not field.many:
             raise UsageError(f"{command}: expected {field.written} {field.metavar}, got no value{_more(command)}")
-        value = read_words(field, values)
-        given[field.name] = (*given.get(field.name, ()), *value) if field.flag.repeated else value
+        given[field.name] = read_words(field, values)
     return given | _arguments([field for field in fields.values() if field.flag.positional], arguments, command)
 
 

@@ -72,8 +72,8 @@ def test_each_command_parses(command: str, capfd: pytest.CaptureFixture[str]) ->
         ("CartPole-v1", {"eval_episodes": 20}, "--eval-episodes 20"),
         (
             "CartPole-v1",
-            {"wrapper": ["a:B", "c:D"]},
-            "--wrapper a:B --wrapper c:D",
+            {"wrappers": ["a:B", "c:D"]},
+            "--wrappers a:B c:D",
         ),
         (
             "millrace/Atari-v0",

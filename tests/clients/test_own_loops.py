@@ -177,7 +177,7 @@ def test_a_curriculum_needs_attributes(
     stage: Stage, clients: Clients, program: str, flags: tuple[str, ...], why: str
 ) -> None:
     cartpole, address = clients[program], loopback()
-    callback = ("--callback", "tests.clients.test_own_loops:Gravity", "--no-workers-timeout-s", "3")
+    callback = ("--callbacks", "tests.clients.test_own_loops:Gravity", "--no-workers-timeout-s", "3")
     runs = learner(stage, address, *flags, *callback, steps=100_000)
     cartpole.start(address)
     assert runs.ends(START_S + 60) == 1

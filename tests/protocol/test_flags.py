@@ -31,8 +31,6 @@ class Flags(Base, frozen=True, kw_only=True):
     """how much faster"""
     sizes: tuple[Annotated[int, Meta(ge=1)], ...] = (8,)
     """how large"""
-    each: Annotated[tuple[str, ...], Flag("WORD", repeated=True)] = ()
-    """one word each time"""
     table: dict[str, bool | int | float | str] = {}
     """names and values"""
     level: Literal[1, 2] | None = 1
@@ -58,7 +56,6 @@ class Flags(Base, frozen=True, kw_only=True):
         ("--name=x --sizes 3 4 --gentle me", None),
         ("--sizes 3 4 --gentle me", {"sizes": (3, 4), "gentle": True, "name": "me"}),
         ("--sizes", {"sizes": ()}),
-        ("--each=-x --each b c", {"each": ("-x", "b"), "name": "c"}),
         ("--table a True b 2 c 2.5 d on", {"table": {"a": True, "b": 2, "c": 2.5, "d": "on"}}),
         ("--level 2", {"level": 2}),
         ("--level none", {"level": None}),

@@ -162,5 +162,5 @@ def one_number(name: str, n: int, value: Any) -> Any:
         raise CopyFailed(n, line=f"{name}: expected a number, got {one_line(repr(value), 80)}")
     advice = "; wrap the environment so that it returns one number" if name == "reward" else ""
     if advice and "mo_gymnasium" in sys.modules:
-        advice += ", as --wrapper mo_gymnasium.wrappers:LinearReward does"
+        advice += ", as --wrappers mo_gymnasium.wrappers:LinearReward does"
     raise CopyFailed(n, line=f"{name}: expected a number, got an array of shape {array.shape}{advice}")

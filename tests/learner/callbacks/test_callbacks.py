@@ -49,7 +49,7 @@ def tell_all(callbacks: Callbacks) -> None:
 def test_a_callback_gets_what_it_wants_in_order() -> None:
     one = Told()
     shown: list[Progress] = []
-    callbacks = Callbacks([one], shown.append)
+    callbacks = Callbacks([one, shown.append])
     assert (callbacks.wants("on_update"), callbacks.wants("on_rollouts")) == (True, False)
     tell_all(callbacks)
     callbacks.meanwhile(NOW)
@@ -81,15 +81,18 @@ def test_false_ends_the_run_and_the_first_counts(answer: object) -> None:
 
 @pytest.mark.parametrize("answer", [None, True, 0, 0.0, "", [], np.array([])])
 def test_nothing_else_ends_it(answer: object) -> None:
-    callbacks = Callbacks([Told(answer)], lambda progress: answer)
+    callbacks = Callbacks([Told(answer), lambda progress: answer])
     tell_all(callbacks)
     assert callbacks.stop_reason is None
 
 
-def test_a_watch_that_returns_false_ends_the_run() -> None:
-    callbacks = Callbacks(watch=lambda progress: False)
+def test_a_function_that_returns_false_ends_the_run() -> None:
+    def enough(progress: Progress) -> bool:
+        return False
+
+    callbacks = Callbacks([enough])
     callbacks.on_update(NOW)
-    assert callbacks.stop_reason == "ended by watch"
+    assert callbacks.stop_reason == "ended by enough"
 
 
 def test_what_a_callback_raises_names_it() -> None:
@@ -144,14 +147,13 @@ def test_after_an_on_start_that_raises_those_behind_it_hear_of_no_end() -> None:
 @pytest.mark.parametrize(
     ("callback", "line"),
     [
-        (3, "expected an object with some of the methods on_start, on_rollouts"),
-        (lambda progress: None, "expected an object with some of the methods"),
+        (3, "expected a function, or an object with some of the methods on_start, on_rollouts"),
         (Told, "expected an object, got a class; make one: Told()"),
         (
             type("Typo", (), {"on_updte": lambda self, progress: None})(),
             "a run never calls on_updte; did you mean on_update?",
         ),
-        (type("Not", (), {"on_update": 3})(), "expected an object with some of the methods"),
+        (type("Not", (), {"on_update": 3})(), "or an object with some of the methods"),
         (type("Half", (Told,), {"on_checkpoint": 3})(), "on_checkpoint: expected a method, got int"),
     ],
 )
@@ -207,7 +209,7 @@ def test_a_callback_by_its_name_is_made_once(module: str) -> None:
         ("mine_of_callbacks:Stp", "module mine_of_callbacks has no Stp; did you mean mine_of_callbacks:Stop?"),
         ("mine_of_callbacks:number", "expected a function or class to call, got int"),
         ("mine_of_callbacks:broken", "broken() failed: ValueError: no such file"),
-        ("mine_of_callbacks:nothing", "expected an object with some of the methods"),
+        ("mine_of_callbacks:nothing", "or an object with some of the methods"),
     ],
 )
 def test_a_name_that_gives_no_callback_is_one_line(module: str, name: str, line: str) -> None:

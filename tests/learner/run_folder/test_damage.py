@@ -344,7 +344,7 @@ def check(
         ("tcp://127.0.0.1:5555", "tcp:+/127.0.0.1:5555"),
         ("batch_size", "bathc_size"),
         ('encoder = "none"', 'encoder = "noje"'),
-        ("wrapper = []", 'wrapper = ["gymnasium.wrappers"]'),
+        ("wrappers = []", 'wrappers = ["gymnasium.wrappers"]'),
     ],
 )
 def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(

@@ -70,7 +70,7 @@ def test_a_folder_without_a_format_is_no_run_folder(run: Path, read: Callable[[P
         ("", "run.package.evil"), ("link", "evil"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("named", ["env", "wrapper", "algo", "callback"])
+@pytest.mark.parametrize("named", ["env", "wrappers", "algo", "callbacks"])
 def test_a_module_in_a_run_folder_is_not_imported(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str, found_from: str, module: str
 ) -> None:
@@ -83,8 +83,8 @@ def test_a_module_in_a_run_folder_is_not_imported(
     monkeypatch.syspath_prepend(str(tmp_path / found_from))
     name = f"{module}:Evil"
     text = (run / "config.toml").read_text()
-    given = {"env": "CartPole-v1", "algo": "ppo", "wrapper": [], "callback": []} | {named: name}
-    for key, old in {"env": '"CartPole-v1"', "algo": '"ppo"', "wrapper": "[]", "callback": "[]"}.items():
+    given = {"env": "CartPole-v1", "algo": "ppo", "wrappers": [], "callbacks": []} | {named: name}
+    for key, old in {"env": '"CartPole-v1"', "algo": '"ppo"', "wrappers": "[]", "callbacks": "[]"}.items():
         new = json.dumps([given[key]] if old == "[]" and given[key] else given[key])
         assert text.count(f"\n{key} = {old}\n") == 1
         text = text.replace(f"\n{key} = {old}\n", f"\n{key} = {new}\n")
@@ -94,7 +94,7 @@ def test_a_module_in_a_run_folder_is_not_imported(
         lambda run: resolve(resume=run),
         lambda run: write_page([run], run / "report.html"),
     ]
-    if named in ("env", "wrapper"):
+    if named in ("env", "wrappers"):
         card = json.loads((run / "policy.json").read_text())
         (run / "policy.json").write_text(json.dumps(card | ({"env": name} if named == "env" else {"wrappers": [name]})))
         readers.append(load_policy)

@@ -318,7 +318,7 @@ def test_a_resumed_run_reads_its_own_file(asked: list[Any], capsys: Captured) ->
 
 def test_the_python_face_takes_the_same_names(asked: list[Any]) -> None:
     seen: list[Progress] = []
-    assert millrace.train("CartPole-v1", seed=3, learning_rate=1e-4, watch=seen.append).path == Path("runs/a-run")
+    assert millrace.train("CartPole-v1", seed=3, learning_rate=1e-4, callbacks=[seen.append]).path == Path("runs/a-run")
     assert asked == [(resolve("CartPole-v1", seed=3, learning_rate=1e-4), None, None)]
     assert [progress.env_steps for progress in seen] == [5]
 

@@ -28,7 +28,6 @@ from millrace.terminal import (
     in_notebook,
     progress_view,
     render_block,
-    shown_progress,
 )
 from protocol.logs.notices import log_notice
 
@@ -321,43 +320,13 @@ def test_a_count_in_a_notebook_is_updated_and_then_cleared(notebook: Any, capsys
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_program_s_run_shows_lines_and_calls_its_watch(capsys: pytest.CaptureFixture[str]) -> None:
-    seen: list[Progress] = []
-    with shown_progress(seen.append, show=True) as show:
-        assert show is not None
-        show(PROGRESS)
-    assert seen == [PROGRESS]
-    assert capsys.readouterr().out.startswith("62,208 of 100,000 env steps | ")
-    assert shown_progress(None, show=False).__enter__() is None
-    with shown_progress(seen.append, show=False) as show:
-        assert show is not None
-        show(PROGRESS)
-    assert seen == [PROGRESS] * 2
-    assert capsys.readouterr().out == ""
-
-
 def test_an_output_that_takes_nothing_does_not_end_a_program_s_run(monkeypatch: pytest.MonkeyPatch) -> None:
     closed = io.StringIO()
     closed.close()
     monkeypatch.setattr(sys, "stdout", closed)
-    seen: list[Progress] = []
-    with shown_progress(seen.append, show=True) as show:
-        assert show is not None
+    with progress_view(may_fail=False) as show:
         show(PROGRESS)
         show(replace(PROGRESS, note="greedy return 9.0"))
-    assert len(seen) == 2
-
-
-def test_what_a_watch_returns_or_raises_reaches_the_run() -> None:
-    def watch(progress: Progress) -> bool:
-        if not progress.updates:
-            raise ValueError("mine")
-        return False
-
-    with pytest.raises(ValueError, match="mine"), shown_progress(watch, show=True) as show:
-        assert show is not None
-        assert show(PROGRESS) is False
-        show(Progress())
 
 
 def test_a_curve_is_a_line_of_blocks_over_the_run_so_far() -> None:

@@ -360,7 +360,7 @@ def test_what_is_no_name_of_a_wrapper_is_one_line(text: str) -> None:
         ("gymnasium.wrappers:TimeLimt", r"has no TimeLimt; did you mean gymnasium.wrappers:TimeLimit\?$"),
         (
             "gymnasium.wrappers:TimeLimit",
-            r"missing 1 required .*'max_episode_steps'; give its arguments, as in --wrapper \"gymnasium.wrappers:",
+            r"missing 1 required .*'max_episode_steps'; give its arguments, as in --wrappers \"gymnasium.wrappers:",
         ),
         (lambda env: 3, r"^wrapper <lambda>: expected it to return a gymnasium.Env, got int$"),
         (lambda env: 1 / 0, r"^wrapper <lambda>: ZeroDivisionError: division by zero$"),

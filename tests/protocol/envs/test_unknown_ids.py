@@ -195,12 +195,12 @@ GRID = {"image": spaces.Box(0, 9, (7, 7, 3)), "direction": spaces.Discrete(4), "
             Observes(spaces.Dict(GRID)),
             """ "gymnasium.wrappers:FilterObservation(filter_keys=['direction', 'image'])" leaves what is supported""",
         ),
-        (Observes(spaces.Dict(GRID), "minigrid.envs.empty"), "--wrapper minigrid.wrappers:ImgObsWrapper leaves the image"),
+        (Observes(spaces.Dict(GRID), "minigrid.envs.empty"), "--wrappers minigrid.wrappers:ImgObsWrapper leaves the image"),
         (
             Observes(spaces.Tuple([spaces.Text(3), spaces.Discrete(2)])),
-            '--wrapper "gymnasium.wrappers:FilterObservation(filter_keys=[1])" leaves what is supported',
+            '--wrappers "gymnasium.wrappers:FilterObservation(filter_keys=[1])" leaves what is supported',
         ),
-        (Observes(spaces.Text(3)), "--wrapper gymnasium.wrappers:FlattenObservation makes it an array"),
+        (Observes(spaces.Text(3)), "--wrappers gymnasium.wrappers:FlattenObservation makes it an array"),
         (Observes(spaces.Graph(spaces.Discrete(2), None)), "a gymnasium.ObservationWrapper of yours that returns arrays"),
         (Observes(spaces.Dict({"said": spaces.Text(3)})), "a gymnasium.ObservationWrapper of yours that returns arrays"),
     ],
@@ -212,7 +212,7 @@ def test_the_line_about_observations_names_a_wrapper_that_helps(env: gymnasium.E
     line = str(why.value)
     assert line.endswith(advice)
     assert "\n" not in line
-    wrapper = line.partition("--wrapper ")[2].partition(" leaves")[0].partition(" makes")[0].strip('"')
+    wrapper = line.partition("--wrappers ")[2].partition(" leaves")[0].partition(" makes")[0].strip('"')
     if wrapper.startswith("gymnasium."):
         from protocol.envs.wrappers import wrap
 

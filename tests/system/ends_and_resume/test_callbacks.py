@@ -260,17 +260,17 @@ def test_a_callback_by_its_name_is_called_again_when_the_run_is_resumed(
     monkeypatch.syspath_prepend(str(tmp_path))
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items() if name != "net"]
     flags += [f"--run-dir={tmp_path / 'runs'}"]
-    named = ["--callback", "mine_on_disk:Stop"]
+    named = ["--callbacks", "mine_on_disk:Stop"]
     assert main(["train", ENV, *flags, *named]) == 0
     folder = folder_of(tmp_path / "runs")
     assert "ended by Stop.on_update" in capsys.readouterr().out
     assert summary(folder)["updates"] == 4
     assert main(["train", "--resume", str(folder), *named]) == 0
     assert summary(folder)["updates"] == 8, "the run keeps the name, and naming it again changes nothing"
-    assert main(["train", "--resume", str(folder), "--callback", "mine_on_disk:Fail"]) == 1
+    assert main(["train", "--resume", str(folder), "--callbacks", "mine_on_disk:Fail"]) == 1
     err = capsys.readouterr().err.strip().splitlines()
     assert err[-1].startswith("millrace: mine_on_disk.py:7: ValueError: no; raised in Fail.on_update; ")
     assert "go on with: --resume" in err[-1]
-    assert main(["train", ENV, *flags, "--callback", "mine_on_disk:Stp"]) == 2
+    assert main(["train", ENV, *flags, "--callbacks", "mine_on_disk:Stp"]) == 2
     assert "module mine_on_disk has no Stp; did you mean mine_on_disk:Stop?" in capsys.readouterr().err
     assert folder_of(tmp_path / "runs") == folder, "no folder is made for a callback that does not exist"

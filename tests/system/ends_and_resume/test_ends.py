@@ -309,7 +309,7 @@ def test_the_last_save_waits_for_space(tmp_path: Path, monkeypatch: pytest.Monke
             told.append(progress.checkpoint)
 
     disk = FullDisk(monkeypatch, 3, refuses=9)
-    folder = run(tmp_path, Callbacks([Uploads()], disk.watch))
+    folder = run(tmp_path, Callbacks([disk.watch, Uploads()]))
     assert summary(folder)["stop_reason"] == "all steps done"
     assert saved(folder) == summary(folder)["updates"]
     assert told[-1] == str(checkpoint.newest(folder)[0].path)

@@ -105,14 +105,14 @@ def test_a_script_trains_resumes_evaluates_and_records_what_it_registers(tmp_pat
     (tmp_path / "own.py").write_text(REGISTERED)
     line = refusal(tmp_path, "evaluate", run, "--env", "own:Walk-v0")
     assert "wrapper __main__:Doubled was made in a script" in line
-    assert "--wrapper my_module:Doubled" in line
-    assert "return 10.0 ± 0.0" in evaluated(tmp_path, run, "--env", "own:Walk-v0", "--wrapper", "own:Doubled")
+    assert "--wrappers my_module:Doubled" in line
+    assert "return 10.0 ± 0.0" in evaluated(tmp_path, run, "--env", "own:Walk-v0", "--wrappers", "own:Doubled")
 
     before = {path: path.read_bytes() for path in Path(run).rglob("*") if path.is_file()}
     assert "Walk-v0" in refusal(tmp_path, "train", "--resume", run, "--steps", "192")
-    assert "expected ['__main__:Doubled']" in refusal(tmp_path, "train", "--resume", run, "--wrapper", "own:Walk")
+    assert "expected ['__main__:Doubled']" in refusal(tmp_path, "train", "--resume", run, "--wrappers", "own:Walk")
     assert before == {path: path.read_bytes() for path in Path(run).rglob("*") if path.is_file()}
-    moved = millrace(tmp_path, "train", "own:Walk-v0", "--resume", run, "--steps", "192", "--wrapper", "own:Doubled")
+    moved = millrace(tmp_path, "train", "own:Walk-v0", "--resume", run, "--steps", "192", "--wrappers", "own:Doubled")
     assert moved.returncode == 0, moved.stderr
     assert "return 10.0 ± 0.0" in evaluated(tmp_path, run), "the run remembers the names that it has now"
 
@@ -139,7 +139,7 @@ def test_a_run_of_a_function_in_a_module_is_found_again_by_every_command(tmp_pat
     assert resumed.returncode == 0, resumed.stderr
     assert "return 12.0 ± 0.0" in evaluated(tmp_path, run)
     flags = [word for name, value in SMALL.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    wrappers = ["--wrapper", "own:Doubled", "--wrapper", "gymnasium.wrappers:TimeLimit(max_episode_steps=3)"]
+    wrappers = ["--wrappers", "own:Doubled", "gymnasium.wrappers:TimeLimit(max_episode_steps=3)"]
     named = millrace(tmp_path, "train", "own:make_walk", *wrappers, *flags, "--steps", "64", "--run-dir", "named")
     assert named.returncode == 0, named.stderr
     (run_by_name,) = (tmp_path / "named").iterdir()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -79,7 +79,8 @@ class Uneven(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 def test_with_a_lag_the_curve_does_not_depend_on_who_is_fast(tmp_path: Path) -> None:
     policies, max_lag = set(), 2
-    for workers, transport in ((1, "inproc"), (3, "ipc"), (4, "ipc")):
+    where: list[tuple[int, Literal["inproc", "ipc"]]] = [(1, "inproc"), (3, "ipc"), (4, "ipc")]
+    for workers, transport in where:
         folder = millrace.train(
             lambda: Uneven(gymnasium.make("CartPole-v1")),
             run_dir=str(tmp_path), seed=3, workers=workers, transport=transport, max_lag=max_lag, envs=4, rollout_steps=16,

@@ -294,5 +294,5 @@ def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
 
 def test_the_line_about_a_reward_of_several_numbers_names_mo_gymnasium_s_wrapper(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mo_gymnasium", ModuleType("mo_gymnasium"))
-    with pytest.raises(EnvironmentFailed, match=r"one number, as --wrapper mo_gymnasium.wrappers:LinearReward does$"):
+    with pytest.raises(EnvironmentFailed, match=r"one number, as --wrappers mo_gymnasium.wrappers:LinearReward does$"):
         stepped(partial(Changes, reward=np.zeros(2)), 1)

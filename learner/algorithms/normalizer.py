@@ -1,4 +1,4 @@
-"""`RolloutService.moments`: running mean and standard deviation of observations, and of the discounted return.
+"""`RolloutService.normalizer`: running mean and standard deviation of observations, and of the discounted return.
 
 They are those of the built-in trainer: the same classes, updated from the same rows. Imports torch, when it is first used.
 """
@@ -19,7 +19,7 @@ from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
 
-class Moments:
+class Normalizer:
     """Running moments of all batches so far. Only valid rows count.
 
     >>> import millrace
@@ -28,12 +28,12 @@ class Moments:
     ...     parameters = service.policy.initial()
     ...     _ = service.publish(parameters)
     ...     batch = service.gather()
-    ...     features = service.moments.normalized(batch)    # as the policy saw them, for your loss
-    ...     reward = service.moments.scaled_rewards(batch, 0.99)
-    ...     service.moments.update(batch)
+    ...     features = service.normalizer.normalized(batch)    # as the policy saw them, for your loss
+    ...     reward = service.normalizer.scaled_rewards(batch, 0.99)
+    ...     service.normalizer.update(batch)
     ...     service.publish(parameters)                     # sends mean and standard deviation, too
     1
-    >>> isinstance(service.moments, millrace.Moments)
+    >>> isinstance(service.normalizer, millrace.Normalizer)
     True
 
     `service.save` keeps them, and a service that is restored goes on from them.
@@ -83,7 +83,7 @@ class Moments:
         if self._rewards is None:
             self._rewards = gamma, RewardScaler(gamma)
         if gamma != self._rewards[0]:
-            raise UsageError(f"moments: gamma: expected {self._rewards[0]} as in the batches before, got {gamma}")
+            raise UsageError(f"normalizer: gamma: expected {self._rewards[0]} as in the batches before, got {gamma}")
         return self._rewards[1].count_and_scale(batch)
 
     def _features(self, batch: Batch) -> Array:

@@ -1,4 +1,4 @@
-"""`RolloutService.moments`: the running moments of the built-in trainer, for a learner of one's own."""
+"""`RolloutService.normalizer`: the running moments of the built-in trainer, for a learner of one's own."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def test_they_are_those_of_all_valid_rows_and_the_policy_acts_with_them() -> Non
         parameters = service.policy.initial(seed=1)
         service.publish(parameters)
         for batch in itertools.islice(service, 4):
-            normalized = service.moments.normalized(batch)
+            normalized = service.normalizer.normalized(batch)
             expected = log_probs(service.policy.named(parameters), normalized, batch.action)
             assert np.abs(expected - batch.log_prob)[batch.valid].max() < 1e-5
-            service.moments.update(batch)
+            service.normalizer.update(batch)
             seen.append(batch.obs[:-1][batch.valid])
             service.publish(parameters)
         rows = np.concatenate(seen).astype(np.float64)
-        assert np.allclose(service.moments.mean, rows.mean(0), rtol=1e-6, atol=1e-7)
-        assert np.allclose(service.moments.std, rows.std(0), rtol=1e-6)
-        assert np.abs(service.moments.mean).min() > 0
+        assert np.allclose(service.normalizer.mean, rows.mean(0), rtol=1e-6, atol=1e-7)
+        assert np.allclose(service.normalizer.std, rows.std(0), rtol=1e-6)
+        assert np.abs(service.normalizer.mean).min() > 0
 
 
 def test_they_are_the_trainers_own() -> None:
@@ -46,13 +46,13 @@ def test_they_are_the_trainers_own() -> None:
         service.publish(service.policy.initial())
         normalizer, scaler = ObservationNormalizer(service.run.policy), RewardScaler(0.9)
         for batch in itertools.islice(service, 3):
-            service.moments.update(batch)
+            service.normalizer.update(batch)
             normalizer.update(batch.obs[:-1], batch.valid)
-            assert np.array_equal(service.moments.buffers(), normalizer.buffers())
-            assert np.array_equal(service.moments.scaled_rewards(batch, 0.9), scaler.count_and_scale(batch))
+            assert np.array_equal(service.normalizer.buffers(), normalizer.buffers())
+            assert np.array_equal(service.normalizer.scaled_rewards(batch, 0.9), scaler.count_and_scale(batch))
             service.publish(service.policy.initial())
         with pytest.raises(millrace.UsageError, match=r"gamma: expected 0\.9 as in the batches before, got 0\.8"):
-            service.moments.scaled_rewards(batch, 0.8)
+            service.normalizer.scaled_rewards(batch, 0.8)
 
 
 def test_they_are_saved_and_restored(tmp_path: Path) -> None:
@@ -60,18 +60,18 @@ def test_they_are_saved_and_restored(tmp_path: Path) -> None:
     with millrace.RolloutService("CartPole-v1", POLICY, **SMALL) as service:
         service.publish(service.policy.initial())
         batch = service.gather()
-        service.moments.update(batch)
-        service.moments.scaled_rewards(batch, 0.9)
+        service.normalizer.update(batch)
+        service.normalizer.scaled_rewards(batch, 0.9)
         service.publish(service.policy.initial())
         service.save(file)
-        state = service.moments.state()
+        state = service.normalizer.state()
     with millrace.RolloutService("CartPole-v1", POLICY, restore=file, **SMALL) as service:
-        assert service.moments.state() == state
+        assert service.normalizer.state() == state
         assert state["observations"]["count"] == batch.env_steps == state["rewards"]["count"]
         parameters = service.policy.initial()
         service.publish(parameters)  # with the moments that were restored
         batch = service.gather()
-        expected = log_probs(service.policy.named(parameters), service.moments.normalized(batch), batch.action)
+        expected = log_probs(service.policy.named(parameters), service.normalizer.normalized(batch), batch.action)
         assert np.abs(expected - batch.log_prob)[batch.valid].max() < 1e-5
 
 
@@ -79,10 +79,10 @@ def test_they_serve_a_policy_that_does_not_normalize() -> None:
     with millrace.RolloutService("CartPole-v1", **SMALL) as service:
         service.publish(service.policy.initial())
         batch = service.gather()
-        service.moments.update(batch)
-        assert service.moments.mean.shape == service.moments.std.shape == (4,)
-        assert np.allclose(service.moments.mean, batch.obs[:-1][batch.valid].mean(0), atol=1e-6)
-        assert service.moments.normalized(batch).shape == batch.obs.shape
+        service.normalizer.update(batch)
+        assert service.normalizer.mean.shape == service.normalizer.std.shape == (4,)
+        assert np.allclose(service.normalizer.mean, batch.obs[:-1][batch.valid].mean(0), atol=1e-6)
+        assert service.normalizer.normalized(batch).shape == batch.obs.shape
         service.publish(service.policy.initial())
 
 
@@ -90,6 +90,6 @@ def test_of_several_arrays_the_features_are_side_by_side() -> None:
     with millrace.RolloutService("workers.envs.toy:Spaces-v0", env_kwargs={"observation": "dict"}, **SMALL) as service:
         service.publish(service.policy.initial())
         batch = service.gather()
-        service.moments.update(batch)
+        service.normalizer.update(batch)
         assert isinstance(batch.obs, dict)
-        assert service.moments.normalized(batch).shape == (25, 4, len(service.moments.mean))
+        assert service.normalizer.normalized(batch).shape == (25, 4, len(service.normalizer.mean))

@@ -1,0 +1,406 @@
+"""The keywords of `train`, `RolloutService`, `evaluate` and `record`, for editors and type checkers.
+
+Made of the records that hold these settings and flags: `python -m tests.millrace.test_keywords` writes this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Literal, TypedDict
+
+
+class RolloutKeywords(TypedDict, total=False):
+    """Keywords of `millrace.RolloutService`."""
+
+    env_kwargs: Mapping[str, bool | int | float | str]
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Texts may use number, slot, lane and copy of each
+    env copy, as in port "{5000 + slot}".
+    """
+    eval_env_kwargs: Mapping[str, bool | int | float | str]
+    """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
+    seed: int
+    """Seed of all random numbers of the run."""
+    workers: int
+    """Number of worker processes on this machine (train only)."""
+    envs: int
+    """Number of env copies, summed over all workers. Must be a multiple of lanes."""
+    lanes: int
+    """Number of groups of env copies. The copies of a lane are stepped together, on one worker at a time. Lanes are
+    distributed over the workers. Results depend on lanes and envs, not on the number of workers.
+    """
+    max_lag: int
+    """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
+    turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
+    """
+    vector: Literal["loop", "native", "envpool"]
+    """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
+    envpool: by envpool (pip install 'millrace-rl[envpool]'). native and envpool use other random numbers than loop.
+    """
+    acting_dtype: Literal["float32", "bfloat16"]
+    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights
+    that are sent. With images it halves the work of acting on CPUs with AMX, and is slower elsewhere.
+    """
+    info_keys: Sequence[str]
+    """Names of numbers that the environment reports in info at the end of an episode, such as is_success distance. Their
+    means are logged.
+    """
+    action_masks: Literal["auto", "info", "none"]
+    """Which actions are allowed, as the environment says it for a Discrete or MultiDiscrete action. auto: by the key
+    action_mask of a Dict observation, if it has one with a bit for each choice. info: by info["action_mask"] of each
+    reset and step; the key of a Dict observation comes first. none: all actions are allowed, and the key is an
+    observation.
+    """
+    max_env_copies: int
+    """Most env copies of the run on all machines, as for floating licences: those of its lanes, and those that play
+    evaluations, on as few workers as needed. 0: no limit. For a machine, set the variable MILLRACE_COPIES_PER_MACHINE.
+    """
+    min_workers: int
+    """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker (learner)."""
+    launched_workers: int
+    """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If so many
+    different workers say that the environment cannot be made, the run ends with their reason. 0: wait for another
+    worker.
+    """
+    transport: Literal["inproc", "ipc", "tcp"]
+    """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment.
+    ipc: local sockets. tcp: TCP on 127.0.0.1.
+    """
+    bind: str
+    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join;
+    this needs keys.
+    """
+    advertise: str
+    """Host name or IP address at which workers on other machines reach this one (learner only). Default: the name of this
+    machine.
+    """
+    keys: str | PathLike[str]
+    """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. If a folder is named here or in MILLRACE_KEYS,
+    TCP connections on this machine need keys too.
+    """
+    insecure: bool
+    """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
+    metrics_bind: str
+    """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the
+    network can read them. Default: no metrics are served.
+    """
+    dashboard: bool
+    """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
+    worker_timeout_s: float
+    """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
+    is not silent while its supervisor says that its environment is busy, however long that takes.
+    """
+    no_workers_timeout_s: float
+    """Write a checkpoint and end the run if there has been no worker for this many seconds."""
+    start_timeout_s: float
+    """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
+    imports, takes longer than this many seconds. 0: never.
+    """
+    step_timeout_s: float
+    """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
+    max_env_failures: int
+    """End the run when a lane fails more often than this in a row, without a rollout in between, and at the latest after
+    10 failures in a row; or when, within an hour, more failures than this came after env steps, and as many again for
+    each env copy and each hour since the learner began. A failure is an exception or an unusable result of the
+    environment or of an `OwnPolicy`, or the end of a worker process without an order: the environment may have ended
+    it.
+    """
+
+
+class TrainKeywords(RolloutKeywords, total=False):
+    """Keywords of `millrace.train`."""
+
+    algo: Literal["ppo", "a2c", "dqn", "impala", "reinforce", "sac", "td3"] | str | type
+    """Learning algorithm: a built-in one, or your own, such as my_module:MyClass. `--algo NAME --help` shows its
+    settings.
+    """
+    steps: int | float
+    """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
+    start_from: str | PathLike[str]
+    """Start from the policy of this run folder in place of random weights, with its statistics of observations and
+    rewards. A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the
+    new run, and schedules start anew. A resumed run does not read the folder again: see docs/how-to/start_from.md.
+    """
+    from_parts: Literal["auto", "policy", "best", "critic", "all"]
+    """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
+    also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
+    auto: critic with sac and td3, whose actor follows the critic at once, if the run has a checkpoint; else policy.
+    """
+    device: Literal["auto", "cpu", "cuda"]
+    """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
+    run_dir: str | PathLike[str]
+    """Folder in which the run folder is made."""
+    eval_episodes: int | None
+    """Number of greedy episodes in an evaluation. none: 100. Without eval_every, the evaluation at the end has fewer, but
+    at least 10, if 100 could take more than three quarters of the env steps of training.
+    """
+    eval_every: int | float
+    """Env steps between evaluations during training. 0: evaluate only at the end."""
+    eval_workers: int
+    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them, beside workers; a
+    learner waits for none, and takes those that `millrace worker --evaluate` starts. The result counts at the next
+    evaluation, or at the end, where the learner waits for it. If no such worker is left by then, the others play. 0:
+    all workers evaluate, and training waits.
+    """
+    eval_copies: int
+    """Number of evaluation episodes that a worker plays at the same time, on env copies of their own. The last bits of
+    results may depend on this number. Results do not depend on the number of workers.
+    """
+    eval_max_steps: int | float
+    """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
+    reaches 10000 steps is cut. It counts with its return up to that step, and the result says how many were cut.
+    """
+    target_return: float | None
+    """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
+    target_mean_return: float | None
+    """Stop as soon as the mean return of the last 100 training episodes is at least this."""
+    inference: Literal["workers", "learner"]
+    """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at
+    once; workers then only step the environments.
+    """
+    torch_threads: int | None
+    """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice
+    is 1; with images, an encoder or a layer of 512 x 512 weights it is all cores. If max_lag is above 0, one core is
+    then left to each local worker, unless this would leave half of the cores or less to the learner. Another number
+    changes the last bits of results.
+    """
+    grace_s: float
+    """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them;
+    then it is undone, and the state before it is saved. 0: wait until the update has ended.
+    """
+    checkpoint_every_s: float
+    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation. 0:
+    after each update.
+    """
+    keep_checkpoints: int
+    """Number of checkpoints to keep, the newest ones."""
+    record: str
+    """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
+    'millrace-rl[record]').
+    """
+    prior: str
+    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'millrace-rl[record]'). clone_epochs
+    starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it,
+    which prior_share sets.
+    """
+    rollout_steps: int
+    """ppo, a2c, dqn, impala, sac, td3: T, the steps of each env copy in a rollout.
+    reinforce: T, the steps of each env copy in a rollout. Must be longer than any episode.
+    """
+    net: Sequence[int]
+    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers: of the actor and of the critic each, or of the
+    Q-network.
+    sac, td3: Sizes of the hidden layers: of the actor and of each critic.
+    """
+    activation: Literal["tanh", "relu"]
+    """Activation function of the hidden layers."""
+    encoder: str | None
+    """A torch module of your own in front of the hidden layers, such as my_package.networks:factory. See
+    protocol/policy/encoder.py.
+    """
+    normalize_observations: bool
+    """ppo: Normalize observations, except images: subtract the running mean, divide by the running standard deviation,
+    clip to ±10. docs/explanation/defaults.md shows why PPO does by default.
+    a2c, dqn, impala, reinforce, sac, td3: Normalize observations, except images: subtract the running mean, divide by
+    the running standard deviation, clip to ±10.
+    """
+    gamma: float
+    """Discount factor."""
+    shared_net: bool
+    """ppo, a2c, impala, reinforce: Let actor and critic share their hidden layers."""
+    learning_rate: float
+    """ppo, a2c, dqn, impala, reinforce, sac: Learning rate of the optimizer.
+    td3: Learning rate of the optimizers.
+    """
+    learning_rate_schedule: Literal["constant", "linear"]
+    """linear: the learning rate falls to zero over the run."""
+    optimizer: Literal["rmsprop", "adam", "adamw"]
+    """ppo, a2c, impala, reinforce: Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5.
+    dqn: Optimizer. adamw: Adam with a decoupled weight decay of 0.01.
+    """
+    ent_coef: float | None
+    """ppo, a2c, impala, reinforce: Weight of the entropy bonus in the loss.
+    sac: Temperature α: the weight of the entropy. none: learned, so that the entropy stays near target_entropy.
+    """
+    vf_coef: float
+    """ppo, a2c, impala, reinforce: Weight of the value loss in the loss."""
+    max_grad_norm: float | None
+    """ppo, a2c, impala, reinforce: Clip the norm of the gradient to this.
+    dqn: Clip the norm of the gradient to this. none: no clipping.
+    """
+    log_std_init: float
+    """ppo, a2c, impala, reinforce: Initial logarithm of the standard deviation of continuous (Box) actions."""
+    normalize_rewards: bool
+    """ppo, a2c, impala: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
+    dqn, sac, td3: Divide rewards by the running standard deviation of the discounted return, when they are drawn from
+    the buffer, and clip them to ±10; with n_step, the sum of n rewards.
+    reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
+    Otherwise the loss of the baseline dominates the gradient.
+    """
+    clone_epochs: int
+    """ppo, a2c, impala, reinforce: Number of epochs of cloning on the dataset of --prior, before the first rollouts are
+    collected: the actor learns its actions, the critic its returns. Needs --prior.
+    sac, td3: Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the
+    actor learns its actions. Needs --prior.
+    """
+    core: Literal["lstm", "gru"] | None
+    """ppo, a2c, impala: Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T
+    steps of some env copies.
+    """
+    core_size: int
+    """ppo, a2c, impala: Number of units of the recurrent layer."""
+    batch_size: int
+    """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more.
+    dqn, sac, td3: Number of transitions in a gradient step.
+    """
+    n_epochs: int
+    """ppo: Number of epochs: how often an update uses each row.
+    impala: Number of epochs: how often an update uses each row. V-trace is computed anew in each epoch.
+    """
+    gae_lambda: float
+    """ppo, a2c: λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
+    normalize_advantage: bool
+    """ppo: Normalize the advantages of each minibatch to mean 0 and standard deviation 1.
+    a2c: Normalize the advantages of each batch to mean 0 and standard deviation 1.
+    """
+    clip_range: float
+    """ppo: ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
+    clip_range_schedule: Literal["constant", "linear"]
+    """ppo: linear: clip_range falls to zero over the run."""
+    clip_range_vf: float | None
+    """ppo: Clip the change of a value in an update to this, in units of (normalized) reward. none: no clipping."""
+    target_kl: float | None
+    """ppo: End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
+    learning_starts: int | float
+    """dqn: Number of env steps before the first gradient step.
+    sac, td3: Number of env steps before the first gradient step. Until then, actions are drawn uniformly.
+    """
+    replay_size: int | float
+    """dqn, sac, td3: Capacity of the replay buffer in transitions; the newest are kept. The final observation of a
+    truncated episode takes the place of one.
+    """
+    priority_alpha: float
+    """dqn, sac, td3: α of prioritized replay: how far its last TD error decides how often a transition is drawn from the
+    replay buffer. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
+    """
+    priority_beta: float
+    """dqn, sac, td3: Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully)
+    over the run.
+    """
+    prior_share: float
+    """dqn, sac, td3: Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
+    prior_steps: int | float
+    """dqn, sac, td3: Number of gradient steps on prior data alone, before the first rollouts are collected. Needs
+    --prior.
+    """
+    n_step: int
+    """dqn, sac, td3: Number of rewards in a target before it bootstraps."""
+    tau: float
+    """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one,
+    such as 0.005, take target_every 1 (polyak averaging).
+    sac, td3: τ of the polyak update: the fraction by which the target network moves in each gradient step.
+    """
+    amsgrad: bool
+    """dqn: Use the AMSGrad variant of the optimizer."""
+    gradient_steps: int
+    """dqn: Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this
+    sets the replay ratio.
+    """
+    double: bool
+    """dqn: Double Q-learning: the network chooses the next action, and the target network values it."""
+    dueling: bool
+    """dqn: Dueling network: an action value is the state's value plus the action's advantage over the mean."""
+    target_every: int
+    """dqn: Number of gradient steps between two updates of the target network."""
+    epsilon_start: float
+    """dqn: Initial probability ε of a random action."""
+    epsilon_end: float
+    """dqn: Final probability ε of a random action."""
+    epsilon_schedule: Literal["linear", "exponential"]
+    """dqn: How ε falls from its initial to its final value."""
+    epsilon_steps: int | float
+    """dqn: Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance to the
+    final value is 1/e of the initial distance.
+    """
+    loss: Literal["huber", "squared"]
+    """dqn: Loss of the TD error. huber: squared up to 1 and linear beyond."""
+    max_grad_value: float | None
+    """dqn: Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
+    minibatches: int
+    """impala: Number of minibatches (gradient steps) in an epoch."""
+    vtrace_lambda: float
+    """impala: λ of V-trace. 1: as in the paper. 0: one step."""
+    rho_bar: float
+    """impala: ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
+    learned values are to those of the newest policy (without clipping: exactly those).
+    """
+    c_bar: float
+    """impala: c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has
+    effect.
+    """
+    baseline: bool
+    """reinforce: Subtract the value that the critic predicts from the return."""
+    normalize_returns: bool
+    """reinforce: Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
+    updates_per_step: float
+    """sac, td3: Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts
+    are.
+    """
+    target_entropy: float | None
+    """sac: The entropy that a learned temperature aims at. none: minus the number of the action's elements."""
+    exploration_noise: float
+    """td3: Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
+    policy_delay: int
+    """td3: Number of gradient steps of the critics for each one of the actor and of the target networks."""
+    target_noise: float
+    """td3: Standard deviation of the noise that is added to the actions of targets."""
+    target_noise_clip: float
+    """td3: Clip the noise of targets to ± this."""
+
+
+class EvaluateKeywords(TypedDict, total=False):
+    """Keywords of `millrace.evaluate`."""
+
+    best: bool
+    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    workers: int
+    """number of worker processes that play the episodes; the result does not depend on it"""
+    transport: Literal["inproc", "ipc", "tcp"]
+    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
+    bind: str
+    """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
+    inference: Literal["workers", "learner"]
+    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
+    max_env_failures: int
+    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
+    seed: int
+    """seed of the episodes"""
+    copies: int
+    """number of episodes that a worker plays at the same time"""
+    max_steps: int
+    """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
+    video: bool
+    """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
+
+
+class RecordKeywords(TypedDict, total=False):
+    """Keywords of `millrace.record`."""
+
+    best: bool
+    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    workers: int
+    """number of worker processes that play the episodes; the result does not depend on it"""
+    transport: Literal["inproc", "ipc", "tcp"]
+    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
+    bind: str
+    """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
+    inference: Literal["workers", "learner"]
+    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
+    max_env_failures: int
+    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
+    npy: str | PathLike[str] | None
+    """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
+    stochastic: bool
+    """sample actions from the policy, as in training, instead of taking the most probable ones"""
+    seed: int
+    """seed of the episodes and of the sampled actions"""
