@@ -266,8 +266,7 @@ def train(
             only your class has are known to no type checker: pass them as `**own`, a `dict[str, Any]`. `start_from` may be a
             `Run`: the new run begins with its policy (`--from`).
 
-    Returns the `Run`. Raises `UserFacingError` with a message of one line. In a script, guard the call with
-    `if __name__ == "__main__":`.
+    Returns the `Run`. Raises `UserFacingError` with a message of one line.
 
     >>> import millrace
     >>> run = millrace.train("CartPole-v1", seed=1, steps=64, envs=2, lanes=1, rollout_steps=16, workers=1, progress=False)

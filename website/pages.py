@@ -25,7 +25,7 @@ START = {"docs": "index.md"}
 """What links to these files becomes a link to this page."""
 MADE: dict[str, Callable[[], str]] = {
     "leaderboard.md": leaderboard_page.page,
-    "reference/python.md": python_page.page,
+    **python_page.pages(),
     "reference/settings.md": settings_page.page,
     "reference/commands.md": commands_page.page,
     "reference/metrics.md": metrics_page.page,

@@ -1,67 +1,144 @@
-"""reference/python.md: the public names in groups. mkdocstrings replaces each `:::` line with signature and docstring."""
+"""reference/python.md lists the public names, and a page of reference/python/ shows each group of them.
+
+mkdocstrings replaces each `:::` line of a page with signature and docstring.
+"""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
+from typing import NamedTuple
+
+from benchmarks.markdown_tables import table
+from website.tables import anchored
 
 HEAD = """# Python
 
-Look here for the signature, the arguments and the errors of a public name. `import millrace` gives all names of the first
-sections. What is in none of these sections is internal: it may change in any version.
+`import millrace` gives all names without a second dot. A name that is not in these tables is internal: it may change in any
+version. `millrace.__version__` is the version of the installed package, as text.
 
 """
+
+
+class Group(NamedTuple):
+    """A page of public names."""
+
+    title: str
+    about: str
+    names: str
+    """names of `millrace` and its public modules, with spaces between"""
+
+
 GROUPS = {
-    "Train and look at runs": (
-        "train", "Run", "Metrics", "Summary", "Evaluation", "evaluate", "record", "RecordedDataset", "Dashboard",
+    "training": Group(
+        "Train and look at runs",
+        "[Settings](../settings.md) has the meaning and the range of every keyword of `train`.",
+        "train Run Metrics Summary Evaluation evaluate record RecordedDataset Dashboard",
     ),
-    "Use a policy": ("load", "LoadedPolicy"),
-    "Callbacks": ("Callback", "Progress"),
-    "Vector environment": ("make_vec",),
-    "Env copies": ("EnvCopy", "env_copy"),
-    "Wrappers": ("ResetAhead",),
-    "Rollouts for a learner of your own": ("RolloutService", "RolloutBatch", "Normalizer"),
-    "Policies that act in workers": ("MLP", "CNN", "Recurrent", "OwnPolicy", "PolicyParameters", "Piece"),
-    "Errors": (
-        "MillraceError", "UserFacingError", "UsageError", "RunError", "CheckpointError", "NoWorkers", "WorkerLost",
-        "Stalled", "EnvironmentFailed", "PolicyFailed",
+    "policies": Group("Use a policy", "A saved policy acts without its environment or algorithm.", "load LoadedPolicy"),
+    "callbacks": Group(
+        "Callbacks",
+        "`train(callbacks=[…])` takes any number of them. `millrace.integrations` has those for other tools.",
+        "Callback Progress integrations.WandbCallback integrations.MlflowCallback",
     ),
-}  # fmt: skip
-"""The names of `millrace.__all__`; its modules and `__version__` have sections of their own"""
-MODULES = {
-    "algorithms": "What an algorithm of your own needs. Importing this module imports PyTorch.",
-    "testing": "Tests of what you write.",
-    "integrations": "Callbacks for other tools.",
-    "sb3": "The vector environment for Stable-Baselines3 (`pip install 'millrace-rl[peers]'`).",
+    "environments": Group(
+        "Environments",
+        "The vector environment, and what helps to write an environment. `millrace.sb3` needs Stable-Baselines3.",
+        "make_vec sb3.make_vec_env sb3.Sb3VecEnv EnvCopy env_copy ResetAhead",
+    ),
+    "rollouts": Group(
+        "Rollouts for your own learner",
+        "millrace collects rollouts, and a learner in any framework learns from them.",
+        "RolloutService RolloutBatch Normalizer",
+    ),
+    "worker_policies": Group(
+        "Policies that act in workers",
+        "What `RolloutService` takes as its policy.",
+        "MLP CNN Recurrent OwnPolicy PolicyParameters Piece",
+    ),
+    "algorithms": Group(
+        "Algorithms",
+        "What an algorithm of your own derives from. Importing `millrace.algorithms` imports PyTorch.",
+        "algorithms.Algorithm algorithms.GradientDescent algorithms.ActorCritic algorithms.OffPolicy algorithms.Continuous "
+        "algorithms.Clones algorithms.PPO algorithms.A2C algorithms.Impala algorithms.REINFORCE algorithms.DQN "
+        "algorithms.SAC algorithms.TD3 testing.check_algorithm testing.AlgorithmMistakes",
+    ),
+    "algorithm_settings": Group(
+        "Settings of algorithms",
+        "The records to derive `Config` from. [Settings](../settings.md) lists what they hold.",
+        "algorithms.AlgorithmConfig algorithms.ActorCriticConfig algorithms.OffPolicyConfig algorithms.ContinuousConfig "
+        "algorithms.PPOConfig algorithms.A2CConfig algorithms.ImpalaConfig algorithms.REINFORCEConfig algorithms.DQNConfig "
+        "algorithms.SACConfig algorithms.TD3Config algorithms.Free algorithms.Adaptable algorithms.Fixed",
+    ),
+    "algorithm_data": Group(
+        "What algorithms learn from",
+        "The arguments and results of an algorithm's methods.",
+        "algorithms.Batch algorithms.LossInput algorithms.Observations algorithms.Estimates algorithms.Transitions "
+        "algorithms.CriticLoss algorithms.Demonstrations algorithms.Start algorithms.UpdateMetrics algorithms.PolicySpec "
+        "algorithms.ActionSpec algorithms.Leaf",
+    ),
+    "algorithm_tools": Group(
+        "Tools of algorithms",
+        "Networks, replay buffers, running statistics and functions that our algorithms use.",
+        "algorithms.ActorCriticNetwork algorithms.QNetwork algorithms.ActorAndCritics algorithms.ReplayBuffer "
+        "algorithms.Sample algorithms.MixedReplay algorithms.ObservationNormalizer algorithms.RewardScaler "
+        "algorithms.EpisodeEnds algorithms.gae algorithms.vtrace algorithms.log_prob_and_entropy "
+        "algorithms.policy_log_prob algorithms.squashed_sample algorithms.trainable algorithms.features "
+        "algorithms.normalize algorithms.scheduled algorithms.check_finite algorithms.Purpose algorithms.torch_seed "
+        "algorithms.UsageError",
+    ),
+    "errors": Group(
+        "Errors",
+        "Each message is one line that says what to do next.",
+        "MillraceError UserFacingError UsageError RunError CheckpointError NoWorkers WorkerLost Stalled EnvironmentFailed "
+        "PolicyFailed",
+    ),
 }
-"""Public modules, and the first sentence of the section of each"""
+"""The groups, by the names of their pages"""
+WITHOUT_MEMBERS = ("Config", ".PPO", ".A2C", ".Impala", ".REINFORCE", ".DQN", ".SAC", ".TD3")
+"""Ends of names whose members are on another page, or are those of a base"""
 
 
-def page() -> str:
-    """The page."""
+def pages() -> dict[str, Callable[[], str]]:
+    """What makes each page, by its path in the site."""
+    return {"reference/python.md": index} | {f"reference/python/{name}.md": partial(page, name) for name in GROUPS}
+
+
+def index() -> str:
+    """The page that lists all names. It has the anchor of each, as the page that shows it."""
     parts = [HEAD]
-    for title, names in GROUPS.items():
-        parts.append(f"## {title}\n\n" + "".join(f"::: millrace.{name}\n\n" for name in names))
-    parts.append("## Version\n\n`millrace.__version__` is the version of the installed package, as text.\n\n")
-    for module, about in MODULES.items():
-        parts.append(f"## millrace.{module}\n\n{about}\n\n" + "".join(f"::: {name}\n\n" for name in names_of(module)))
+    for page, group in GROUPS.items():
+        rows = [(anchored(name, f"[`{name}`](python/{page}.md#{name})"), about(name)) for name in names_of(group)]
+        parts.append(f"## [{group.title}](python/{page}.md)\n\n{table(('name', 'what it is'), rows)}\n")
     return "".join(parts)
 
 
-def names_of(module: str) -> list[str]:
-    """The full public names of a module."""
-    found = import_module(f"millrace.{module}")
-    names = getattr(found, "__all__", None) or [
-        name for name, value in vars(found).items() if not name.startswith("_") and _is_from(value, found.__name__)
-    ]
-    return [f"millrace.{module}.{name}" for name in names]
+def page(name: str) -> str:
+    """The page of a group."""
+    group = GROUPS[name]
+    alone = "    options: {members: false}\n"
+    shown = (f"::: {each}\n{alone if each.endswith(WITHOUT_MEMBERS) else ''}\n" for each in names_of(group))
+    return f"# {group.title}\n\n{group.about}\n\n" + "".join(shown)
 
 
-def _is_from(value: object, module: str) -> bool:
-    return callable(value) and getattr(value, "__module__", None) == module
+def names_of(group: Group) -> list[str]:
+    """The full public names of a group."""
+    return [f"millrace.{name}" for name in group.names.split()]
 
 
-def anchors() -> set[str]:
-    """The anchors that mkdocstrings makes: the full name of each object."""
-    return {f"millrace.{name}" for names in GROUPS.values() for name in names} | {
-        name for module in MODULES for name in names_of(module)
-    }
+def about(name: str) -> str:
+    """The first sentence about a public name."""
+    module, _, last = name.rpartition(".")
+    found = getattr(import_module(module), last)
+    if not inspect.isclass(found) and not inspect.isfunction(found):
+        return "a name for a type"
+    text = inspect.getdoc(found) or ""
+    return " ".join(text.partition("\n\n")[0].split()).partition(". ")[0].removesuffix(".").replace("|", r"\|")
+
+
+def anchors(page: str) -> set[str]:
+    """The anchors that mkdocstrings makes on a page of the site: the full name of each object."""
+    group = GROUPS.get(page.removeprefix("reference/python/").removesuffix(".md"))
+    return set() if group is None else set(names_of(group))

@@ -121,16 +121,18 @@ def test_a_type_that_nobody_knows_is_an_error() -> None:
         settings_page.values(set[int])
 
 
-def test_every_public_name_is_on_the_python_page() -> None:
+def test_every_public_name_is_on_one_python_page() -> None:
     pytest.importorskip("stable_baselines3", reason="the page of the Python names has those of millrace.sb3")
-    public = set(millrace.__all__) - set(python_page.MODULES) - {"__version__"}
-    assert {name for names in python_page.GROUPS.values() for name in names} == public
-    assert {name for name in millrace.__all__ if name in millrace._MODULES} <= set(python_page.MODULES)
-    page = python_page.page()
-    for module in ("algorithms", "testing", "integrations"):
-        for name in getattr(millrace, module).__all__:
-            assert f"::: millrace.{module}.{name}\n" in page
-    assert "::: millrace.sb3.make_vec_env\n" in page
+    modules = {"algorithms", "testing", "integrations"}
+    public = {f"millrace.{name}" for name in set(millrace.__all__) - modules - {"__version__"}}
+    for module in modules:
+        public |= {f"millrace.{module}.{name}" for name in getattr(millrace, module).__all__}
+    text = "".join(make() for make in python_page.pages().values())
+    shown = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
+    assert {name for name in shown if not name.startswith("millrace.sb3.")} == public
+    assert len(set(shown)) == len(shown)
+    assert "millrace.sb3.make_vec_env" in shown
+    assert all(f'<span id="{name}">' in text for name in shown), "the list of all names has their anchors"
 
 
 def test_every_command_is_on_its_page() -> None:
