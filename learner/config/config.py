@@ -39,7 +39,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     start_from: Annotated[Fixed[str], Flag("PATH", alias="from")] = ""
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and rewards.
     A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the new run, and
-    schedules start anew. A resumed run does not read the folder again: see docs/how-to/start_from.md.
+    schedules start anew. A resumed run does not read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Fixed[Literal["auto", "policy", "best", "critic", "all"]] = "auto"
     """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:

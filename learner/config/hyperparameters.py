@@ -100,7 +100,7 @@ class PPOConfig(ActorCriticConfig, frozen=True):
 
     normalize_observations: Fixed[bool] = True
     """Normalize observations, except images: subtract the running mean, divide by the running standard deviation, clip to
-    ±10. docs/explanation/defaults.md shows why PPO does by default.
+    ±10. docs/how-to/algorithms.md shows why PPO does by default.
     """
     normalize_rewards: Fixed[bool] = True
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""

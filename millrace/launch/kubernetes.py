@@ -32,7 +32,7 @@ def manifest(flags: KubernetesFlags, rest: Sequence[str], now: datetime) -> str:
 def _comments(flags: KubernetesFlags) -> str:
     secret = f"kubectl create secret generic {flags.name}-keys --from-file=KEYS"
     lines = [
-        f"A learner and {flags.workers} workers. See docs/how-to/kubernetes.md.",
+        f"A learner and {flags.workers} workers. See docs/how-to/clusters.md.",
         *(["This file holds keys: keep it secret."] if flags.keys else ["millrace keys new default --keys KEYS", secret]),
         "kubectl apply -f THIS_FILE",
         f"kubectl logs -f job/{flags.name}-learner",

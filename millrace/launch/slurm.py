@@ -35,7 +35,7 @@ def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
     env, *own = map(shlex.quote, learner_flags(flags.env, rest, flags.workers, bind="BIND", runs="RUNS"))
     return f"""\
 #!/bin/bash
-# A learner and {flags.workers} workers as one Slurm job: sbatch THIS_FILE. See docs/how-to/slurm.md.
+# A learner and {flags.workers} workers as one Slurm job: sbatch THIS_FILE. See docs/how-to/clusters.md.
 {directives}#SBATCH --requeue
 
 set -u

@@ -238,14 +238,6 @@ def test_every_preset_makes_a_configuration_of_its_own() -> None:
             assert resolve(env, algo=algo) != resolve(env, algo=algo, preset="none")
 
 
-def test_every_named_preset_is_on_the_page_of_the_notebooks() -> None:
-    page = Path(__file__).parents[3] / "docs" / "how-to" / "teaching_notebooks.md"
-    assert set(re.findall(r"--preset ([\w-]+)", page.read_text())) == set(named_presets())
-    images = re.findall(r"\]\((\.\./images/[^)]+)\)", page.read_text())
-    assert len(images) == 5
-    assert all((page.parent / image).is_file() for image in images)
-
-
 def test_every_named_preset_is_a_whole_run() -> None:
     assert named_presets()
     for name, preset in named_presets().items():

@@ -176,7 +176,7 @@ def test_kubernetes_expands_no_variable_in_our_arguments(capsys: pytest.CaptureF
 
 
 def of_the_page() -> dict[str, dict[str, Any]]:
-    shown = re.findall(r"<<'END'\n(.*?)^END", (ROOT / "docs/how-to/kubernetes.md").read_text(), re.DOTALL | re.MULTILINE)
+    shown = re.findall(r"<<'END'\n(.*?)^END", (ROOT / "docs/how-to/clusters.md").read_text(), re.DOTALL | re.MULTILINE)
     return documents("---\n".join(shown))
 
 

@@ -88,7 +88,7 @@ MAY_DIFFER = {"wall_s", "ledger"}
 
 
 def assert_equal(one: Path, other: Path) -> None:
-    """All that docs/how-to/resume_exactly.md says is equal is equal."""
+    """All that docs/how-to/resume.md says is equal is equal."""
     (a, _), (b, _) = checkpoint.newest(one), checkpoint.newest(other)
     assert a.env_steps == b.env_steps
     for part in ("algorithm", "best_policy"):
