@@ -119,7 +119,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     start_from: str | PathLike[str]
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and
     rewards. A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the
-    new run, and schedules start anew. A resumed run does not read the folder again: see docs/how-to/start_from.md.
+    new run, and schedules start anew. A resumed run does not read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Literal["auto", "policy", "best", "critic", "all"]
     """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
@@ -200,7 +200,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     normalize_observations: bool
     """ppo: Normalize observations, except images: subtract the running mean, divide by the running standard deviation,
-    clip to ±10. docs/explanation/defaults.md shows why PPO does by default.
+    clip to ±10. docs/how-to/algorithms.md shows why PPO does by default.
     a2c, dqn, impala, reinforce, sac, td3: Normalize observations, except images: subtract the running mean, divide by
     the running standard deviation, clip to ±10.
     """
