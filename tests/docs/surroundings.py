@@ -11,7 +11,7 @@ from pathlib import Path
 
 EXTRAS = {
     "wandb", "mlflow", "optuna", "jax", "ray", "envpool", "ale_py", "minari", "moviepy", "stable_baselines3", "mujoco",
-    "Box2D", "zstandard",
+    "Box2D", "zstandard", "onnx", "onnxscript",
 }  # fmt: skip
 MISSING = re.compile(
     r"^\s*ModuleNotFoundError: No module named '(\w+)|^\s*(?:\w+\.)*UsageError: .*pip install (\S+)", re.MULTILINE
