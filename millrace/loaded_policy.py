@@ -33,7 +33,14 @@ Observation: TypeAlias = Any
 
 
 class LoadedPolicy:
-    """A policy of a run folder. `millrace.load` makes it.
+    """A policy of a run folder, which acts: `policy(observation)` is an action for `env.step`. `millrace.load` makes it.
+
+    It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or
+    n. Actions are the environment's: of the dtype and shape of its action space, counted from its `start` and within its
+    bounds. Observations are as the environment returns them; the policy normalizes them itself if it was trained so.
+
+    A policy with a recurrent core remembers what it saw in each env copy: call `start(n)` before the first observations, and
+    say with `first` which copies begin a new episode.
 
     >>> import gymnasium, millrace
     >>> policy = millrace.load(run)
@@ -46,13 +53,15 @@ class LoadedPolicy:
 
     def __init__(self, run: Path, *, best: bool, deterministic: bool, seed: int) -> None:
         check_at_least("load: seed", seed, 0)
-        self.run = run
+        self.run: Path = run
         """The run folder."""
         saved = saved_policy(run, "best" if best else "final")
         self.spec: PolicySpec = saved.spec
         """The observations, the actions and the network, as plain data."""
         self.parameters, self.buffers = saved.parameters, saved.buffers
-        """Flat float32 vectors, as `RolloutService.publish` takes them: a learner of your own can start from this policy."""
+        """Flat float32 vectors [P] and [2 D], as `RolloutService.publish` takes them: a learner of your own can start from
+        this policy. `PolicyParameters(policy.spec)` names their pieces. `buffers` is empty if nothing is normalized.
+        """
         self._name = f"{saved.env.id}, {'best' if best else 'newest'} policy"
         self._policy = make_policy(saved.spec)
         self._policy.load(saved.parameters, saved.buffers)

@@ -91,8 +91,15 @@ class RolloutService:
     """Collects rollouts of one policy with worker processes, here or elsewhere, for a learner of your own.
 
     Use it in a `with` statement and from one thread. While you compute, a thread of the service answers the workers, so a
-    long computation loses none of them. Iterating gives a `RolloutBatch` for each update; it waits until one rollout of each
-    lane is there. It was collected under the weights that were the newest when `gather` was called `max_lag` batches before.
+    long computation loses none of them.
+
+    `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. Iterating, or
+    `gather`, gives a `RolloutBatch` for each update: T = `rollout_steps` rows of N = `envs` env copies. It waits until one
+    rollout of each lane is there. The batch was collected under the weights that were the newest when `gather` was called
+    `max_lag` batches before: with 0, under those that you published last.
+
+    After `close`, and from another thread, every method raises `UsageError`. `gather` and `evaluate` raise `RunError` if no
+    batch can come: `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`. Ctrl-C raises `KeyboardInterrupt`.
 
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", millrace.MLP(64), workers=1, envs=4, rollout_steps=8) as service:
@@ -126,10 +133,9 @@ class RolloutService:
             policy: `MLP`, `CNN`, `Recurrent` or your `OwnPolicy`; by default `MLP(64, 64)`.
             rollout_steps: T, env steps of an env copy in a batch.
             restore: a file that `save` wrote; `restored` then has its arrays.
-            **settings: the settings of `millrace train` for environments, workers, network and timeouts, by the same names:
-                `workers=2`, `envs=8`, `lanes=4`, `max_lag=0`, `seed=1`, `env_kwargs={}`, `vector`, `transport`, `keys`,
-                `worker_timeout_s` and so on. With `bind="tcp://0.0.0.0:5555"` no worker is started here: workers elsewhere
-                join with `millrace worker`.
+            **settings: those of `millrace train` for environments, workers, network and timeouts, by the same names and with
+                the same defaults: `workers=2`, `envs=8`, `lanes=4`, `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker
+                is started here: workers elsewhere join with `millrace worker`.
 
         Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, `EnvironmentFailed` if the
         environment cannot be made, and `PolicyFailed` if your `OwnPolicy` cannot.
@@ -143,14 +149,16 @@ class RolloutService:
         self.restored: dict[str, Array] = {}
         """The arrays of the file that was restored, by name."""
         past: tuple[Ledger, Sequence[int]] | None = None
-        self._version, self.env_steps = -1, 0
+        self._version = -1
+        self.env_steps: int = 0
+        """Env steps in all batches so far, those before a restore included."""
         state: ServiceState | None = None
         if restore is not None:
             state, self.restored = read(Path(restore))
             state.ledger.end_outstanding()
             past = state.ledger, state.incarnations
             self._version, self.env_steps = max(state.version - 1, -1), state.env_steps
-        self.config = config
+        self.config: RolloutConfig = config
         """All settings of collecting rollouts."""
         self._interrupts = Interrupts()
         self._lock = threading.Lock()
@@ -180,10 +188,12 @@ class RolloutService:
         except BaseException:
             self._resources.close()
             raise
-        self.policy = PolicyParameters(self.run.policy)
-        """Names, shapes and offsets of the parameters, and initial values."""
+        self.policy: PolicyParameters = PolicyParameters(self.run.policy)
+        """Names, shapes and offsets of the parameters in the flat vector, and initial values."""
         self.observation_space: gymnasium.Space[Any] = described.observation_space
+        """That of a single env copy."""
         self.action_space: gymnasium.Space[Any] = described.action_space
+        """That of a single env copy."""
         self._thread = threading.Thread(target=self._answer_workers, name="millrace-service", daemon=True)
         self._thread.start()
 
@@ -225,7 +235,8 @@ class RolloutService:
 
     @property
     def normalizer(self) -> Normalizer:
-        """Running mean and standard deviation of observations and returns, as in the built-in trainer. Imports torch.
+        """Running mean and standard deviation of observations and returns, as in the built-in trainer. It is made, and torch
+        imported, when it is first asked for; `publish` then sends its numbers to a policy that normalizes observations.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -241,7 +252,11 @@ class RolloutService:
         return self._normalizer
 
     def gather(self) -> RolloutBatch:
-        """Wait for the next batch. Raises `RunError` when no worker is left, or the environment failed too often.
+        """Wait for the next batch.
+
+        Raises `NoWorkers` if none has been there for `no_workers_timeout_s`, `EnvironmentFailed` or `PolicyFailed` if it
+        failed more often than `max_env_failures` allows, `Stalled` if no env step has ended for ten minutes (or as long as
+        one may take), and `UsageError` before the first `publish`.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:

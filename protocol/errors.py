@@ -47,7 +47,7 @@ def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
 
 
 class MillraceError(Exception):
-    """Base of all errors of millrace.
+    """Base of all errors of millrace. `str(error)` is one line: who, what, what was expected, what it got, what to do next.
 
     >>> import millrace
     >>> try:
@@ -59,7 +59,10 @@ class MillraceError(Exception):
 
 
 class UserFacingError(MillraceError):
-    """One side cannot go on. The command line prints the one line and exits with `exit_code`.
+    """One side cannot go on: the base of all errors that a user meets.
+
+    The command line prints the line and exits with `exit_code`: 2 for what the user asked for, 1 for what happened. `detail`
+    is text to show below the line, as the traceback of a worker; often empty.
 
     >>> import millrace
     >>> try:
@@ -70,6 +73,7 @@ class UserFacingError(MillraceError):
     """
 
     exit_code = 1
+    """what the command line exits with"""
 
     def __init__(self, line: str, detail: str = "") -> None:
         """`line` is the whole message: what it quotes is escaped, so it stays one line. `detail` is shown below it."""
@@ -79,6 +83,9 @@ class UserFacingError(MillraceError):
 
 class UsageError(UserFacingError):
     """What the user asked for cannot be done; the text says what can.
+
+    It is about an unknown setting or environment, a value out of its range, a space that no policy can have, a folder that
+    is no run, or a call that comes too early. Most are raised before a worker starts.
 
     >>> import millrace
     >>> millrace.train("CartPole-v1", learning_rat=1e-3)
@@ -113,7 +120,9 @@ class RunTakenOver(UserFacingError):
 
 
 class RunError(UserFacingError):
-    """The run cannot go on.
+    """The run cannot go on, or a file cannot be written. The errors below say more.
+
+    A training run has kept its newest whole checkpoint, from which `millrace.train(resume=run)` continues.
 
     >>> import millrace
     >>> millrace.Run(run).plot("no-such-folder/curve.png")
@@ -123,7 +132,9 @@ class RunError(UserFacingError):
 
 
 class CheckpointError(RunError):
-    """A checkpoint is missing, broken or of another format.
+    """A checkpoint, or a file that `RolloutService.save` wrote, is missing, broken, of another format or of another policy.
+
+    A run that resumes takes the newest checkpoint that is whole; this is raised if there is none.
 
     >>> import millrace, pathlib
     >>> _ = pathlib.Path("state.npz").write_bytes(b"not a saved state")
@@ -136,7 +147,10 @@ class CheckpointError(RunError):
 
 
 class NoWorkers(RunError):
-    """No worker is left, or none ever joined.
+    """No worker is left, or none ever joined, for as long as `no_workers_timeout_s`. The line says how to start one.
+
+    A training run that had begun has then written a checkpoint. A vector environment waits for its own workers for a minute,
+    and for those elsewhere for `timeout`.
 
     >>> import millrace
     >>> try:
@@ -148,7 +162,10 @@ class NoWorkers(RunError):
 
 
 class WorkerLost(RunError):
-    """A worker was lost, and its env copies with it.
+    """A worker was lost, and its env copies with it: its process ended, or it did not answer in time.
+
+    Only a vector environment with `on_worker_loss="raise"` raises it; after `reset` it continues with new
+    copies. Training and `RolloutService` give the lanes of a lost worker to others.
 
     >>> import gymnasium, millrace, os
     >>> class Dies(gymnasium.Wrapper):
@@ -166,7 +183,9 @@ class WorkerLost(RunError):
 
 
 class Stalled(RunError):
-    """A deadline passed.
+    """Workers are there, but nothing came from them for ten minutes, or for as long as one call of the environment may take.
+
+    The line says what was waited for: mostly an environment that hangs. `step_timeout_s` ends the worker of one that does.
 
     >>> import millrace
     >>> try:

@@ -20,7 +20,11 @@ from protocol.specs import PolicySpec
 
 
 class Normalizer:
-    """Running moments of all batches so far. Only valid rows count.
+    """Running mean and standard deviation of each feature of the observations, and of the discounted return.
+
+    They are over all batches that were counted so far; rows that only reset count nowhere. D is the number of features: the
+    entries of all arrays of the observation side by side, with a one-hot vector for a discrete value. Images are no features
+    and stay as they are. Numbers are kept in float64 and given out as float32.
 
     >>> import millrace
     >>> policy = millrace.MLP(normalize_observations=True)

@@ -26,6 +26,10 @@ Row = Mapping[str, float | None]
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """The progress of a run: the terminal shows it, the metrics record it after each update, and callbacks get it.
 
+    Returns are sums of raw rewards, undiscounted. Times are in seconds, speeds in env steps a second over all workers. A
+    number that does not exist yet is None. What only some methods of `Callback` get says so. Do not keep the arrays of
+    `rollouts`, which are read-only: copy them.
+
     >>> import millrace
     >>> seen = []
     >>> def watch(progress: millrace.Progress) -> None:
@@ -38,9 +42,11 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     run: str = ""
     """path of the run folder"""
     env_steps: int = 0
+    """env steps that updates have used so far, those before a resume included"""
     total_steps: int = 0
     """env steps to train for"""
     updates: int = 0
+    """updates made so far, those before a resume included"""
     wall_s: float = 0.0
     """seconds of training, those before a resume included; evaluations do not count"""
     steps_per_s: float = 0.0
@@ -52,10 +58,13 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     facts: dict[str, FactMean] = {}
     """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
     lag_mean: float = 0.0
+    """mean lag of the rollouts of the last update, in versions of the weights"""
     lag_max: int = 0
+    """the largest of these lags"""
     workers_alive: int = 0
+    """workers that have joined and are not lost"""
     workers_expected: int = 0
-    """0: any number"""
+    """workers that this run starts; 0: any number may join"""
     ledger: dict[str, int] = {}
     """number of tickets and transitions in each state"""
     stages: dict[str, float] = {}

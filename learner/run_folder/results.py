@@ -65,7 +65,9 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     episodes: Natural
+    """number of episodes"""
     return_mean: Real
+    """mean return of an episode: its summed raw rewards, undiscounted"""
     return_std: Real
     """population standard deviation over the episodes"""
     length_mean: Real
@@ -117,7 +119,10 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """The results of a run: summary.json.
+    """The results of a run, from its summary.json. `Run.summary` is None until the run has ended.
+
+    Returns are sums of raw rewards, undiscounted. Numbers count from the beginning of the run, also after a resume, unless
+    their text says something else.
 
     >>> import millrace
     >>> summary = millrace.Run(run).summary
@@ -126,21 +131,27 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     env: str
+    """id or name of the environment"""
     algo: str
+    """name of the algorithm; `module:Class` of one of your own"""
     seed: int
     env_steps: Natural
+    """env steps that updates used, over all env copies"""
     updates: Natural
     wall_s: Seconds
+    """seconds of training; evaluations do not count"""
     env_steps_per_s: Real
+    """`env_steps` by `wall_s`"""
     stop_reason: str
+    """why it ended: `all steps done`, a target that was reached, the callback that ended it, an error or a signal"""
     cut_short: bool = False
     """an error or an interrupt ended the run"""
     return_mean_100: Real | None
-    """mean return of the last 100 training episodes"""
+    """mean return of the last 100 training episodes; None if none has ended"""
     facts_100: dict[str, FactMean] = {}
     """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
     evaluation: Evaluation | None
-    """evaluation of the final policy"""
+    """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
     ledger: dict[str, Natural] = {}
@@ -150,7 +161,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     first_use_s: dict[str, Real] = {}
     """by worker: median seconds from publishing new weights to the arrival of the first rollout under them"""
     stages: dict[str, Seconds] = {}
-    """seconds spent in each stage"""
+    """seconds that the learner spent in each stage: collecting, updating, evaluating and so on"""
     versions: dict[str, str] = {}
     """versions of millrace and of the packages that decide its results"""
 
