@@ -23,7 +23,7 @@ wrong with a class of either level. A run takes it as `millrace train CartPole-v
 The algorithm itself:
 
 - `Algorithm`, the base of all; `GradientDescent`, the base of ours: optimizers, schedules, statistics, `UpdateMetrics`, the
-  state; `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`, `Impala` and `REINFORCE`;
+  state; `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`, `IMPALA` and `REINFORCE`;
   `OffPolicy`, the base of those with a replay buffer, of which are `DQN`, `SAC` and `TD3`. The last two share `Continuous`:
   actions in a bounded Box, an exact replay ratio.
 - `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`, the bases of `Config`; `PPOConfig` and so
@@ -63,7 +63,7 @@ from learner.algorithms.cloning.clones import Clones
 from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.dqn import DQN
 from learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
-from learner.algorithms.impala import Impala
+from learner.algorithms.impala import IMPALA
 from learner.algorithms.minibatches import LossInput, Observations
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from learner.algorithms.ppo import PPO
@@ -81,7 +81,7 @@ from learner.config.hyperparameters import (
     AlgorithmConfig,
     ContinuousConfig,
     DQNConfig,
-    ImpalaConfig,
+    IMPALAConfig,
     OffPolicyConfig,
     PPOConfig,
     REINFORCEConfig,
@@ -100,6 +100,7 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 __all__ = [
     "A2C",
     "DQN",
+    "IMPALA",
     "PPO",
     "REINFORCE",
     "SAC",
@@ -125,8 +126,7 @@ __all__ = [
     "Fixed",
     "Free",
     "GradientDescent",
-    "Impala",
-    "ImpalaConfig",
+    "IMPALAConfig",
     "Leaf",
     "LossInput",
     "MixedReplay",

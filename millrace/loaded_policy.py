@@ -39,7 +39,7 @@ class LoadedPolicy:
     n. Actions are the environment's: of the dtype and shape of its action space, counted from its `start` and within its
     bounds. Observations are as the environment returns them; the policy normalizes them itself if it was trained so.
 
-    A policy with a recurrent core remembers what it saw in each env copy: call `start(n)` before the first observations, and
+    A policy with a recurrent core remembers what it saw in each env copy: call `reset(n)` before the first observations, and
     say with `first` which copies begin a new episode.
 
     >>> import gymnasium, millrace
@@ -70,25 +70,25 @@ class LoadedPolicy:
         self._is_masked = saved.masked
         self._to_env_action = action_converter_of(saved.spec)
         self._generator = None if deterministic else generator(seed, Purpose.PLAYED_ACTIONS)
-        self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was started
+        self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was reset
 
     @checked
-    def start(self, copies: int = 1, *, seed: int | None = None) -> None:
+    def reset(self, copies: int = 1, *, seed: int | None = None) -> None:
         """Begin new episodes in this number of env copies. A policy with a recurrent core needs it; others do not.
 
         `seed`: restart the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1.
 
         >>> import millrace, numpy
         >>> policy = millrace.load(run, deterministic=False)
-        >>> policy.start(2, seed=7)
+        >>> policy.reset(2, seed=7)
         >>> actions = policy(numpy.zeros((2, 4)))
         """
-        check_at_least("start: copies", copies, 1)
-        check_at_least("start: seed", seed or 0, 0)
+        check_at_least("reset: copies", copies, 1)
+        check_at_least("reset: seed", seed or 0, 0)
         try:
             self._state = zero_state(self.spec, 1, copies)
         except (MemoryError, ValueError) as error:  # ValueError: no array can be so long
-            raise UsageError(f"start: copies: expected a number whose states fit into memory, got {copies}") from error
+            raise UsageError(f"reset: copies: expected a number whose states fit into memory, got {copies}") from error
         if seed is not None and self._generator is not None:
             self._generator = generator(seed, Purpose.PLAYED_ACTIONS)
 
@@ -104,7 +104,7 @@ class LoadedPolicy:
             mask: Which actions are allowed: [choices] bool or int8, as `info["action_mask"]` has it, or [n, choices]. If the
                 policy was trained with masks in its Dict observations, they are read there. None: all are allowed.
 
-        Raises `UsageError` if the observation is not of the space, not finite, or of another number of copies than `start`.
+        Raises `UsageError` if the observation is not of the space, not finite, or of another number of copies than `reset`.
 
         >>> import millrace
         >>> policy = millrace.load(run)
@@ -140,9 +140,9 @@ class LoadedPolicy:
         if not self.spec.state_size:
             return zero_state(self.spec, 1, n)
         if self._state is None:
-            raise UsageError(f"{self!r} is recurrent: call start({n}) before the first observation of an episode")
+            raise UsageError(f"{self!r} is recurrent: call reset({n}) before the first observation of an episode")
         if self._state.shape[1] != n:
-            raise UsageError(f"{self!r}: expected {self._state.shape[1]} observations, as in start, got {n}")
+            raise UsageError(f"{self!r}: expected {self._state.shape[1]} observations, as in reset, got {n}")
         if first is not None:
             begins = np.asarray(first, bool)
             if begins.shape not in ((), (n,)):

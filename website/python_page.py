@@ -62,14 +62,14 @@ GROUPS = {
         "Algorithms",
         "What an algorithm of your own derives from. Importing `millrace.algorithms` imports PyTorch.",
         "algorithms.Algorithm algorithms.GradientDescent algorithms.ActorCritic algorithms.OffPolicy algorithms.Continuous "
-        "algorithms.Clones algorithms.PPO algorithms.A2C algorithms.Impala algorithms.REINFORCE algorithms.DQN "
+        "algorithms.Clones algorithms.PPO algorithms.A2C algorithms.IMPALA algorithms.REINFORCE algorithms.DQN "
         "algorithms.SAC algorithms.TD3 testing.check_algorithm testing.AlgorithmMistakes",
     ),
     "algorithm_settings": Group(
         "Settings of algorithms",
         "The records to derive `Config` from. [Settings](../settings.md) lists what they hold.",
         "algorithms.AlgorithmConfig algorithms.ActorCriticConfig algorithms.OffPolicyConfig algorithms.ContinuousConfig "
-        "algorithms.PPOConfig algorithms.A2CConfig algorithms.ImpalaConfig algorithms.REINFORCEConfig algorithms.DQNConfig "
+        "algorithms.PPOConfig algorithms.A2CConfig algorithms.IMPALAConfig algorithms.REINFORCEConfig algorithms.DQNConfig "
         "algorithms.SACConfig algorithms.TD3Config algorithms.Free algorithms.Adaptable algorithms.Fixed",
     ),
     "algorithm_data": Group(
@@ -97,7 +97,7 @@ GROUPS = {
     ),
 }
 """The groups, by the names of their pages"""
-WITHOUT_MEMBERS = ("Config", ".PPO", ".A2C", ".Impala", ".REINFORCE", ".DQN", ".SAC", ".TD3")
+WITHOUT_MEMBERS = ("Config", ".PPO", ".A2C", ".IMPALA", ".REINFORCE", ".DQN", ".SAC", ".TD3")
 """Ends of names whose members are on another page, or are those of a base"""
 
 

@@ -11,16 +11,16 @@ import numpy as np
 from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
 from learner.algorithms.minibatches import Observations, log_probs
 from learner.algorithms.returns import EpisodeEnds, vtrace
-from learner.config.hyperparameters import ImpalaConfig
+from learner.config.hyperparameters import IMPALAConfig
 from protocol.arrays import Floats
 from protocol.rollout import Batch
 
 
-class Impala(ActorCritic):
+class IMPALA(ActorCritic):
     """The policy gradient with V-trace, which is computed anew in each epoch."""
 
-    Config = ImpalaConfig
-    config: ImpalaConfig
+    Config = IMPALAConfig
+    config: IMPALAConfig
     estimates_each_epoch = True
 
     def standardizes_advantages(self) -> bool:

@@ -27,7 +27,7 @@ ALGORITHMS = {
     "ppo": "learner.algorithms.ppo:PPO",
     "a2c": "learner.algorithms.a2c:A2C",
     "dqn": "learner.algorithms.dqn:DQN",
-    "impala": "learner.algorithms.impala:Impala",
+    "impala": "learner.algorithms.impala:IMPALA",
     "reinforce": "learner.algorithms.reinforce:REINFORCE",
     "sac": "learner.algorithms.sac:SAC",
     "td3": "learner.algorithms.td3:TD3",

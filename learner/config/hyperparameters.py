@@ -129,7 +129,7 @@ class A2CConfig(RecurrentConfig, frozen=True):
     """Normalize the advantages of each batch to mean 0 and standard deviation 1."""
 
 
-class ImpalaConfig(RecurrentConfig, frozen=True):
+class IMPALAConfig(RecurrentConfig, frozen=True):
     """Actor-critic with V-trace, which corrects for rollouts of older weights, max_lag above 0 (Espeholt et al. 2018)."""
 
     rollout_steps: Free[Count] = 32
@@ -298,7 +298,7 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
     "ppo": PPOConfig,
     "a2c": A2CConfig,
     "dqn": DQNConfig,
-    "impala": ImpalaConfig,
+    "impala": IMPALAConfig,
     "reinforce": REINFORCEConfig,
     "sac": SACConfig,
     "td3": TD3Config,

@@ -84,7 +84,7 @@ def test_it_acts_as_an_evaluation_does_bit_for_bit(name: str, copies: int, tmp_p
     unflatten = make_unflatten(run.env.make().observation_space)
     episodes = played(folder, copies)
     policy = millrace.load(folder)
-    policy.start(copies)
+    policy.reset(copies)
     compared = 0
     for t in range(max(len(actions) for _, actions in episodes)):
         batch = observations(episodes, t, unflatten)
@@ -120,7 +120,7 @@ def test_sampled_actions_are_those_of_a_recording_with_the_same_seed(tmp_path: P
     policy = millrace.load(folder, deterministic=False, seed=0)
     for seed in (3, 8):
         ((leaves, actions),) = played(folder, 1, greedy=False, seed=seed)
-        policy.start(seed=seed)
+        policy.reset(seed=seed)
         assert [int(policy(obs)) for obs in leaves[0][:-1]] == actions.tolist()
     greedy = millrace.load(folder)
     assert [int(greedy(obs)) for obs in leaves[0][:-1]] != actions.tolist()
@@ -144,21 +144,21 @@ def test_the_best_policy_is_another_file(tmp_path: Path) -> None:
     assert millrace.load(folder, best=True)(obs) != millrace.load(folder)(obs)
 
 
-def test_a_recurrent_policy_says_that_it_must_be_started_and_how(tmp_path: Path) -> None:
+def test_a_recurrent_policy_says_that_it_must_be_reset_first_and_how(tmp_path: Path) -> None:
     policy = millrace.load(folder_of(run_of("CartPole-v1", core="lstm", core_size=8), tmp_path))
-    with pytest.raises(millrace.UsageError, match=r"recurrent: call start\(3\) before the first observation"):
+    with pytest.raises(millrace.UsageError, match=r"recurrent: call reset\(3\) before the first observation"):
         policy(np.zeros((3, 4)))
-    policy.start(2)
-    with pytest.raises(millrace.UsageError, match="expected 2 observations, as in start, got 3"):
+    policy.reset(2)
+    with pytest.raises(millrace.UsageError, match="expected 2 observations, as in reset, got 3"):
         policy(np.zeros((3, 4)))
-    with pytest.raises(millrace.UsageError, match="start: copies: expected int >= 1, got 0"):
-        policy.start(0)
+    with pytest.raises(millrace.UsageError, match="reset: copies: expected int >= 1, got 0"):
+        policy.reset(0)
 
 
 def test_first_begins_an_episode_in_these_copies_only(tmp_path: Path) -> None:
     run = run_of("Pendulum-v1", core="gru", core_size=8)
     policy, obs = millrace.load(folder_of(run, tmp_path)), np.array([[0.5, -0.5, 2.0], [1.0, 0.0, -1.0]], np.float32)
-    policy.start(2)
+    policy.reset(2)
     begun, later = policy(obs), policy(obs)
     with pytest.raises(millrace.UsageError, match=r"first: expected a bool, or \[2\] of them, got shape \[3\]"):
         policy(obs, first=[True] * 3)

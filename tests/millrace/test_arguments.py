@@ -99,7 +99,7 @@ def doors(run: millrace.Run) -> list[Door]:
         (run.plot, {"out"}, {}),
         (millrace.Run, {"path"}, {}),
         (millrace.load, names(millrace.load), {"run": run}),
-        (policy.start, {"copies", "seed"}, {}),
+        (policy.reset, {"copies", "seed"}, {}),
         (millrace.PolicyParameters(policy.spec).initial, {"seed"}, {}),
         (mlp, {"width", "activation", "normalize_observations"}, {}),
         (recurrent, {"width", "core", "core_size"}, {}),

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from learner.algorithms.actor_critic import ActorCritic
 from learner.algorithms.dqn import DQN
-from learner.algorithms.impala import Impala
+from learner.algorithms.impala import IMPALA
 from learner.algorithms.kernels import trained_networks
 from learner.algorithms.minibatches import Minibatch, log_probs
 from learner.algorithms.ppo import PPO
 from learner.algorithms.replay import replay_buffer
-from learner.config.hyperparameters import DQNConfig, ImpalaConfig, PPOConfig
+from learner.config.hyperparameters import DQNConfig, IMPALAConfig, PPOConfig
 from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
@@ -219,7 +219,7 @@ def _theirs(name: str) -> str:
 
 
 def test_the_ratio_of_impala_is_1_under_the_policy_that_acted() -> None:
-    algorithm = Impala(ImpalaConfig(), spec_of("multidiscrete"), total_steps=10_000, seed=0)
+    algorithm = IMPALA(IMPALAConfig(), spec_of("multidiscrete"), total_steps=10_000, seed=0)
     rows = masked_batch(algorithm, 1)
     found = log_probs(algorithm.net, algorithm.observations(rows), rows, no_pulse)
     np.testing.assert_allclose(found[rows.valid], rows.log_prob[rows.valid], atol=1e-5)

@@ -10,10 +10,10 @@ import torch
 
 from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.impala import Impala
+from learner.algorithms.impala import IMPALA
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.returns import EpisodeEnds
-from learner.config.hyperparameters import A2CConfig, ImpalaConfig
+from learner.config.hyperparameters import A2CConfig, IMPALAConfig
 from protocol.arrays import Array
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
@@ -26,9 +26,9 @@ from tests.support.numbers.steps import Errors, only_step, usual_distribution, w
 GAMMA = 0.9
 
 
-def impala(spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Impala:
+def impala(spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> IMPALA:
     settings = {"max_grad_norm": 1e9, **settings}
-    return Impala(ImpalaConfig(gamma=GAMMA, **settings), spec, total_steps=10_000, seed=seed)
+    return IMPALA(IMPALAConfig(gamma=GAMMA, **settings), spec, total_steps=10_000, seed=seed)
 
 
 @pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN), shared(DISCRETE)])
@@ -60,7 +60,7 @@ def largest_differences(found: Estimates, advantage: Array, target: Array) -> Er
     return Errors(*(float(np.abs(one - other)[found.used].max()) for one, other in pairs))
 
 
-def log_prob_error(algorithm: Impala, rows: Batch) -> float:
+def log_prob_error(algorithm: IMPALA, rows: Batch) -> float:
     """How far two float32 log-probabilities of the actions of this batch may differ under the algorithm's weights."""
     x = algorithm.observations(rows).features[: rows.valid.size].double()
     action, exact = in_double(torch.from_numpy(rows.action).flatten(0, 1)), in_float64(algorithm.net)
