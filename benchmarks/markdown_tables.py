@@ -1,4 +1,4 @@
-"""Markdown tables: of docs/results.md and of the pages that `website` makes. Pure."""
+"""Markdown tables: of docs/explanation/results.md and of the pages that `website` makes. Pure."""
 
 from __future__ import annotations
 

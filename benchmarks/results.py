@@ -1,8 +1,8 @@
-"""Adds runs to benchmarks/scores.json, and writes the tables of docs/results.md: `python -m benchmarks.results RUN ...`.
+"""Adds runs to benchmarks/scores.json, and writes the tables of docs/explanation/results.md from it.
 
-Without runs it only writes the tables. For each run it takes the best policy of the run's own evaluations, evaluated again
-on 100 other episodes, and the final policy. If a run's own evaluations had fewer episodes, the policies are evaluated here.
-Runs that differ only in their seed form one row.
+`python -m benchmarks.results RUN ...`; without runs it only writes the tables. For each run it takes the best policy of the
+run's own evaluations, evaluated again on 100 other episodes, and the final policy. If a run's own evaluations had fewer
+episodes, the policies are evaluated here. Runs that differ only in their seed form one row.
 """
 
 from __future__ import annotations
@@ -16,7 +16,16 @@ from pathlib import Path
 import msgspec
 
 from benchmarks.programs import flag
-from benchmarks.scores import EPISODES, Score, all_scores, comparison, merged, read_published, read_scores, write_scores
+from benchmarks.scores import (
+    EPISODES,
+    Score,
+    commands_table,
+    merged,
+    read_published,
+    read_scores,
+    returns_table,
+    write_scores,
+)
 from learner.config.config import TABLES, Config
 from learner.config.layers import config_of_run, resolve
 from learner.config.presets import added, environment_name
@@ -26,8 +35,8 @@ from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder, Which
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 
-PAGE = Path(__file__).parents[1] / "docs" / "results.md"
-TABLES_OF_PAGE = re.compile(r"^\| environment \| algorithm \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
+PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "results.md"
+TABLES_OF_PAGE = re.compile(r"^\| (?:environment|seconds) \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
 OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
 NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
 EVALUATION = ("eval_every", "eval_episodes")
@@ -94,7 +103,7 @@ def _words(name: str, value: object, default: object) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="scores.json and docs/results.md from run folders")
+    parser = argparse.ArgumentParser(description="scores.json and docs/explanation/results.md from run folders")
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--only-final", action="store_true", help="leave the best policies of the runs' evaluations out")
     flags = parser.parse_args()
@@ -106,7 +115,7 @@ def main() -> None:
             scores[score.command] = merged(scores.get(score.command), score)
     write_scores(scores.values())
     written = read_scores()
-    tables = iter((all_scores(written), comparison(written, read_published())))
+    tables = iter((returns_table(written, read_published()), commands_table(written)))
     PAGE.write_text(TABLES_OF_PAGE.sub(lambda old: next(tables), PAGE.read_text()))
     print(PAGE)
 

@@ -5,7 +5,6 @@ Run folders are not kept in the repository; what tables need of them is. `python
 
 from __future__ import annotations
 
-import statistics
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -38,10 +37,6 @@ class Score(msgspec.Struct, kw_only=True, omit_defaults=True):
     """versions of the packages that decide the results, if they are the same for all seeds"""
     note: str = ""
     """what else a reader must know of the row"""
-
-    def mean(self) -> float:
-        """Mean over the seeds, of the final policies."""
-        return statistics.fmean(self.final.values())
 
 
 class PublishedScore(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
@@ -109,20 +104,9 @@ def seeds_text(returns: dict[int, float]) -> str:
     return f"{text} (seed {which} only)" if len(returns) == 1 else f"{text} (seeds {which})"
 
 
-def all_scores(scores: Iterable[Score]) -> str:
-    """The first table of docs/results.md: every score, and the command that repeats it."""
-    head = ("environment", "algorithm", "env steps", "best", "final", "seconds", "command (for each seed)")
-    rows = []
-    for score in scores:
-        seconds = "–" if score.seconds is None else f"{score.seconds:.0f}"
-        env = f"{score.env}, {score.note}" if score.note else score.env
-        returns = seeds_text(score.best), seeds_text(score.final)
-        rows.append((env, score.algo, f"{score.env_steps:,}", *returns, seconds, f"`{score.command}`"))
-    return table(head, rows)
-
-
-def comparison(scores: Iterable[Score], published: Sequence[PublishedScore]) -> str:
-    """The second table of docs/results.md: the scores for which others have published one of the same algorithm."""
+def returns_table(scores: Iterable[Score], published: Sequence[PublishedScore]) -> str:
+    """The first table of docs/explanation/results.md: our returns, and those that others published of the same algorithm."""
+    head = ("environment", "algorithm", "env steps", "final policy", "best policy", "published (env steps)")
     rows = []
     for score in scores:
         others = [
@@ -130,7 +114,13 @@ def comparison(scores: Iterable[Score], published: Sequence[PublishedScore]) -> 
             for other in published
             if (other.env, other.algo) == (score.env, score.algo)
         ]
-        if others:
-            ours = f"{return_text(score.mean())} ({steps_text(score.env_steps)})"
-            rows.append((score.env, score.algo, ours, ", ".join(others)))
-    return table(("environment", "algorithm", "millrace", "published"), rows)
+        env = f"{score.env}, {score.note}" if score.note else score.env
+        returns = seeds_text(score.final), seeds_text(score.best)
+        rows.append((env, score.algo, steps_text(score.env_steps), *returns, ", ".join(others)))
+    return table(head, rows)
+
+
+def commands_table(scores: Iterable[Score]) -> str:
+    """The second table of docs/explanation/results.md: the command of each score, and how long it took."""
+    rows = [("–" if score.seconds is None else f"{score.seconds:.0f}", f"`{score.command}`") for score in scores]
+    return table(("seconds", "command"), rows)

@@ -10,7 +10,7 @@ import posixpath
 from collections.abc import Callable
 from pathlib import Path
 
-from website import commands_page, leaderboard_page, metrics_page, python_page, settings_page
+from website import commands_page, metrics_page, python_page, settings_page
 from website.links import Link, elsewhere, resolved, with_links
 
 ROOT = Path(__file__).parent.parent
@@ -24,7 +24,6 @@ FROM_ELSEWHERE = {
 START = {"docs": "index.md"}
 """What links to these files becomes a link to this page."""
 MADE: dict[str, Callable[[], str]] = {
-    "leaderboard.md": leaderboard_page.page,
     **python_page.pages(),
     "reference/settings.md": settings_page.page,
     "reference/commands.md": commands_page.page,

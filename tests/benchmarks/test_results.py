@@ -1,4 +1,4 @@
-"""docs/results.md has the table of benchmarks/scores.json, and the commands of the scores parse."""
+"""docs/explanation/results.md has the tables of benchmarks/scores.json, and the commands of the scores parse."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from benchmarks import results
 from benchmarks.scores import (
     PublishedScore,
     Score,
-    all_scores,
-    comparison,
+    commands_table,
     merged,
     read_published,
     read_scores,
+    returns_table,
     seeds_text,
     write_scores,
 )
@@ -30,17 +30,18 @@ SCORES = read_scores()
 
 def test_the_page_has_the_tables_of_the_scores() -> None:
     text = results.PAGE.read_text()
-    assert f"\n\n{all_scores(SCORES)}\n" in text
-    assert f"\n\n{comparison(SCORES, read_published())}\n" in text
+    assert f"\n\n{returns_table(SCORES, read_published())}\n" in text
+    assert f"\n\n{commands_table(SCORES)}\n" in text
 
 
 def test_scores_are_compared_with_those_of_the_same_environment_and_algorithm() -> None:
-    score = Score(env="A-v5", algo="ppo", command="", env_steps=998_915, final={1: 10.0, 2: 30.0})
+    score = Score(env="A-v5", algo="ppo", command="", env_steps=998_915, final={1: 10.0, 3: 30.0})
     rows = (("A-v5", "ppo", 25.0, 1_000_000), ("A-v5", "sac", 99.0, 300_000), ("B-v5", "ppo", 98.0, 1))
     published = [
         PublishedScore(env=env, algo=algo, system="X", returns=value, env_steps=steps) for env, algo, value, steps in rows
     ]
-    assert comparison([score], published).splitlines()[2:] == ["| A-v5 | ppo | 20.0 (1M) | X 25.0 (1M) |"]
+    (row,) = returns_table([score], published).splitlines()[2:]
+    assert row == "| A-v5 | ppo | 1M | 10.0, 30.0 (seeds 1, 3) | – | X 25.0 (1M) |"
 
 
 def test_the_file_is_as_the_program_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ def written() -> dict[str, str]:
     """The text of each page that someone wrote, by its path in the repository."""
     paths = [
         *ROOT.glob("docs/**/*.md"),
-        *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")),
+        *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/README.md")),
     ]
     paths += [ROOT / "protocol" / "README.md"]
     return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in sorted(paths)}

@@ -145,7 +145,7 @@ def test_every_command_is_on_its_page() -> None:
 
 
 def test_every_exit_code_of_an_error_is_on_its_page() -> None:
-    page = (ROOT / "docs/reference/exit_codes.md").read_text()
+    page = (ROOT / "docs/how-to/troubleshooting.md").read_text()
     for name in millrace.__all__:
         error = getattr(errors, name, None)
         if isinstance(error, type) and issubclass(error, UserFacingError) and error is not UserFacingError:
