@@ -45,7 +45,7 @@ class OwnPolicy:
     episode begins; if the object keeps nothing else between its calls, results do not depend on the number of workers. An
     action is whole numbers that count from 0, or float32, which is clipped to the space after it was stored. If the
     environment has action masks, `act` also gets `mask=` [N, choices] bool, and must choose what it allows.
-    `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_policy.md has more.
+    `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_learner.md has more.
     """
 
     factory: str | Callable[..., object]

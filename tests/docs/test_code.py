@@ -25,7 +25,7 @@ DEADLINE_S = 100
 FILE_NAME = re.compile(r"^# (\w+\.py)\b")
 FRAGMENT = "# fragment"
 QUICK = {
-    "docs/explanation/rows.md", "docs/how-to/own_policy.md", "docs/how-to/simulators.md",
+    "docs/explanation/rows.md", "docs/how-to/simulators.md",
     "docs/tutorial/your_environment.md",
 }  # fmt: skip
 """Pages that take a second or two. They run in `make test`, too."""
