@@ -58,10 +58,12 @@ class LoadedPolicy:
         saved = saved_policy(run, "best" if best else "final")
         self.spec: PolicySpec = saved.spec
         """The observations, the actions and the network, as plain data."""
-        self.parameters, self.buffers = saved.parameters, saved.buffers
-        """Flat float32 vectors [P] and [2 D], as `RolloutService.publish` takes them: a learner of your own can start from
-        this policy. `PolicyParameters(policy.spec)` names their pieces. `buffers` is empty if nothing is normalized.
+        self.parameters: Floats = saved.parameters
+        """The flat float32 vector [P] that `RolloutService.publish` takes: a learner of your own can start from this policy.
+        `PolicyParameters(policy.spec)` names its pieces.
         """
+        self.buffers: Floats = saved.buffers
+        """Mean and standard deviation of the observations, flat float32 [2 D], likewise; empty if none are normalized."""
         self._name = f"{saved.env.id}, {'best' if best else 'newest'} policy"
         self._policy = make_policy(saved.spec)
         self._policy.load(saved.parameters, saved.buffers)
