@@ -66,7 +66,7 @@ docs: .venv/installed-dev  ## write the generated parts of protocol/README.md, a
 
 site: .venv/installed-docs  ## build the documentation in site/: warnings are errors, links are checked, every block of code runs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
-	$(BIN)/python -m pytest --numprocesses $$(nproc) -m 'docs or not docs' tests/docs
+	$(BIN)/python -m pytest --numprocesses $$(nproc) -m 'docs or not docs' tests/docs tests/millrace/test_notebook.py
 
 dist: .venv/installed-dev  ## build sdist and wheel in dist/, install each into a clean environment, and train from there
 	$(BIN)/python -m tests.distributions

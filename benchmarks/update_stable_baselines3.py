@@ -34,6 +34,7 @@ OFF_POLICY = {"SAC": (SAC, SACConfig, TheirSAC), "TD3": (TD3, TD3Config, TheirTD
 OBSERVATION = (Leaf("", "box", (4,), "float32"),)
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
 COPIES, NEVER = 8, 10**9
+PLAYED = 500  # transitions that Stable-Baselines3 draws from; it learns nothing while it collects them
 STEPS = 8  # gradient steps, or updates, that are timed together
 
 
@@ -78,13 +79,13 @@ def dqn(width: int, target: float) -> Contest:
         gymnasium.make("CartPole-v1"),
         batch_size=rows,
         buffer_size=size,
-        learning_starts=0,
+        learning_starts=PLAYED,
         max_grad_norm=10,
         policy_kwargs={"net_arch": [width, width]},
         target_update_interval=NEVER,
         device="cpu",
     )
-    theirs.learn(500)
+    theirs.learn(PLAYED)
     runs = {
         "peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS,
         "graph": ours(True),
@@ -115,11 +116,11 @@ def continuous(name: str, width: int, target: float | None) -> Contest:
         gymnasium.make("Pendulum-v1"),
         batch_size=rows,
         buffer_size=size,
-        learning_starts=0,
+        learning_starts=PLAYED,
         policy_kwargs={"net_arch": [width, width]},
         device="cpu",
     )
-    theirs.learn(500)
+    theirs.learn(PLAYED)
     runs = {
         "peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS,
         "graph": ours(True),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import Enum
+from functools import cache
 from types import NoneType
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
@@ -39,6 +40,7 @@ class Change(NamedTuple):
     given: Any
 
 
+@cache
 def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str, OnResume]:
     """How a resumed run takes each setting of a record, in the order of its fields.
 

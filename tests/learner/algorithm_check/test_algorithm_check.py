@@ -243,16 +243,17 @@ MISTAKES: list[tuple[type, str]] = [
 @pytest.mark.parametrize(("planted", "says"), MISTAKES, ids=lambda value: getattr(value, "__name__", ""))
 def test_a_planted_mistake_is_found(planted: type, says: str) -> None:
     with pytest.raises(AlgorithmMistakes) as caught:
-        check_algorithm(planted, learns=False, normalize_observations=True, **SMALL)
+        check_algorithm(planted, learns=False, normalize_observations=True, **SMALL | {"rollout_steps": 8})
     assert any(says in line for line in caught.value.mistakes), caught.value.mistakes
     assert str(caught.value).splitlines() == [f"{planted.__name__}: {line}" for line in caught.value.mistakes]
     assert isinstance(caught.value, AssertionError)
     assert isinstance(caught.value, MillraceError)
 
 
-def test_an_algorithm_that_does_not_learn_is_found() -> None:
+def test_an_algorithm_that_does_not_learn_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("learner.algorithm_check.mistakes.LEARNING_STEPS", 4_000)
     with pytest.raises(
-        AlgorithmMistakes, match=r"does not learn the identity environment: after 40,\d+ env steps the mean"
+        AlgorithmMistakes, match=r"does not learn the identity environment: after 4,\d+ env steps the mean"
     ) as caught:
         check_algorithm(LearnsTheOpposite, **SMALL)
     assert len(caught.value.mistakes) == 1, "all else is right"
@@ -284,7 +285,7 @@ class OtherLoss(PPO):
 
 
 def test_a_subclass_of_ppo_need_not_log_what_ppo_logs() -> None:
-    check_algorithm(OtherLoss, learns=False, **SMALL)
+    check_algorithm(OtherLoss, learns=False, **SMALL | {"rollout_steps": 8})
     with pytest.raises(AlgorithmMistakes) as caught:
         check_algorithm(OtherLoss, learns=False, target_kl=0.01, **SMALL)
     says = "OtherLoss.loss: target_kl needs approx_kl among the numbers that it logs, got loss, grad_norm; log "

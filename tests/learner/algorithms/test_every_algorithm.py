@@ -68,6 +68,8 @@ def subject_of(name: str, spec: PolicySpec, settings: dict[str, Any], masks: boo
     kind, config = algorithm_class(name), msgspec.convert(settings, HYPERPARAMETERS[name])
     policy = kind.policy_spec(config, spec.observation, spec.action) if name in STEPS else spec
     steps = T if spec.core is None else 6  # each is many small steps of the core
+    if len(spec.observation) > 1 and name not in STEPS:
+        steps = T // 2  # images
     subject = Subject(kind, config, policy, steps, ())
     acting: Any = subject.new()
     rows = (masked_batch(acting, seed) if masks else batch(acting, seed, seed == 0, steps) for seed in range(4))

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.conversation.fake_ends import Faults, World
 
-BLOCKS, CASES = 8, 250
+BLOCKS, CASES = 25, 80
 
 
 def case(seed: int) -> World:

@@ -364,7 +364,7 @@ def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_sample_of_damages(whole: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
-    counts = check(whole, tmp_path, name, cuts=5, flips=5, caplog=caplog, count=6)
+    counts = check(whole, tmp_path, name, cuts=3, flips=3, caplog=caplog, count=4)
     sys.stdout.write(f"\n{name}: {dict(sorted(counts.items()))}\n")
     assert counts.total() >= 12 * len(FILES[name])
 

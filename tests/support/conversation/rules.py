@@ -25,12 +25,14 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
     rollouts, members, ledger = coordinator.rollouts, coordinator.members, coordinator.rollouts.ledger
     check_ledger(coordinator)
     assert ledger.outstanding <= len(rollouts.lanes) * (1 + max_lag), "more tickets than the bound allows"
-    for lane in rollouts.lanes:
-        owners = [member.peer for member in members.values() if lane.number in member.lanes]
-        assert owners == ([] if lane.owner is None else [lane.owner]), "a lane has two owners, or its owner does not know"
-        mine = {number for number, each in rollouts.held.items() if each.lane == lane.number}
-        assert mine == lane.outstanding, "a lane does not know its tickets"
-        assert not lane.due or lane.number in rollouts._to_deal, "a lane gets no more tickets"
+    owners = sorted((number, member.peer) for member in members.values() for number in member.lanes)
+    known = [(lane.number, lane.owner) for lane in rollouts.lanes if lane.owner is not None]
+    assert owners == known, "a lane has two owners, or its owner does not know"
+    mine: list[set[int]] = [set() for _ in rollouts.lanes]
+    for number, each in rollouts.held.items():
+        mine[each.lane].add(number)
+    assert mine == [lane.outstanding for lane in rollouts.lanes], "a lane does not know its tickets"
+    assert all(not lane.due or lane.number in rollouts._to_deal for lane in rollouts.lanes), "a lane gets no more tickets"
     for number, each in rollouts.held.items():
         assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
         assert rollouts.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
