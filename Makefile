@@ -60,9 +60,10 @@ soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; the
 	$(BIN)/python -m tests.system.random_faults.soak --minutes $(MINUTES)
 	$(BIN)/python -m pytest -m soak tests
 
-docs: .venv/installed-dev  ## write the generated parts of protocol/README.md, and millrace/keywords.py
+docs: .venv/installed-dev  ## write what is made from the code: parts of protocol/README.md, millrace/keywords.py, three reference pages
 	$(BIN)/python -m tests.protocol.test_wire_document
 	$(BIN)/python -m tests.millrace.test_keywords
+	$(BIN)/python -m website.pages
 
 site: .venv/installed-docs  ## build the documentation in site/: warnings are errors, links are checked, every block of code runs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

@@ -25,11 +25,14 @@ START = {"docs": "index.md"}
 """What links to these files becomes a link to this page."""
 MADE: dict[str, Callable[[], str]] = {
     **python_page.pages(),
+}
+"""Pages that are made from the code when the site is built: path in the site -> what makes it"""
+KEPT: dict[str, Callable[[], str]] = {
     "reference/settings.md": settings_page.page,
     "reference/commands.md": commands_page.page,
     "reference/metrics.md": metrics_page.page,
 }
-"""Pages that are made from the code: path in the site -> what makes it"""
+"""Pages that are made from the code and kept in docs/, so that links lead to them in the repository too"""
 
 
 class DeadLink(Exception):
@@ -76,3 +79,8 @@ def as_code(text: str, path: str) -> str:
     """What stands in place of a link to a file: its path, after the text of the link if that says more."""
     name = text.strip("`")
     return f"`{path}`" if name in (path, posixpath.basename(path), f"{path}/") else f"{text} (`{path}`)"
+
+
+if __name__ == "__main__":  # python -m website.pages: `make docs`
+    for kept, make in KEPT.items():
+        (ROOT / "docs" / kept).write_text(make(), encoding="utf-8")

@@ -24,7 +24,7 @@ from protocol.errors import UserFacingError
 from tests.learner.algorithms.cloning.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
 from website import commands_page, python_page, settings_page
 from website.doctest_fences import with_fences
-from website.pages import ROOT
+from website.pages import KEPT, ROOT
 
 KNOWN = {name for group in METRICS.values() for name in group}
 RUNS: dict[str, dict[str, Any]] = {
@@ -166,3 +166,8 @@ def test_every_file_of_a_run_folder_is_on_its_page() -> None:
 def test_examples_in_docstrings_become_code() -> None:
     text = "About.\n\n>>> x = 1\n>>> x\n1\n\nMore.\n\n    >>> y"
     assert with_fences(text) == ("About.\n\n```pycon\n>>> x = 1\n>>> x\n1\n```\n\nMore.\n\n    ```pycon\n    >>> y\n    ```")
+
+
+@pytest.mark.parametrize("page", KEPT)
+def test_a_page_that_is_kept_is_that_of_the_code(page: str) -> None:
+    assert (ROOT / "docs" / page).read_text("utf-8") == KEPT[page](), "write it by `make docs`"
