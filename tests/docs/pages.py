@@ -11,6 +11,7 @@ from website.pages import FROM_ELSEWHERE, MADE, ROOT
 
 WITHOUT_CHECKS_OF_COMMANDS = {"CHANGELOG.md"}
 """Pages that also name what was there once"""
+COMMENT = re.compile(r"<!-- (.*) -->")
 
 
 class Block(NamedTuple):
@@ -20,6 +21,8 @@ class Block(NamedTuple):
     """of the page, at which its first line stands, from 1"""
     language: str
     text: str
+    about: str
+    """what the comment in the line before it says, which readers do not see"""
 
 
 @cache
@@ -65,7 +68,8 @@ def blocks(text: str) -> list[Block]:
         elif FENCE.match(line) and line.strip().strip("`~") == "":
             indent = " " * (len(line) - len(line.lstrip()))  # of a tab or a list
             inside = [text.removeprefix(indent) for text in lines[opened[0] : number - 1]]
-            found.append(Block(opened[0] + 1, opened[1], "\n".join(inside)))
+            about = COMMENT.fullmatch(lines[opened[0] - 2].strip()) if opened[0] > 1 else None
+            found.append(Block(opened[0] + 1, opened[1], "\n".join(inside), about[1] if about else ""))
             opened = None
     return found
 

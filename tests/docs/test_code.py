@@ -1,7 +1,7 @@
 """Every block of Python in README.md and docs/ runs: the blocks of a page in their order, as one program.
 
 Rule: a block whose first line is `# NAME.py` is also the file of that name, for the blocks after it. A block that needs an
-extra that is not installed ends the page with a skip. A block that begins with `# fragment` is not run.
+extra that is not installed ends the page with a skip. A block below the comment `<!-- fragment -->` is not run.
 
 Each page is a program of its own in a folder of its own, and has a deadline. Pages that take seconds run in `make site`.
 """
@@ -23,7 +23,7 @@ from website.pages import ROOT
 
 DEADLINE_S = 100
 FILE_NAME = re.compile(r"^# (\w+\.py)\b")
-FRAGMENT = "# fragment"
+FRAGMENT = "fragment"
 QUICK = {
     "docs/explanation/rows.md", "docs/how-to/simulators.md",
     "docs/tutorial/your_environment.md",
@@ -33,7 +33,7 @@ QUICK = {
 
 def python_blocks(text: str) -> list[pages.Block]:
     found = [block for block in pages.blocks(text) if block.language.split(" ")[0] == "python"]
-    return [block for block in found if not block.text.lstrip().startswith(FRAGMENT)]
+    return [block for block in found if not block.about.startswith(FRAGMENT)]
 
 
 def program(text: str) -> str:
@@ -102,7 +102,7 @@ def test_a_block_that_raises_is_found(tmp_path: Path) -> None:
 def test_blocks_share_names_and_files(tmp_path: Path) -> None:
     text = (
         "```python\n# own.py\nx = 1\n```\n```python\nimport own\nassert own.x == x\n```\n"
-        "```python\n# fragment\nno_such_name\n```\n```text\nnothing\n```\n"
+        "<!-- fragment: why -->\n```python\nno_such_name\n```\n```text\nnothing\n```\n"
         '=== "In a tab"\n\n    ```python\n    if x:\n        x = 2\n    ```\n'
     )
     assert run_page("docs/page.md", text, tmp_path) == ""
