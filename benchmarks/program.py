@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
     failed, all_began_s = [], time.monotonic()
     for each in [name] if name else BENCHMARKS:
         if not name and BENCHMARKS[each].peers and importlib.util.find_spec("stable_baselines3") is None:
-            print(f"{each}: left out, Stable-Baselines3 is not installed (pip install 'millrace-rl[peers]')", flush=True)
+            print(f"{each}: left out, Stable-Baselines3 is not installed (pip install stable-baselines3)", flush=True)
             continue
         began_s = time.monotonic()
         command = [

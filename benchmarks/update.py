@@ -1,7 +1,7 @@
 """Updates of the learner against the usual style and Stable-Baselines3: `python -m benchmarks.update`.
 
 One process, one thread; see `contest.py` for how it is timed, and the two files beside it for what the work is. Without
-Stable-Baselines3 (`pip install millrace-rl[peers]`) the comparison with it is left out, and a line says so.
+Stable-Baselines3 (`pip install stable-baselines3`) the comparison with it is left out, and a line says so.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A sweep with optuna: each trial trains several seeds, and is pruned between its evaluations if others were better.
 
-    pip install 'millrace-rl[optuna]'
+    pip install optuna
     python examples/optuna_sweep.py
 
 A trial's value is the mean return over its seeds. The seeds run one after another; at each evaluation optuna sees the mean

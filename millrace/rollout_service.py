@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Self, Unpack
 import gymnasium
 import numpy as np
 
+from learner.config.other_names import in_place_of
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import convert_rollout_settings
 from learner.interrupts import Interrupts
@@ -451,7 +452,8 @@ def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, A
     """The settings as a record, checked. Raises `UsageError`."""
     known = RolloutConfig.__struct_fields__
     if unknown := [name for name in settings if name not in known]:
-        raise UsageError(f"rollout service: unknown setting {unknown[0]}{did_you_mean(unknown[0], known)}")
+        hint = in_place_of(unknown[0], settings[unknown[0]], known) or did_you_mean(unknown[0], known)
+        raise UsageError(f"rollout service: unknown setting {unknown[0]}{hint}")
     plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in settings.items()}
     given = {**plain, "env": remembered_name(env), "wrappers": wrapper_names(wrappers)}
     if not given.get("bind"):

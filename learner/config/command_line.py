@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 from learner.config.config import Config
-from learner.config.hyperparameters import algorithms_with
 from learner.config.layers import lower_layers, override
+from learner.config.other_names import in_place_of
 from learner.config.validation import validate
 from learner.run_folder.newest_run import AUTO, newest_run
 from protocol.flags.fields import Flag, fields_of
@@ -85,7 +85,8 @@ def _read_layers(command: str, argv: list[str], words: dict[str, str], resume: P
     below = partial(lower_layers, algo=words.get("algo"), file=file, resume=resume, preset=preset)
     algorithm = type(below("").algorithm)
     own = fields_of(algorithm)
-    given = given_values(fields_of(RunFlags) | own, argv, command, algorithms_with)
+    fields = fields_of(RunFlags) | own
+    given = given_values(fields, argv, command, partial(in_place_of, known=fields, flag=True))
     base = below(given.get("env", ""))
     if asks_for_help(argv):
         shown = RunFlags(**{name: getattr(base, name) for name in Config.__struct_fields__})

@@ -10,19 +10,21 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 
 from learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
 from learner.config.config import TABLES, Config
-from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
+from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.other_names import in_place_of
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
 from learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError, did_you_mean
 from protocol.flags.fields import fields_of
+from protocol.flags.values import with_whole_numbers
 
 
 def resolve(
@@ -130,7 +132,7 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
             settings[name] = _coerce(config, name, value)
         else:
             known = [setting for setting in (*settings, *algorithm) if setting != "algorithm"]
-            hint = algorithms_with(name) or did_you_mean(name, known)
+            hint = in_place_of(name, value, known) or did_you_mean(name, known)
             raise UsageError(f"{where}: unknown setting {name}{hint}")
     return convert(settings, where)
 
@@ -143,17 +145,13 @@ def _defaults_of(algo: str, where: str = "") -> Config:
 
 
 def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
-    """1e5 becomes an integer where the field is one, and "none" becomes None where the default is None."""
+    """1e5 and "1_000" become integers where the field is one, and "none" becomes None where the default is None."""
     default = getattr(type(record)(), name)
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, str) and value == "none" and default is None:
         return None
-    if isinstance(value, float) and value.is_integer():
-        kind = fields_of(type(record))[name].kind
-        options = get_args(kind) or (kind,)
-        return int(value) if int in options and float not in options else value
-    return value
+    return with_whole_numbers(fields_of(type(record))[name], value)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     vector: Free[Vector] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install 'millrace-rl[envpool]'). native and envpool use other random numbers than loop.
+    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop.
     """
     acting_dtype: Free[ActingDtype] = "float32"
     """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights that

@@ -36,7 +36,7 @@ class MinariDataset:
             from minari.dataset.minari_dataset import parse_dataset_id
             from minari.storage import get_dataset_path
         except ImportError as error:
-            raise UsageError("recording needs minari, which is an extra; pip install 'millrace-rl[record]'") from error
+            raise UsageError("recording needs minari; pip install 'minari[hdf5]'") from error
         try:
             parse_dataset_id(dataset_id)
         except (ValueError, TypeError):  # TypeError: a name without a version

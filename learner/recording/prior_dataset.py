@@ -103,7 +103,7 @@ def _open(dataset_id: str) -> Any:
         import h5py  # noqa: F401
         import minari
     except ImportError as error:
-        raise UsageError("--prior needs minari, which is an extra; pip install 'millrace-rl[record]'") from error
+        raise UsageError("--prior needs minari; pip install 'minari[hdf5]'") from error
     try:
         return minari.load_dataset(dataset_id)
     except FileNotFoundError:

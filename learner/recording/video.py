@@ -31,7 +31,7 @@ def prepare_rendering() -> None:
     try:
         import moviepy  # noqa: F401
     except ImportError as error:
-        raise UsageError("videos need moviepy, which is an extra; pip install 'millrace-rl[video]'") from error
+        raise UsageError("videos need moviepy; pip install moviepy pygame-ce") from error
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
@@ -73,7 +73,7 @@ def record_videos(
     except EnvironmentFailed as error:
         if "DependencyNotInstalled" in str(error):
             missing = str(error).rpartition("DependencyNotInstalled: ")[2].partition(";")[0]
-            line = f"environment {env_id} cannot be filmed: {missing}; pip install 'millrace-rl[video]'"
+            line = f"environment {env_id} cannot be filmed: {missing}; pip install moviepy pygame-ce"
             raise UsageError(line) from error
         raise
     except OSError as error:

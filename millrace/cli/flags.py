@@ -48,7 +48,7 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     max_steps: Count = 1_000_000
     """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
     video: bool = False
-    """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
+    """film the episodes: an mp4 of each in the folder videos of the run (pip install moviepy pygame-ce)"""
 
 
 class ListFlags(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,7 +79,7 @@ class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecordFlags(PlayFlags, frozen=True, kw_only=True):
-    """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'millrace-rl[record]')."""
+    """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'minari[hdf5]')."""
 
     out: str
     """id of the dataset, such as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
@@ -152,7 +152,7 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
 
 
 class RayFlags(LaunchFlags, frozen=True, kw_only=True):
-    """Train with workers on a Ray cluster: the learner here, each worker in an actor (pip install 'millrace-rl[ray]')."""
+    """Train with workers on a Ray cluster: the learner here, each worker in an actor (pip install ray)."""
 
     address: str = "auto"
     """address of the cluster, as HOST:PORT; auto is the environment variable RAY_ADDRESS, or the cluster of this machine"""

@@ -37,5 +37,5 @@ def _ray(argv: list[str]) -> int:
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
-        raise UsageError("launch ray: Ray is not installed; pip install 'millrace-rl[ray]'") from None
+        raise UsageError("launch ray: Ray is not installed; pip install ray") from None
     return show_run(argv, lambda watch: launch(flags, learner, watch))

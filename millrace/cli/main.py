@@ -80,7 +80,7 @@ def _exit_code(argv: list[str]) -> int:
             return _internal_error(argv, error)
         _print_error(
             f"millrace: {argv[0]} needs {error.name}, which is not installed: worker, status and keys do without; "
-            "pip install millrace-rl installs the rest"
+            "`pip install -e .` in millrace's clone installs the rest"
         )
         return _failed(argv, 2)
     except Exception as error:

@@ -17,7 +17,7 @@ RUN_TAG = "millrace.run"
 
 
 class MlflowCallback(RowCallback):
-    """Logs a run to MLflow (`pip install 'millrace-rl[mlflow]'`).
+    """Logs a run to MLflow (`pip install mlflow`).
 
     ```python
     import millrace

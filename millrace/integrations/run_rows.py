@@ -107,4 +107,4 @@ def tool(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != name:
             raise
-        raise UsageError(f"{name} is not installed: pip install 'millrace-rl[{name}]'") from None
+        raise UsageError(f"{name} is not installed: pip install {name}") from None

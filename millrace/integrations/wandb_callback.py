@@ -10,7 +10,7 @@ from millrace.integrations.run_rows import RowCallback, flat_settings, run_name,
 
 
 class WandbCallback(RowCallback):
-    """Logs a run to Weights & Biases (`pip install 'millrace-rl[wandb]'`).
+    """Logs a run to Weights & Biases (`pip install wandb`).
 
     ```python
     import millrace

@@ -65,7 +65,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
     try:
         import envpool
     except ImportError as error:
-        line = f"environment {env.id}: vector envpool needs envpool ({error}); pip install 'millrace-rl[envpool]'"
+        line = f"environment {env.id}: vector envpool needs envpool ({error}); pip install envpool"
         raise UsageError(line) from error
     known = env.registered()
     try:

@@ -88,7 +88,7 @@ def why_not_made(env_id: str, error: Exception, plugins_failed: Sequence[str] = 
     says = first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
-            return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
+            return f"environment {env_id}: Atari games need ale-py; pip install ale-py opencv-python-headless"
         case gymnasium.error.DependencyNotInstalled():
             return f"environment {env_id}: {says}"
         case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):

@@ -55,6 +55,11 @@ class FlagField(NamedTuple):
         return get_origin(self.kind) in (tuple, list, dict)
 
     @property
+    def whole(self) -> bool:
+        """Whether its values are whole numbers."""
+        return (_plain(get_args(self.kind)[0])[0] if self.many else self.kind) is int
+
+    @property
     def metavar(self) -> str:
         """How the help shows the values; empty for a flag without."""
         if self.flag.metavar:

@@ -1,4 +1,7 @@
-"""Words of a command line, or a keyword argument, as the value of a field; and why a value is refused: expected, got."""
+"""Words of a command line, or a keyword argument, as the value of a field; and why a value is refused: expected, got.
+
+Rule: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,38 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
             value: object = list(words)
         case _:
             (value,) = words
+    value = with_whole_numbers(field, value)
     return _converted(field, value, shlex.join(words), strict=False)
+
+
+def with_whole_numbers(field: FlagField, value: Any) -> Any:
+    """A value with the whole numbers that a user wrote as text or as a float, if the field has such; else as it is."""
+    if not field.whole:
+        return value
+    if not field.many:
+        return _whole(value)
+    if isinstance(value, str):
+        value = [value]
+    return [one for each in value for one in _several(each)] if isinstance(value, list | tuple) else value
+
+
+def _several(value: Any) -> list[Any]:
+    return list(map(_whole, value.strip("()[], ").split(","))) if isinstance(value, str) else [_whole(value)]
+
+
+def _whole(value: Any) -> Any:
+    for number in (int, float) if isinstance(value, str) else ():
+        try:
+            value = number(value)
+            break
+        except ValueError:
+            pass
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def read_value(field: FlagField, value: Any) -> Any:
     """The same value of Python's, as the field has it. Raises `UsageError`."""
-    return _converted(field, value, f"{value!r:.60}", strict=True)
+    return _converted(field, with_whole_numbers(field, value), f"{value!r:.60}", strict=True)
 
 
 def _converted(field: FlagField, value: Any, given: str, *, strict: bool) -> Any:

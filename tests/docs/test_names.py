@@ -163,3 +163,9 @@ def test_right_names_are_not_called_wrong(flags: set[str]) -> None:
         "`train/value_loss`, `rollout/is_success`, `millrace_env_steps_total`, exit code 130"
     )
     assert not list(wrong_names("page.md", text, flags))
+
+
+def test_no_message_says_to_install_millrace_from_an_index() -> None:
+    for folder in ("learner", "workers", "protocol", "millrace", "examples", "benchmarks", "website"):
+        for file in (ROOT / folder).rglob("*.py"):
+            assert not re.search(r"pip install '?millrace", file.read_text()), f"{file}: it is on no index"

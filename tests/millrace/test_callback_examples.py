@@ -76,7 +76,7 @@ def test_the_sweep_over_seeds_with_pruning(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.delitem(sys.modules, "examples.optuna_sweep")
 
 
-@pytest.mark.skipif(find_spec("optuna") is None, reason="optuna is not here: pip install 'millrace-rl[optuna]'")
+@pytest.mark.skipif(find_spec("optuna") is None, reason="optuna is not here: pip install optuna")
 def test_the_sweep_with_optuna(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from examples import optuna_sweep
 

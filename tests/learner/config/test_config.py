@@ -106,6 +106,7 @@ def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert resolve("CartPole-v1", file=written(tmp_path, "steps = 3e5")).steps == 300_000
     assert resolve("CartPole-v1", file=written(tmp_path, "eval_episodes = 1e2")).eval_episodes == 100  # which may be none
     assert isinstance(resolve("CartPole-v1", target_return=5e2).target_return, float)
+    assert ppo(resolve("CartPole-v1", steps="1_000", net="32,1e2")).net == (32, 100)
     assert "steps: expected int" in refusal(steps=1.5)
     assert refusal(net=[64, 0]) == "keyword argument: net: expected int >= 1, got [64, 0]"
 

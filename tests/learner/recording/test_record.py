@@ -526,7 +526,7 @@ def test_what_cannot_be_kept_is_said_before_a_step_is_made(
     slashed = a_run(tmp_path / "slashed", EnvSpec("millrace-tests/Box-v0", {"key": "a/b"}))
     fails(slashed, "ns/box-v0", UsageError, "Minari cannot keep an observation whose key has a slash, a/b")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    fails(run, "ns/box-v0", UsageError, r"recording needs minari, which is an extra; pip install 'millrace-rl\[record\]'")
+    fails(run, "ns/box-v0", UsageError, r"recording needs minari; pip install 'minari\[hdf5\]'")
     assert everything(root) == set()
 
 

@@ -563,10 +563,10 @@ def test_what_cannot_be_filmed_is_said(tmp_path: Path, capsys: Captured, monkeyp
     assert not (run / "videos").exists()
     monkeypatch.setattr("gymnasium.envs.classic_control.cartpole.CartPoleEnv.render", no_pygame)
     line = refusal(capsys, "evaluate", str(a_run_that_acts(tmp_path)), "--video", "--transport", "inproc")
-    assert line == "environment CartPole-v1 cannot be filmed: pygame is not installed; pip install 'millrace-rl[video]'"
+    assert line == "environment CartPole-v1 cannot be filmed: pygame is not installed; pip install moviepy pygame-ce"
     monkeypatch.setitem(sys.modules, "moviepy", None)
     line = refusal(capsys, "evaluate", str(run), "--video", "--transport", "inproc")
-    assert line == "videos need moviepy, which is an extra; pip install 'millrace-rl[video]'"
+    assert line == "videos need moviepy; pip install moviepy pygame-ce"
 
 
 def test_what_a_worker_says_cannot_control_the_terminal(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:

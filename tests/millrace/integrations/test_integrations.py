@@ -189,7 +189,7 @@ def test_a_tool_that_is_not_installed_is_one_line(make: Any, name: str, monkeypa
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(millrace.UsageError) as caught:
         make()
-    assert str(caught.value) == f"{name} is not installed: pip install 'millrace-rl[{name}]'"
+    assert str(caught.value) == f"{name} is not installed: pip install {name}"
 
 
 def test_rows_are_sent_now_and_then_and_the_last_one_always() -> None:

@@ -30,7 +30,7 @@ from workers.copies.envpool_copies import EnvpoolCopies
 from workers.envs.toy import Countdown
 
 Vector = Literal["native", "envpool"]
-here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
+here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install envpool")
 POOL = pytest.param("envpool", marks=here)
 BOTH = pytest.mark.parametrize("vector", ["native", POOL])
 
@@ -237,7 +237,7 @@ def test_what_cannot_be_stepped_at_once_is_refused_in_one_line(vector: Vector, e
 
 def test_where_envpool_is_not_installed_a_line_says_how_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "envpool", None)
-    with pytest.raises(UsageError, match=r"vector envpool needs envpool .*; pip install 'millrace-rl\[envpool\]'"):
+    with pytest.raises(UsageError, match=r"vector envpool needs envpool .*; pip install envpool"):
         run_spec(Config(env="CartPole-v1", vector="envpool"), EnvSpec("CartPole-v1"))
 
 

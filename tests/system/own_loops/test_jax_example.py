@@ -1,4 +1,4 @@
-"""examples/ppo_jax.py learns, and goes on from what it saved. Needs JAX: `pip install 'millrace-rl[jax]'`."""
+"""examples/ppo_jax.py learns, and goes on from what it saved. Needs JAX: `pip install jax`."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def test_envpool_at_its_time_limit() -> None:
     assert found == [{}, {}, {0: (3.0, 0.0), 1: (3.0, 10.0)}, {}, {}, {}, {0: (3.0, 0.0), 1: (3.0, 10.0)}, {}]
 
 
-@pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
+@pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install envpool")
 def test_envpool() -> None:
     """Also at the time limit, which is applied here, and in steps in which some copies are reset explicitly."""
     run = msgspec.structs.replace(

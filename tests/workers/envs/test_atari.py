@@ -24,9 +24,9 @@ from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies, cop
 from workers.copies.envpool_copies import EnvpoolCopies
 from workers.envs import atari
 
-envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
+envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install envpool")
 pytestmark = pytest.mark.skipif(
-    find_spec("ale_py") is None or find_spec("cv2") is None, reason="no emulator: pip install 'millrace-rl[atari]'"
+    find_spec("ale_py") is None or find_spec("cv2") is None, reason="no emulator: pip install ale-py opencv-python-headless"
 )
 
 KINDS = ["loop", "native", pytest.param("envpool", marks=envpool)]

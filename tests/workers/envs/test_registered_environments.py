@@ -18,7 +18,7 @@ REGISTERED = [name for name, spec in gymnasium.registry.items() if str(spec.entr
 @pytest.mark.parametrize("name", sorted({*REGISTERED} - FAIL_ON_PURPOSE))
 def test_gymnasiums_checker_finds_no_mistake(name: str) -> None:
     if "Atari" in name and (find_spec("ale_py") is None or find_spec("cv2") is None):
-        pytest.skip("no emulator: pip install 'millrace-rl[atari]'")
+        pytest.skip("no emulator: pip install ale-py opencv-python-headless")
     env = gymnasium.make(name, disable_env_checker=True)
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
