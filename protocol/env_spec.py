@@ -27,9 +27,9 @@ from protocol.bounds import one_line
 from protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of
 from protocol.envs.make_env import made_by_callable, made_by_id, made_without_checker, names_a_function, why_not_made
 from protocol.envs.unknown_ids import (
+    find,
     ids_of_gymnasium,
     is_registered,
-    load_plugins,
     plugin_modules,
     registered_by_plugins,
     registers,
@@ -244,16 +244,32 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Call `make` with the id. Raises `UsageError`."""
         registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
         plain = registrar is None and ":" not in self.id
-        plugins_failed = load_plugins(self.id) if plain and not is_registered(self.id) else []
+        failed = find(self.id) if plain and not is_registered(self.id) else []
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except UsageError:
             raise
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
-            raise UsageError(why_not_made(self.id, error, plugins_failed)) from error
+            raise UsageError(why_not_made(self.id, error, failed, _why_not)) from error
         except Exception as error:  # its constructor raised any exception
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
+
+
+def _why_not(env_id: str) -> str:
+    """Why a registered environment that perhaps was meant cannot be made; empty if it can. No function is called."""
+    if ":" in env_id:
+        return ""
+    find(env_id)
+    if not is_registered(env_id):
+        return "it is not registered"
+    try:
+        EnvSpec(env_id).make().close()
+    except UsageError as error:
+        return str(error)
+    except BaseException as error:  # its `close` may raise anything
+        return f"{type(error).__name__}: {first_line(error)}"
+    return ""
 
 
 # -------------------------------------------------------------------------------------------- what only this process has

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from protocol.bounds import one_line
+from protocol.envs.advice.missing_modules import what_to_install
 from protocol.envs.found_names import attribute
 from protocol.errors import UsageError, did_you_mean, first_line
 
@@ -42,7 +43,7 @@ def import_own(module: str, what: str) -> ModuleType:
             raise UsageError(
                 f"{what}: no module named {error.name}; is it installed, or its folder on PYTHONPATH?"
             ) from error
-        raise UsageError(f"{what}: the import of {module} failed: {_why(error)}; is that package installed?") from error
+        raise UsageError(f"{what}: the import of {module} failed: {_why(error)}; {what_to_install(error.name)}") from error
     except (Exception, SystemExit) as error:
         raise own_code_failed(f"{what}: the import of {module}", error) from error
 

@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
 from protocol.arrays import Array
 from protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
-from protocol.envs.space_advice import observation_advice
+from protocol.envs.advice.space_advice import observation_advice
 from protocol.envs.space_generators import generator_states, restore_generators
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError, first_line

@@ -10,11 +10,11 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
+from protocol.envs.advice.atari_ids import preprocessed
+from protocol.envs.advice.missing_modules import what_to_install
+from protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
 from protocol.envs.found_names import attribute
-from protocol.envs.unknown_ids import (
-    most_similar,
-    what_to_write,
-)
+from protocol.envs.unknown_ids import most_similar, what_to_write
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
 from protocol.errors import UsageError, first_line
 
@@ -68,7 +68,9 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
         ) from error
     if isinstance(made, gymnasium.Env):
         return made
-    if hasattr(made, "possible_agents"):
+    if is_of_old_gym(made):
+        advice = f"; {instead_of_object(made)}"
+    elif hasattr(made, "possible_agents"):
         advice = "; it has several agents: return a gymnasium.Env with one action and one reward for all of them"
     elif hasattr(made, "num_envs"):
         advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
@@ -77,39 +79,47 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
     raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}{advice}")
 
 
-def why_not_made(env_id: str, error: Exception, plugins_failed: Sequence[str] = ()) -> str:
+def why_not_made(
+    env_id: str, error: Exception, failed: Sequence[str] = (), why_not: Callable[[str], str] = lambda env_id: ""
+) -> str:
     """One line for an environment that is not known, or whose package is missing.
 
-    `plugins_failed`: lines about installed packages that could not register their environments.
+    `failed`: lines about installed packages that could not register their environments. `why_not`: as of `what_to_write`.
     """
-    module, colon, _ = env_id.partition(":")
+    module, colon, name = env_id.partition(":")
     while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
         error = error.__cause__  # gymnasium raises one of its own, which names the module of the id whatever is missing
     says = first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
-            return f"environment {env_id}: Atari games need ale-py; pip install ale-py opencv-python-headless"
+            return f"environment {env_id}: Atari games need ale-py; {what_to_install('ale_py')}"
         case gymnasium.error.DependencyNotInstalled():
             return f"environment {env_id}: {says}"
         case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):
             return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
+        case ModuleNotFoundError(name=missing):
+            return f"environment {env_id}: a package it needs is missing ({says}); {what_to_install(missing)}"
         case ImportError():
-            return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
+            return f"environment {env_id} cannot be imported: {says}"
         case gymnasium.error.Error() if "vector entry point" in says:
             return (
                 f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
         case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
             return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that is not
+        case gymnasium.error.UnregisteredEnv() if ours := preprocessed(env_id):
+            return f"environment {env_id} is not registered: write {ours}"
         case gymnasium.error.UnregisteredEnv() if not colon:
-            broken = f" ({'; '.join(plugins_failed)})" if plugins_failed else ""
-            return f"environment {env_id} is not registered: {what_to_write(env_id)}{broken}"
+            broken = f" ({'; '.join(failed)})" if failed else ""
+            return f"environment {env_id} is not registered: {what_to_write(env_id, why_not)}{broken}"
+        case gymnasium.error.UnregisteredEnv() if wrapped := instead_of_id(env_id):
+            return f"environment {env_id} is of the old package gym; {wrapped}"
         case gymnasium.error.UnregisteredEnv():
-            name = env_id.partition(":")[2]
-            similar = most_similar(name, vars(sys.modules.get(module, object)))
-            hint = f"; did you mean {module}:{similar}?" if similar else ""
-            return (
-                f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named{hint}"
+            there = vars(sys.modules.get(module, object))
+            names = [f"{module}:{each}" for each, value in there.items() if callable(value)]
+            hint = most_similar(name, names, why_not)
+            return f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named" + (
+                f"; {hint}" if hint else ""
             )
         case _:
             return f"environment {env_id} cannot be made: {says}"

@@ -1,8 +1,9 @@
-"""Environment ids that gymnasium does not know: plugins that register them, and a line that says what to write.
+"""Environment ids that gymnasium does not know: which installed package registers them, and what to write if none does.
 
-Rule: a plugin is an installed package that names a function in the entry points `gymnasium.envs`. gymnasium 1 does not
-call them any more, so they are called here, when an id is not known otherwise. No other package is imported: which ids an
-installed package would register is read from its source text.
+Rule: a package is imported for an id only if it says that it registers it: by the entry points `gymnasium.envs`, which
+gymnasium 1 does not call any more; by the namespace of the id, which is the package's name; or in its source text, which is
+read first. Packages that do not need gymnasium are never imported. A worker does all this by itself, on its own machine. An
+id is suggested only if it could be made.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import io
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -25,12 +26,13 @@ from gymnasium.envs.registration import find_highest_version, parse_env_id
 from gymnasium.envs.registration import namespace as _namespace
 
 from protocol.bounds import one_line
+from protocol.envs.advice.missing_modules import what_to_install
 from protocol.errors import first_line
 
 GROUP = "gymnasium.envs"
 LARGEST_FILE, LARGEST_PACKAGE = 1 << 20, 1 << 24  # bytes of source text that are read
 MOST_NAMED = 3
-_REGISTERED = re.compile(r"""(?:\bid\s*=|\bregister(?:_env)?\()\s*f?["']([\w./{}-]+-v\d+)["']""")
+_REGISTERED = re.compile(r"""(?:\bid\s*=|\bregister(?:_env)?\()\s*f?["']([\w./{}-]+-v\d+|[\w.-]+/[\w.{}-]+)["']""")
 _PART = re.compile(r"{[^}]*}")  # of an f-string
 
 
@@ -39,13 +41,14 @@ class InstalledPackage(NamedTuple):
 
     module: str
     """the module to import"""
-    ids: tuple[str, ...]
-    """the ids that stand in its source text; `{…}` stands for any part of an id"""
+    ids: dict[str, str]
+    """the ids that stand in its source text, and the module where each stands; `{…}` stands for any part of an id"""
 
-    def registers(self, env_id: str) -> bool:
-        """Whether the source text registers this id."""
-        patterns = (r"[\w.-]*".join(map(re.escape, _PART.split(each))) for each in self.ids)
-        return any(re.fullmatch(pattern, env_id) for pattern in patterns)
+    def registering(self, env_id: str) -> list[str]:
+        """The modules to import so that this id is registered; none if the package says nothing of it."""
+        named = env_id.partition("/")[0].replace("-", "_").lower() == self.module.lower()
+        modules = [module for pattern, module in self.ids.items() if _matches(pattern, env_id)]
+        return list(dict.fromkeys([self.module, *modules])) if named or modules else []
 
     @property
     def examples(self) -> list[str]:
@@ -61,22 +64,40 @@ class Plugin(NamedTuple):
     """the namespace of its ids; empty if there is none"""
 
 
+def find(env_id: str) -> list[str]:
+    """Let installed packages register their environments until this id is known. Returns a line for each that failed."""
+    failed = load_plugins(env_id)
+    for package in () if is_registered(env_id) else installed_packages():
+        for module in package.registering(env_id):
+            if not is_registered(env_id):
+                with _quietly(module, failed):
+                    importlib.import_module(module)
+    return failed
+
+
 def load_plugins(env_id: str) -> list[str]:
     """Let installed plugins register their environments until this id is known. Returns a line for each that failed."""
-    failed = []
+    failed: list[str] = []
     for plugin, namespace in _plugins():
         if is_registered(env_id):
             break
-        try:
-            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-                warnings.simplefilter("ignore")
-                with _namespace(namespace) if namespace else contextlib.nullcontext():
-                    importlib.import_module(plugin.module)  # most packages register when they are imported
-                    if not is_registered(env_id):
-                        plugin.load()()
-        except Exception as error:  # another package's code
-            failed.append(f"{plugin.module}: {type(error).__name__}: {one_line(first_line(error), 200)}")
+        with _quietly(plugin.module, failed), _namespace(namespace) if namespace else contextlib.nullcontext():
+            importlib.import_module(plugin.module)  # most packages register when they are imported
+            if not is_registered(env_id):
+                plugin.load()()
     return failed
+
+
+@contextlib.contextmanager
+def _quietly(module: str, failed: list[str]) -> Iterator[None]:
+    """Within it, another package prints nothing; what it raises becomes a line of `failed`."""
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    except Exception as error:
+        install = f"; {what_to_install(error.name)}" if isinstance(error, ModuleNotFoundError) else ""
+        failed.append(f"{module}: {type(error).__name__}: {one_line(first_line(error), 200)}{install}")
 
 
 def plugin_modules() -> set[str]:
@@ -122,7 +143,11 @@ def ids_of_gymnasium() -> frozenset[str]:
 
 def registers(module: str, env_id: str) -> bool:
     """Whether the source text of a module that is imported here registers this id."""
-    return InstalledPackage(module, tuple(_ids([_source(module)]))).registers(env_id)
+    return any(_matches(pattern, env_id) for pattern in _ids([_source(module)]))
+
+
+def _matches(pattern: str, env_id: str) -> bool:
+    return re.fullmatch(r"[\w.-]*".join(map(re.escape, _PART.split(pattern))), env_id) is not None
 
 
 def _source(module: str) -> str:
@@ -133,59 +158,63 @@ def _source(module: str) -> str:
         return ""
 
 
-def what_to_write(env_id: str) -> str:
-    """What to write instead of an id that is not registered, as the end of a line."""
+def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
+    """What to write instead of an id that is not registered, as the end of a line.
+
+    `why_not` makes an environment, and returns the line that says why it cannot be made, or nothing.
+    """
     packages = list(installed_packages())
-    for package in packages:
-        if package.registers(env_id):
-            return (
-                f"the installed package {package.module} registers it when it is imported; write {package.module}:{env_id}"
-            )
-    if (similar := most_similar(env_id, [f"{one.module}:{env}" for one in packages for env in one.examples])) is not None:
-        return f"did you mean {similar}?"
+    examples = [example for package in packages for example in package.examples]
+    if (similar := most_similar(env_id, examples, why_not)) is not None:
+        return similar
     own = "one of your own is given as my_module:MyEnv-v0, one of a client in another language needs the client (--bind)"
     names = [package.module for package in packages if package.ids]
     if not names:
         return f"is the package that has it installed? {own[0].upper()}{own[1:]}"
-    example = next(package.examples[0] for package in packages if package.ids)
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return (
-        f"packages with environments are installed ({', '.join(names[:MOST_NAMED])}{more}): their ids are given as "
-        f"{names[0]}:{example}, and {own}"
-    )
+    return f"no installed package registers it ({', '.join(names[:MOST_NAMED])}{more} have environments), and {own}"
 
 
-def most_similar(env_id: str, names: Iterable[str] = ()) -> str | None:
-    """The registered id that is most similar, or one of these `module:name`; None if none is similar."""
-    known = [*gymnasium.registry, *names]
-    by_name = {one.rpartition(":")[2].lower(): one for one in known}
-    close = difflib.get_close_matches(env_id.lower(), by_name, n=1, cutoff=0.75)
-    return by_name[close[0]] if close else None
+def most_similar(env_id: str, examples: Iterable[str], why_not: Callable[[str], str]) -> str | None:
+    """Which of the registered ids and of these `examples` was perhaps meant, as the end of a line; None if none is similar.
+
+    It can be made, or the line says what to install first.
+    """
+    by_name = {one.rpartition(":")[2].lower(): one for one in [*gymnasium.registry, *examples]}
+    for close in difflib.get_close_matches(env_id.lower(), by_name, cutoff=0.75):
+        meant = by_name[close]
+        if not (line := why_not(meant)):
+            return f"did you mean {meant}?"
+        if "pip install" in line:
+            return f"did you mean {meant}? It cannot be made yet: {line}"
+    return None
 
 
 def installed_packages() -> Iterator[InstalledPackage]:
     """Installed packages that need gymnasium, with the ids in their source text. Imports none of them."""
-    for found in metadata.distributions():
+    for found in sorted(metadata.distributions(), key=lambda each: each.name):
         if any(re.match(r"gymnasium\b", need) and "extra ==" not in need for need in found.requires or ()):
             files = [file for file in found.files or () if file.suffix == ".py" and len(file.parts) > 1]
             module = next((file.parts[0] for file in files if file.name == "__init__.py" and len(file.parts) == 2), "")
             if module and module not in {"workers", "learner", "millrace", "protocol"}:
-                texts = _texts(path for file in files if file.parts[0] == module for path in [str(file.locate())])
-                yield InstalledPackage(module, tuple(dict.fromkeys(_ids(texts))))
+                own = [file for file in files if file.parts[0] == module]
+                yield InstalledPackage(module, dict(_ids_of_files(own)))
 
 
-def _texts(paths: Iterable[str]) -> Iterator[str]:
+def _ids_of_files(files: Iterable[metadata.PackagePath]) -> Iterator[tuple[str, str]]:
+    """The ids that stand in these files, each with the module that it stands in."""
     left = LARGEST_PACKAGE
-    for path in sorted(paths, key=lambda path: (path.count("/"), path)):
+    for file in sorted(files, key=lambda file: (len(file.parts), file)):
         try:
-            with open(path, encoding="utf-8", errors="replace") as file:
-                text = file.read(LARGEST_FILE)
+            with open(str(file.locate()), encoding="utf-8", errors="replace") as opened:
+                text = opened.read(LARGEST_FILE)
         except OSError:
             continue
         left -= len(text)
         if left < 0:
             return
-        yield text
+        module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
+        yield from ((env_id, module) for env_id in _ids([text]))
 
 
 def _ids(texts: Iterable[str]) -> Iterator[str]:

@@ -11,6 +11,7 @@ from typing import Any
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from protocol.env_spec import EnvSpec
+from protocol.envs.advice.atari_ids import preprocessed
 from protocol.errors import UsageError
 
 
@@ -48,6 +49,5 @@ def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
 
 def vector_alternative(env: EnvSpec) -> str:
     """Advice for an id whose vectorized form cannot be used, as text for an error message."""
-    if env.id.startswith("ALE/"):
-        return f"take millrace/Atari-v0 --env-kwargs game {env.id[4:].partition('-')[0]}, or use --vector loop"
-    return "use --vector loop"
+    ours = preprocessed(env.id)
+    return f"take {ours}, or use --vector loop" if ours else "use --vector loop"

@@ -60,8 +60,8 @@ def failure(setting: str, name: str) -> UserFacingError:
         ("nowhere_to.find:Mine", "no module named nowhere_to; is it installed, or its folder on PYTHONPATH?", ""),
         (
             "needs_a_package:Mine",
-            "the import of needs_a_package failed: ModuleNotFoundError: No module named 'not_installed_here'; is that "
-            "package installed?",
+            "the import of needs_a_package failed: ModuleNotFoundError: No module named 'not_installed_here'; pip "
+            "install it, then try again",
             "",
         ),
         (

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from protocol.env_spec import EnvSpec, remembered_name
 from protocol.envs.description import describe_env
-from protocol.envs.unknown_ids import installed_packages, most_similar
+from protocol.envs.unknown_ids import installed_packages
 from protocol.errors import UsageError
 
 GAME = """
@@ -59,6 +59,12 @@ class Site:
         if entry_points:
             (info / "entry_points.txt").write_text(entry_points)
 
+    def add(self, module: str, file: str, source: str) -> None:
+        """A file of an installed package."""
+        (self.path / module / file).write_text(source)
+        with (self.path / f"{module}-1.0.dist-info" / "RECORD").open("a") as record:
+            record.write(f"{module}/{file},,\n")
+
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
@@ -81,16 +87,28 @@ def refusal(env_id: str) -> str:
     return line
 
 
-def test_the_line_names_the_installed_package_and_what_to_write(site: Site) -> None:
-    assert "fake_flappy" not in refusal("FakeFlappy-v0")
+@pytest.mark.parametrize("env", ["FakeFlappy-v0", "FakeMazeDense-v3", "FakeMaze-v3"])
+def test_an_id_is_found_in_the_package_that_registers_it_when_it_is_imported(site: Site, env: str) -> None:
+    assert "fake_flappy" not in refusal(env)
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    for env in ("FakeFlappy-v0", "FakeMazeDense-v3", "FakeMaze-v3"):
-        assert refusal(env) == (
-            f"environment {env} is not registered: the installed package fake_flappy registers it when it is imported; "
-            f"write fake_flappy:{env}"
-        )
-    assert "fake_flappy" not in sys.modules, "it is read, not imported"
-    assert type(EnvSpec("fake_flappy:FakeFlappy-v0").make().unwrapped).__name__ == "Game"
+    refusal("Countdown-v0")
+    assert "fake_flappy" not in sys.modules, "it is imported only for an id that its source text registers"
+    assert type(EnvSpec(env).make().unwrapped).__name__ == "Game"
+
+
+def test_a_namespace_is_the_name_of_a_package_and_a_module_within_it_may_register(site: Site) -> None:
+    site.install("fake_tetris", "")
+    site.add("fake_tetris", "games.py", GAME + "gymnasium.register('Fake-Tetris/Game', 'fake_tetris.games:Game')")
+    assert type(EnvSpec("Fake-Tetris/Game").make().unwrapped).__name__ == "Game"
+    site.install("fake_silent", GAME + "gymnasium.register('/'.join(['fake_silent', 'G-v0']), 'fake_silent:Game')")
+    assert type(EnvSpec("fake_silent/G-v0").make().unwrapped).__name__ == "Game"
+
+
+def test_a_package_that_cannot_be_imported_is_named_with_what_to_install(site: Site) -> None:
+    site.install("fake_flappy", "import pkg_resources_of_old" + REGISTERS_ON_IMPORT)
+    assert refusal("FakeFlappy-v0").endswith(
+        "(fake_flappy: ModuleNotFoundError: No module named 'pkg_resources_of_old'; pip install it, then try again)"
+    )
 
 
 def test_a_registered_environment_that_makes_another_one_is_not_blamed(site: Site) -> None:
@@ -99,21 +117,40 @@ def test_a_registered_environment_that_makes_another_one_is_not_blamed(site: Sit
     assert "FakeInner" in refusal("FakeOuter-v0")
 
 
-def test_a_misspelled_id_is_suggested_with_its_module(site: Site) -> None:
+def test_a_misspelled_id_is_suggested(site: Site) -> None:
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    assert refusal("FakeFlapy-v0").endswith("is not registered: did you mean fake_flappy:FakeFlappy-v0?")
+    assert refusal("FakeFlapy-v0").endswith("is not registered: did you mean FakeFlappy-v0?")
     assert refusal("CartPol-v1").endswith("did you mean CartPole-v1?")
     says = "module fake_flappy neither registers FakeFlapy-v0 nor has a class or function so named; did you mean "
-    assert refusal("fake_flappy:FakeFlapy-v0").endswith(f"{says}fake_flappy:FakeFlappy-v0?")
+    assert refusal("fake_flappy:FakeFlapy-v0").endswith(f"{says}FakeFlappy-v0?")
+    assert refusal("fake_flappy:Gamo").endswith("; did you mean fake_flappy:Game?")
+
+
+def test_what_cannot_be_made_is_not_suggested(site: Site) -> None:
+    gymnasium.register("FakeSimulator-v0", entry_point=lambda: 1 / 0)
+    gymnasium.register("FakeSimulators-v0", "fake_flappy:Game")
+    site.install("fake_flappy", REGISTERS_ON_IMPORT)
+    assert refusal("FakeSimulato-v0").endswith("did you mean FakeSimulators-v0?")
+
+
+def test_what_can_be_made_after_an_installation_is_suggested_with_it(site: Site) -> None:
+    gymnasium.register("FakeSimulator-v0", "fake_absent:Game")
+    assert refusal("FakeSimulato-v0").endswith(
+        "did you mean FakeSimulator-v0? It cannot be made yet: environment FakeSimulator-v0: a package it needs is missing "
+        "(No module named 'fake_absent'); pip install it, then try again"
+    )
 
 
 def test_an_id_that_nothing_resembles_says_which_packages_there_are(site: Site) -> None:
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
     line = refusal("Qqqqqqqqqqq-v7")
-    assert "packages with environments are installed (" in line
+    assert "no installed package registers it (" in line
     assert "and one of your own is given as my_module:MyEnv-v0" in line
     assert line.endswith("one of a client in another language needs the client (--bind)")
-    assert most_similar("Qqqqqqqqqqq-v7") is None
+
+
+def test_an_id_of_old_atari_wrappers_is_answered_with_ours() -> None:
+    assert refusal("FakePongNoFrameskip-v4").endswith("write millrace/Atari-v0 --env-kwargs game FakePong")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,13 @@
+"""ALE's ids of Atari games, which are raw, and our environment of the same games, with the usual wrappers. Pure."""
+
+from __future__ import annotations
+
+import re
+
+_ALE = re.compile(r"ALE/(\w+)-v5|(\w+)NoFrameskip-v[04]")
+
+
+def preprocessed(env_id: str) -> str:
+    """What to write in place of ALE's id of a game, for the usual wrappers (DeepMind's); empty for any other id."""
+    match = _ALE.fullmatch(env_id)
+    return f"millrace/Atari-v0 --env-kwargs game {match[1] or match[2]}" if match else ""
