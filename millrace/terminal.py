@@ -377,8 +377,6 @@ class _WarningHandler(logging.Handler):
         self._view = view
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one record, unless the progress shows the same."""
-        if getattr(record, "in_progress", False):
-            return
+        """Print one record."""
         level = "" if is_notice(record) else f"{record.levelname.lower()}: "
         self._view.print_line(f"{level}{record.getMessage()}")

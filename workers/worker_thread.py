@@ -67,6 +67,10 @@ class WorkerThread:
         page = self._reader.read(now)
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
 
+    def last_line(self) -> str:
+        """Nothing: a thread writes to this process's stderr."""
+        return ""
+
     def enforce(self, timeouts: CallTimeouts, now: float) -> None:
         """Nothing: a thread cannot be ended from outside."""
 

@@ -18,13 +18,13 @@ from learner.members.member_server import MemberServer, ServerCallbacks, ServerS
 from learner.members.process_callbacks import ProcessCallbacks
 from protocol.envs.description import DescribedEnv
 from protocol.errors import Stalled
+from protocol.logs.long_wait import LongWait
 from protocol.specs import DescribeSpec
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.05
-LOG_WAITING_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,8 @@ def described_by_workers(
     )
     server_settings = ServerSettings(log_joins=False)
     server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)
-    began_s = logged_s = clock()
+    began_s = clock()
+    wait = LongWait(began_s)
     try:
         while coordinator.described is None:
             server.listen(POLL_S)
@@ -80,21 +81,14 @@ def described_by_workers(
                 raise coordinator.unsuitable
             now = clock()
             server.check_members(settings.no_workers_timeout_s)
-            waiting_for = _waiting_for(link, server, sorted(member.hello.worker for member in members.values()))
             # In environment code, a worker is ended by the timeouts of the calls, which name themselves.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
             if now - max(began_s, busy_s) > settings.stall_timeout_s and members:
-                raise Stalled(f"no description of the environment within {settings.stall_timeout_s:.0f} s; {waiting_for}")
-            if now - logged_s > LOG_WAITING_EVERY_S:
-                logged_s = now
-                log.warning("%s", waiting_for)
+                told = server.what_workers_do()
+                raise Stalled(f"no description of the environment within {settings.stall_timeout_s:.0f} s; {told}")
+            if wait.due(now):
+                log.warning("no env steps for %.0f s: %s", wait.seconds(now), server.what_workers_do())
         server.send(coordinator.finish())
         return coordinator.described
     finally:
         server.close()
-
-
-def _waiting_for(link: LearnerLink, server: MemberServer, workers: list[str]) -> str:
-    if not workers:
-        return f"waiting for {server.awaited()}"
-    return f"waiting for a description of the environment from {', '.join(workers[:8])}"

@@ -31,6 +31,7 @@ from learner.members.events import (
     WorkerRefused,
     describe,
 )
+from learner.members.held_up import held_up, in_words
 from learner.members.join_limiter import JoinLimiter
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
@@ -40,6 +41,7 @@ from learner.members.process_callbacks import ProcessCallbacks
 from protocol.address import advertised_address, name_for_people
 from protocol.bounds import one_line
 from protocol.errors import BadMessage, NoWorkers
+from protocol.logs.long_wait import LongWait
 from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
 from protocol.wire.codec import Buffer, encode
 from protocol.wire.learner_link import LearnerLink
@@ -52,6 +54,7 @@ TURN_S = 0.2  # of reading messages, at most, before the caller may go on
 SHORT_TURN_S = 0.003  # at least so much, also in a short turn
 FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
 LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way
+MOST_TOLD = 4  # workers of which one line says what they do
 STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
 
 
@@ -161,10 +164,16 @@ class MemberServer:
 
         Workers that only evaluate do not count.
         """
-        deadline_s = self._clock() + timeout_s
-        while len(self._membership.collectors()) < workers:
-            if self._clock() > deadline_s:
+        deadline_s, wait = self._clock() + timeout_s, LongWait(self._clock())
+        while (joined := len(self._membership.collectors())) < workers:
+            now = self._clock()
+            if now > deadline_s:
                 raise self.no_workers(workers, timeout_s)
+            if wait.due(now):
+                told = self.what_workers_do()
+                log.warning(
+                    "no env steps for %.0f s, %d of %d workers have joined: %s", wait.seconds(now), joined, workers, told
+                )
             turn()
 
     def check_members(self, timeout_s: float, *, collecting: bool = False) -> None:
@@ -201,6 +210,17 @@ class MemberServer:
         joined = f"{len(self._membership.members)} joined{self._missing_reason()}"
         awaited = "1 worker" if workers == 1 else f"{workers} workers"
         return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")
+
+    def what_workers_do(self) -> str:
+        """What the workers do, those that are held up longest first, and what is awaited if there are none."""
+        now, members = self._clock(), self._membership.members.values()
+        lines = [line for *_, line in sorted((held_up(member, now) for member in members), reverse=True)]
+        joined = {member.hello.worker for member in members}
+        running = [each for each in self._processes.running() if each.worker not in joined]
+        lines += [f"worker {each.worker}: {in_words(each.doing, each.for_s)}" for each in running]
+        more = [f"{len(lines) - MOST_TOLD} more"] if len(lines) > MOST_TOLD else []
+        said = [f"{name} wrote: {line}" for name, line in [*self._processes.said().items()][:MOST_TOLD]]
+        return "; ".join([", ".join([*lines[:MOST_TOLD], *more]) or f"waiting for {self.awaited()}", *said])
 
     def awaited(self) -> str:
         """What is awaited without a worker, with the known reasons why workers may be missing."""

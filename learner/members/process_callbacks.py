@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from learner.members.events import Failed
@@ -18,6 +18,8 @@ class ProcessCallbacks:
     """Returns the workers whose processes have ended since the last call. It may raise."""
     running: Callable[[], Iterable[WorkerActivity]] = lambda: ()
     """Returns what the workers do whose processes run. A stopped process is left out."""
+    said: Callable[[], Mapping[str, str]] = dict
+    """Returns the last line that each of them wrote to its log, by the worker's name; what wrote nothing is left out."""
     count: Callable[[], int] | None = None
     """Returns the number of processes that step the environment. None: one per member."""
     lower_priority: Callable[[], None] = lambda: None

@@ -33,6 +33,7 @@ from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import Stages, one_line
 from protocol.errors import BadRollout, Stalled
+from protocol.logs.long_wait import LongWait
 from protocol.messages import Evaluated, Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes
 from protocol.rows.rollout_checks import validate
@@ -45,7 +46,6 @@ T = TypeVar("T")
 POLL_S = 0.1
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
-LOG_WAITING_AFTER_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -158,17 +158,19 @@ class Hub:
         `watch` is called at least every `POLL_S` of a long wait.
         """
         began_s = self._clock()
-        log_at_s, steps = began_s + LOG_WAITING_AFTER_S, self._worker_steps()
+        wait, steps = LongWait(began_s), self._worker_steps()
 
         def watch_and_log() -> None:
-            nonlocal log_at_s, steps
+            nonlocal steps
             now = self._clock()
             if now - began_s >= LONG_S:
                 watch()
-            if now > log_at_s:  # ever less often
-                log_at_s, before, steps = now + (now - began_s), steps, self._worker_steps()
-                level = logging.INFO if steps != before else logging.WARNING
-                log.log(level, "%s", self.waiting(now), extra={"in_progress": True})
+            if wait.due(now):
+                before, steps = steps, self._worker_steps()
+                if steps != before:
+                    log.info("%s", self.waiting(now))
+                else:
+                    log.warning("no env steps for %.0f s: %s", wait.seconds(now), self._server.what_workers_do())
 
         rollouts = self.coordinator.rollouts
         self._time.turn("gathering", began_s)

@@ -66,7 +66,9 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
     def stepping() -> list[Member]:
         return list(env.hub.coordinator.members.values())
 
-    processes = ProcessCallbacks(ended, thread.activities, lambda: len(stepping()), stepping=stepping, expected=expected)
+    processes = ProcessCallbacks(
+        ended, thread.activities, count=lambda: len(stepping()), stepping=stepping, expected=expected
+    )
     env.hub.on_death = processes.failed.append
     return processes
 

@@ -75,6 +75,7 @@ class Endpoint(Bound):
         processes = ProcessCallbacks(
             supervisor.poll,
             supervisor.activities,
+            supervisor.said,
             lower_priority=supervisor.lower_priority,
             expected=count,
             most_copies=copies_per_machine() if count else 0,

@@ -121,5 +121,10 @@ def why_not_made(
             return f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named" + (
                 f"; {hint}" if hint else ""
             )
+        case TypeError() if "missing" in says and "argument" in says:
+            return (
+                f"environment {env_id} cannot be made: {says}; give it as --env-kwargs NAME VALUE, or, if it is no number and no "
+                "text, name a function of yours that makes the environment: my_module:make_env"
+            )
         case _:
             return f"environment {env_id} cannot be made: {says}"

@@ -32,7 +32,8 @@ from protocol.errors import first_line
 GROUP = "gymnasium.envs"
 LARGEST_FILE, LARGEST_PACKAGE = 1 << 20, 1 << 24  # bytes of source text that are read
 MOST_NAMED = 3
-_REGISTERED = re.compile(r"""(?:\bid\s*=|\bregister(?:_env)?\()\s*f?["']([\w./{}-]+-v\d+|[\w.-]+/[\w.{}-]+)["']""")
+FEWEST_LETTERS = 3
+_REGISTERED = re.compile(r"""(?:\bid\s*=|\bregister\()\s*f?["']([\w./{}-]+)["']|["']([\w./{}-]+-v\d+)["']""")
 _PART = re.compile(r"{[^}]*}")  # of an f-string
 
 
@@ -218,7 +219,9 @@ def _ids_of_files(files: Iterable[metadata.PackagePath]) -> Iterator[tuple[str, 
 
 
 def _ids(texts: Iterable[str]) -> Iterator[str]:
-    """The ids that are registered in a package's source text."""
+    """What may be the ids that are registered in a package's source text: at least three letters of each are known."""
     for text in texts:
-        if "register" in text:
-            yield from _REGISTERED.findall(text)
+        for found in _REGISTERED.findall(text) if "register" in text else ():
+            each = "".join(found)
+            if len(_PART.sub("", each).partition("-v")[0]) >= FEWEST_LETTERS:
+                yield each

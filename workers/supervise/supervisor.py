@@ -54,6 +54,10 @@ class Running(Protocol):
         """What it does. None if it has ended, or if its process is stopped."""
         ...
 
+    def last_line(self) -> str:
+        """The last line that it wrote to a log of its own; empty if it has written nothing, or has no log."""
+        ...
+
     def enforce(self, timeouts: CallTimeouts, now: float) -> None:
         """End it if a call of its environment takes too long."""
         ...
@@ -179,6 +183,11 @@ class Supervisor:
         now = self._clock()
         found = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
         return [activity for activity in found if activity is not None]
+
+    def said(self) -> dict[str, str]:
+        """The last line of the log of each running worker that has written to one."""
+        found = {worker.name: worker.running.last_line() for worker in self._workers if worker.running is not None}
+        return {name: line for name, line in found.items() if line}
 
     @property
     def count(self) -> int:

@@ -82,6 +82,7 @@ class WorkerProcess:
             secret[TOKEN_VARIABLE] = start.token.to_text()
         try:
             with _opened(start.log) as stderr:
+                self._log_from = stderr.tell()  # what stands before is of another process
                 self._process = popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -128,6 +129,10 @@ class WorkerProcess:
             return None
         page = self._page.read(now)
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
+
+    def last_line(self) -> str:
+        """The last line of its log that it wrote itself; empty if it has none."""
+        return one_line("".join(self._output().strip().splitlines()[-1:]))
 
     def enforce(self, timeouts: CallTimeouts, now: float) -> None:
         """End it if a call of its environment takes too long, or if it does not end although it leaves."""
@@ -212,9 +217,7 @@ class WorkerProcess:
 
     def _ending(self, code: int) -> Ending:
         """How it ended. `code` is negative if a signal ended it."""
-        page, output = self._page.read(time.monotonic()), ""
-        with suppress(OSError):  # the log may have been deleted
-            output = self._log.read_text(errors="replace") if self._log is not None else ""
+        page, output = self._page.read(time.monotonic()), self._output()
         last = "".join(f" ({line})" for line in output.strip().splitlines()[-1:])
         meanwhile = f" in {CALLS[page.doing]}" if page.doing in CALLS else ""
         if page.doing == "starting":
@@ -239,6 +242,15 @@ class WorkerProcess:
         # In `close`, an environment has done its work: that its process ends there does not count against the run.
         failed = page.doing != "closing" and (worked or page.doing not in NO_ENVIRONMENT_CODE)
         return Ending(code, one_line(line), failed=failed, worked=worked)
+
+    def _output(self) -> str:
+        """What it has written to its log."""
+        with suppress(OSError):  # the log may have been deleted
+            if self._log is not None:
+                with self._log.open("rb") as log:
+                    log.seek(self._log_from)
+                    return log.read().decode(errors="replace")
+        return ""
 
     def _write(self, stacks: str) -> None:
         """Write to where the worker's stderr goes."""

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from learner.members.describe import LOG_WAITING_EVERY_S, DescribeSettings, described_by_workers
+from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
 from learner.members.events import EnvironmentRaised, Failed, WorkerProcessFailed
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
-from protocol.alive import NO_SLOT
+from protocol.alive import NO_SLOT, WorkerActivity
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
@@ -263,10 +263,23 @@ def test_a_worker_that_never_answers_stalls_the_start(caplog: pytest.LogCaptureF
     link = FakeLink()
     saying(link)
     beat = ProcessCallbacks(lambda: _heartbeats(link), expected=1)
-    with pytest.raises(Stalled, match=r"no description of the environment within 100 s; waiting for .* from w0"):
+    with pytest.raises(Stalled, match=r"no description of the environment within 100 s; worker w0 on host: "):
         shell(link, processes=beat)
-    lines = [record.getMessage() for record in caplog.records if "waiting for a description" in record.getMessage()]
-    assert abs(len(lines) - SETTINGS.stall_timeout_s / LOG_WAITING_EVERY_S) <= 1
+    lines = [record.getMessage() for record in caplog.records if "no env steps" in record.getMessage()]
+    assert lines == [
+        "no env steps for 30 s: worker w0 on host: 0.0 steps/s",
+        "no env steps for 90 s: worker w0 on host: 0.0 steps/s",
+    ]
+
+
+def test_what_the_workers_do_and_write_is_told_before_any_has_joined(caplog: pytest.LogCaptureFixture) -> None:
+    link = FakeLink()
+    making = WorkerActivity("w0", 1, "making", 28.0, 0)
+    processes = ProcessCallbacks(running=lambda: [making], said=lambda: {"w0": "no licence yet"}, expected=1)
+    with pytest.raises(NoWorkers):
+        shell(link, processes=processes)
+    told = [record.getMessage() for record in caplog.records if "no env steps" in record.getMessage()]
+    assert told[0] == "no env steps for 30 s: worker w0: in construction for 28 s; w0 wrote: no licence yet"
 
 
 def _heartbeats(link: FakeLink) -> tuple[()]:

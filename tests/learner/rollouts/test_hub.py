@@ -12,9 +12,10 @@ import pytest
 from learner.members.held_up import LONG_S
 from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.hub import LOG_WAITING_AFTER_S, PULSE_S, Hub, HubSettings
+from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.errors import RunError
+from protocol.logs.long_wait import AGAIN_S
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Weights
 from protocol.rollout import rollout_bytes
 from protocol.wire.codec import decode_to_worker
@@ -93,8 +94,8 @@ def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCa
     """A rollout of a slow environment takes long, and nothing is wrong."""
     link, hub, heartbeat = hub_with_a_worker()
     hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
-    steps_until_s = link.now + 3 * LOG_WAITING_AFTER_S
-    arrives_s = link.now + 9 * LOG_WAITING_AFTER_S
+    steps_until_s = link.now + AGAIN_S
+    arrives_s = link.now + 3 * AGAIN_S
     poll = link.poll
 
     def poll_while_it_works(timeout_s: float) -> bool:
@@ -108,8 +109,11 @@ def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCa
     link.poll = poll_while_it_works  # type: ignore[method-assign]
     caplog.set_level(logging.INFO)
     hub.gather()
-    levels = [record.levelname for record in caplog.records if "for lane 0 (worker w0 on host: " in record.getMessage()]
-    assert levels == ["INFO"] * 3 + ["WARNING"], "after 10, 20, 40 and 80 s"
+    said = [
+        (record.levelname, record.getMessage()) for record in caplog.records if "worker w0 on host: " in record.getMessage()
+    ]
+    assert [level for level, _ in said] == ["INFO"] * 2 + ["WARNING"], "after 30, 90 and 150 s"
+    assert said[-1][1] == "no env steps for 150 s: worker w0 on host: 0.0 steps/s"
 
 
 def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:

@@ -91,7 +91,7 @@ def refusal(env_id: str) -> str:
 def test_an_id_is_found_in_the_package_that_registers_it_when_it_is_imported(site: Site, env: str) -> None:
     assert "fake_flappy" not in refusal(env)
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    refusal("Countdown-v0")
+    refusal("FakeOther-v0")
     assert "fake_flappy" not in sys.modules, "it is imported only for an id that its source text registers"
     assert type(EnvSpec(env).make().unwrapped).__name__ == "Game"
 
@@ -127,7 +127,7 @@ def test_a_misspelled_id_is_suggested(site: Site) -> None:
 
 
 def test_what_cannot_be_made_is_not_suggested(site: Site) -> None:
-    gymnasium.register("FakeSimulator-v0", entry_point=lambda: 1 / 0)
+    gymnasium.register("FakeSimulator-v0", "fake_flappy:missing")
     gymnasium.register("FakeSimulators-v0", "fake_flappy:Game")
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
     assert refusal("FakeSimulato-v0").endswith("did you mean FakeSimulators-v0?")

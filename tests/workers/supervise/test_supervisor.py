@@ -34,6 +34,10 @@ class FakeRunning:
     doing: Doing = "waiting"
     since_s: float = 0.0
     enforced: list[float] = field(default_factory=list)
+    wrote: str = ""
+
+    def last_line(self) -> str:
+        return self.wrote
 
     def ended(self) -> Ending | None:
         return self.end
