@@ -27,6 +27,7 @@ from learner.run_folder.json_log import kept_log
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
 from protocol.env_spec import EnvSpec
+from protocol.envs.advice.atari_ids import preprocessed
 from protocol.envs.description import DescribedEnv
 from protocol.errors import UsageError
 from protocol.logs.notices import log_notice
@@ -143,6 +144,8 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
     spaces = EnvSpaces.of_description(described, config.action_masks)
     if spaces.masked:
         log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
+    if env.factory is None and not env.wrappers and (ours := preprocessed(env.id)):
+        log_notice(log, f"{env.id} shows raw frames, one at a time; {ours} has the usual wrappers, and presets")
     return KnownEnvironment(env, spaces, described, evaluation.max_episode_steps)
 
 

@@ -1,4 +1,6 @@
-"""Finds out, when `millrace` is imported, whether other code hides its packages `learner`, `workers` or `protocol`.
+"""Finds out, when `millrace` is imported, whether it can work with what Python finds in place of what it needs.
+
+Other code may hide its packages `learner`, `workers` or `protocol`, and gymnasium may be too old.
 
 Python searches the folder of the script (with `python -m`: the current folder) before the installed packages. A user's own
 `learner.py` there would be imported in place of millrace's, with a confusing error later.
@@ -8,32 +10,65 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import sys
+from importlib import metadata
 from pathlib import Path
+from typing import NoReturn
 
 PACKAGES = ("learner", "workers", "protocol")
 INSTALLED_IN = Path(__file__).parents[1]
 """The folder that holds `millrace` and the packages that belong to it."""
 
 
+OLDEST_GYMNASIUM = (1, 3)
+
+
 class ImportConflict(ImportError):
-    """Another module has the name of a package of millrace and would be imported in its place."""
+    """Another module has the name of a package of millrace and would be imported in its place, or gymnasium is too old."""
 
 
 def check_imports() -> None:
-    """Check that `learner`, `workers` and `protocol` are ours, without importing them. Raises `ImportConflict`.
+    """Check that `learner`, `workers` and `protocol` are ours, and gymnasium's version. Raises `ImportConflict`.
 
-    With `python -m millrace`, no caller could handle the error, so the process ends with one line and exit code 2.
+    Nothing is imported for it.
+
+    On the command line, no caller could handle the error, so the process ends with one line and exit code 2.
     """
     for name in PACKAGES:
         found = _location(name)
         if found is None or os.path.realpath(found) == os.path.realpath(INSTALLED_IN / name):
             continue
-        line = f"{found} is in the way: millrace has its own package {name}; rename yours, or run from another folder"
-        if sys.argv[:1] == ["-m"]:  # what `python -m` sets while it looks for the module
-            sys.stderr.write(f"millrace: {line}\n")
-            sys.exit(2)
-        raise ImportConflict(line, name=name, path=str(found))
+        _refuse(
+            f"{found} is in the way: millrace has its own package {name}; rename yours, or run from another folder",
+            name,
+            found,
+        )
+    if too_old := _gymnasium_too_old():
+        _refuse(too_old, "gymnasium", None)
+
+
+def _refuse(line: str, name: str, found: Path | None) -> NoReturn:
+    # With `python -m`, argv[0] is "-m" while it looks for the module.
+    if sys.argv and Path(sys.argv[0]).name in ("-m", "millrace"):
+        sys.stderr.write(f"millrace: {line}\n")
+        sys.exit(2)
+    raise ImportConflict(line, name=name, path=None if found is None else str(found))
+
+
+def _gymnasium_too_old() -> str:
+    """A line if the installed gymnasium is too old; else nothing, also if there is none."""
+    try:
+        version = metadata.version("gymnasium")
+    except metadata.PackageNotFoundError:
+        return ""
+    if tuple(map(int, re.findall(r"\d+", version)[:2])) >= OLDEST_GYMNASIUM:
+        return ""
+    oldest = ".".join(map(str, OLDEST_GYMNASIUM))
+    return (
+        f"gymnasium {version} is too old, perhaps because a package of environments asked for it: pip install "
+        f"'gymnasium>={oldest}', and a version of that package that allows it"
+    )
 
 
 def _location(name: str) -> Path | None:

@@ -127,7 +127,8 @@ def check_arguments(arguments: Mapping[str, Any], of: str) -> None:
         except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
             raise UsageError(
                 f"{of}: argument {name}: expected a number of at most 64 bits, text, True or False, got "
-                f"{one_line(repr(value))}; to give it something else, pass a function without arguments that makes it"
+                f"{type(value).__name__} {one_line(repr(value), 60)}; for anything else, pass a function in "
+                f"place of the id: lambda: gymnasium.make(ID, {name}={name})"
             ) from error
 
 

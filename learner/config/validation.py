@@ -16,6 +16,7 @@ from learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
+from protocol.env_spec import check_arguments
 from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
 from protocol.flags.fields import fields_of
@@ -42,6 +43,7 @@ def _converted(values: Any, kind: type[RecordT], settings: dict[str, Any], where
     for table in TABLES:
         if not isinstance(settings.get(table, {}), Mapping):
             raise UsageError(f"{where}: {table}: expected table, got {settings[table]!r:.60}".removeprefix(": "))
+        check_arguments(settings.get(table, {}), table)
     try:
         return msgspec.convert(values, kind)
     except (msgspec.ValidationError, UnicodeEncodeError) as error:  # the latter for a path that is no text

@@ -123,8 +123,8 @@ def why_not_made(
             )
         case TypeError() if "missing" in says and "argument" in says:
             return (
-                f"environment {env_id} cannot be made: {says}; give it as --env-kwargs NAME VALUE, or, if it is no number and no "
-                "text, name a function of yours that makes the environment: my_module:make_env"
+                f"environment {env_id} cannot be made: {says}; give numbers and text as --env-kwargs NAME VALUE; for "
+                "anything else, name a function of yours that makes the environment: my_module:make_env"
             )
         case _:
             return f"environment {env_id} cannot be made: {says}"

@@ -67,13 +67,15 @@ class Plugin(NamedTuple):
 
 def find(env_id: str) -> list[str]:
     """Let installed packages register their environments until this id is known. Returns a line for each that failed."""
-    failed = load_plugins(env_id)
-    for package in () if is_registered(env_id) else installed_packages():
+    failed: list[str] = []
+    for package in installed_packages():
         for module in package.registering(env_id):
             if not is_registered(env_id):
                 with _quietly(module, failed):
-                    importlib.import_module(module)
-    return failed
+                    imported = importlib.import_module(module)
+                    if not is_registered(env_id):  # some have a function of this name, which others would call
+                        getattr(imported, "register_envs", bool)()
+    return failed + load_plugins(env_id)
 
 
 def load_plugins(env_id: str) -> list[str]:

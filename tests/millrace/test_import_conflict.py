@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.import_conflict import PACKAGES
+from millrace.import_conflict import OLDEST_GYMNASIUM, PACKAGES
 
 ROOT = Path(__file__).parents[2]
 
@@ -54,6 +54,18 @@ def test_python_m_millrace_says_one_line_without_a_traceback(tmp_path: Path) -> 
     done = python(tmp_path, "-m", "millrace", "--help")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"millrace: {message(tmp_path / 'learner.py', 'learner')}\n"
+
+
+def test_a_gymnasium_that_is_too_old_is_said_in_one_line(tmp_path: Path) -> None:
+    info = tmp_path / "gymnasium-0.29.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: gymnasium\nVersion: 0.29.1\n")
+    done = python(tmp_path, "-m", "millrace", "train", "CartPole-v1")
+    assert done.returncode == 2
+    assert done.stderr.startswith("millrace: gymnasium 0.29.1 is too old")
+    oldest = f"gymnasium>={'.'.join(map(str, OLDEST_GYMNASIUM))}"
+    assert f"pip install '{oldest}'" in done.stderr
+    assert f'"{oldest}",' in (ROOT / "pyproject.toml").read_text()
 
 
 def test_the_installed_command_searches_the_current_folder_last(tmp_path: Path) -> None:

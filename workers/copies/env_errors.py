@@ -5,7 +5,8 @@ Rule: the line of an error names the lane, or the evaluation, once, at its begin
 
 from __future__ import annotations
 
-from traceback import format_exception
+import re
+from traceback import extract_tb, format_exception
 
 from protocol.errors import EnvironmentFailed, first_line
 
@@ -33,6 +34,21 @@ def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = ""
     copy = "" if what.copy is None else f"copy {what.copy}, "
     if not (line := what.line):
         cause = what.__cause__ or what
-        line = f"its environment raised {type(cause).__name__}: {first_line(cause, '')}"
+        line = f"its environment raised {type(cause).__name__}: {first_line(cause, '')}{_about_action(cause)}"
         detail = "".join(format_exception(cause))
     return EnvironmentFailed(f"{whose}{copy}{doing or what.doing}: {line}", detail, lane)
+
+
+def _about_action(cause: BaseException) -> str:
+    """What to write if the environment wants an action to be an int of Python, as the end of a line; else nothing.
+
+    It gets a numpy integer, as from gymnasium's vector environments and from `Discrete.sample`.
+    """
+    frames = extract_tb(cause.__traceback__)
+    raised_by = (frames[-1].line or "") if frames else ""
+    if not re.search(r"isinstance\(.*\bint\b", raised_by) and "np.int64(" not in first_line(cause, ""):
+        return ""
+    return (
+        "; its action is a numpy integer: write int(action) there, or --wrapper my_module:MyWrapper, a "
+        "gymnasium.ActionWrapper of yours whose action() returns int(action)"
+    )

@@ -40,7 +40,7 @@ def instead_of_id(env_id: str) -> str:
         version = _version(point.reset)
     except Exception:  # another package's code, or a function that makes the environment
         version = "V26"
-    return f"`{INSTALL}`, then write Gym{version}Environment-v0 --env-kwargs env_id {env_id}"
+    return f"`{INSTALL}`, then write shimmy:Gym{version}Environment-v0 --env-kwargs env_id {env_id}"
 
 
 def _version(reset: Callable[..., object]) -> str:

@@ -6,6 +6,7 @@ The packages are made here, and nothing is downloaded.
 from __future__ import annotations
 
 import sys
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,11 @@ def test_a_namespace_is_the_name_of_a_package_and_a_module_within_it_may_registe
     assert type(EnvSpec("Fake-Tetris/Game").make().unwrapped).__name__ == "Game"
     site.install("fake_silent", GAME + "gymnasium.register('/'.join(['fake_silent', 'G-v0']), 'fake_silent:Game')")
     assert type(EnvSpec("fake_silent/G-v0").make().unwrapped).__name__ == "Game"
+
+
+def test_a_package_may_register_in_a_function_register_envs(site: Site) -> None:
+    site.install("fake_sky", GAME + "def register_envs(): gymnasium.register('FakeSky-v0', 'fake_sky:Game')")
+    assert type(EnvSpec("FakeSky-v0").make().unwrapped).__name__ == "Game"
 
 
 def test_a_package_that_cannot_be_imported_is_named_with_what_to_install(site: Site) -> None:
@@ -209,6 +215,35 @@ def test_no_plugin_is_imported_for_an_id_that_is_known(site: Site) -> None:
     for env in ("CartPole-v1", "workers.envs.toy:Countdown-v0", "millrace/CartDoublePendulum-v0"):
         EnvSpec.of(env).make().close()
     assert "fake_broken" not in sys.modules
+
+
+# ------------------------------------------------------------------------------------------- the old package gym
+
+
+def old_env(monkeypatch: pytest.MonkeyPatch, *, seeded: bool) -> Any:
+    """A class as one of gym's, which is registered there as Old-v0. gym itself is not installed."""
+
+    class OldEnv:
+        __module__ = "gym.core"
+
+    OldEnv.reset = (lambda self, *, seed=None: 0) if seeded else (lambda self: 0)  # type: ignore[attr-defined]
+    gym = types.SimpleNamespace(envs=types.SimpleNamespace(registration=types.SimpleNamespace(registry={})))
+    gym.envs.registration.registry["Old-v0"] = types.SimpleNamespace(entry_point=OldEnv)
+    monkeypatch.setitem(sys.modules, "gym", gym)
+    return OldEnv
+
+
+@pytest.mark.parametrize(("seeded", "version"), [(True, "V26"), (False, "V21")])
+def test_an_environment_of_the_old_gym_is_answered_with_what_wraps_it(
+    site: Site, monkeypatch: pytest.MonkeyPatch, seeded: bool, version: str
+) -> None:
+    made = old_env(monkeypatch, seeded=seeded)
+    site.install("fake_old", "")
+    install = "`pip install gym==0.26.2 shimmy`"
+    write = f"{install}, then write shimmy:Gym{version}Environment-v0 --env-kwargs env_id fake_old:Old-v0"
+    assert refusal("fake_old:Old-v0").endswith(f"is of the old package gym; {write}")
+    with pytest.raises(UsageError, match=f"{install}, and return shimmy.Gym{version}CompatibilityV0\\(env=it\\)"):
+        EnvSpec.of(made).make()
 
 
 # ------------------------------------------------------------------------------- observations that no policy takes

@@ -48,6 +48,25 @@ def test_an_environment_that_raises_is_named_with_its_own_traceback() -> None:
     assert "toy.py" in error.detail
 
 
+class WantsAnInt(Countdown):
+    def step(self, action: Any) -> Any:
+        assert isinstance(action, int), "no move"
+        return super().step(action)
+
+
+class NamesIt(Countdown):
+    def step(self, action: Any) -> Any:
+        raise KeyError(f"no move {action!r}")
+
+
+@pytest.mark.parametrize("made", [WantsAnInt, NamesIt])
+def test_an_environment_that_wants_an_int_of_python_is_told_what_it_gets(made: type[Countdown]) -> None:
+    """As gymnasium's vector environments pass actions, and `Discrete.sample` draws them."""
+    run = run_of(f"{TOY}Countdown-v0", N=3)
+    with pytest.raises(EnvironmentFailed, match="its action is a numpy integer: write int\\(action\\) there"):
+        collect(random_collector(run, loop_over([Countdown, Countdown, made])), run, lanes=(5,))
+
+
 def test_the_lane_and_copy_that_raise_are_named() -> None:
     class Third(Countdown):
         def reset(self, **keywords: Any) -> tuple[Any, dict[str, Any]]:
