@@ -35,7 +35,7 @@ class RolloutKeywords(TypedDict, total=False):
     """
     vector: Literal["loop", "native", "envpool"]
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install 'millrace-rl[envpool]'). native and envpool use other random numbers than loop.
+    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop.
     """
     acting_dtype: Literal["float32", "bfloat16"]
     """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights
@@ -176,12 +176,12 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Number of checkpoints to keep, the newest ones."""
     record: str
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
-    'millrace-rl[record]').
+    'minari[hdf5]').
     """
     prior: str
-    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'millrace-rl[record]'). clone_epochs
-    starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it,
-    which prior_share sets.
+    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]'). clone_epochs starts
+    with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it, which
+    prior_share sets.
     """
     rollout_steps: int
     """ppo, a2c, dqn, impala, sac, td3: T, the steps of each env copy in a rollout.
@@ -380,7 +380,7 @@ class EvaluateKeywords(TypedDict, total=False):
     max_steps: int
     """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
     video: bool
-    """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
+    """film the episodes: an mp4 of each in the folder videos of the run (pip install moviepy pygame-ce)"""
 
 
 class RecordKeywords(TypedDict, total=False):

@@ -49,6 +49,6 @@ def _about_action(cause: BaseException) -> str:
     if not re.search(r"isinstance\(.*\bint\b", raised_by) and "np.int64(" not in first_line(cause, ""):
         return ""
     return (
-        "; its action is a numpy integer: write int(action) there, or --wrapper my_module:MyWrapper, a "
+        "; its action is a numpy integer: write int(action) there, or --wrappers my_module:MyWrapper, a "
         "gymnasium.ActionWrapper of yours whose action() returns int(action)"
     )
