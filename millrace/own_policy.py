@@ -88,7 +88,7 @@ class OwnPolicy:
             raise UsageError(f"policy {self.factory}: expected module:factory, as in my_package.policies:make_policy")
         if not (type(self.state_size) is int and self.state_size >= 0):
             raise UsageError(f"policy {self.name}: state_size: expected a whole number from 0, got {self.state_size!r}")
-        check_arguments(self.kwargs, f"policy {self.name}")
+        check_arguments(self.kwargs, f"policy {self.name}", self.name.rpartition(":")[2] + "({name}={name})")
         for name in (*self.arrays, *self.extras):
             if not isinstance(name, str):
                 raise UsageError(f"policy {self.name}: expected text as the name of an array, got {name!r}")

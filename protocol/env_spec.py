@@ -119,16 +119,19 @@ class PickledCallable:
         return f"PickledCallable({len(self.data)} bytes)"
 
 
-def check_arguments(arguments: Mapping[str, Any], of: str) -> None:
-    """Raise `UsageError` for a keyword argument that no message can carry. `of`: what takes it, for the error."""
+def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasium.make(ID, {name}={name})") -> None:
+    """Raise `UsageError` for a keyword argument that no message can carry. `of`: what takes it, for the error.
+
+    `makes`: how a function of the user's makes it with another argument of this name.
+    """
     for name, value in arguments.items():
         try:
             msgspec.msgpack.decode(msgspec.msgpack.encode({name: value}), type=dict[str, Scalar])
         except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
             raise UsageError(
                 f"{of}: argument {name}: expected a number of at most 64 bits, text, True or False, got "
-                f"{type(value).__name__} {one_line(repr(value), 60)}; for anything else, pass a function in "
-                f"place of the id: lambda: gymnasium.make(ID, {name}={name})"
+                f"{type(value).__name__} {one_line(repr(value), 60)}; for anything else, pass a function in place of the name: "
+                f"lambda: {makes.format(name=name)}"
             ) from error
 
 
