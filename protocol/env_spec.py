@@ -130,7 +130,7 @@ def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasi
         except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
             raise UsageError(
                 f"{of}: argument {name}: expected a number of at most 64 bits, text, True or False, got "
-                f"{type(value).__name__} {one_line(repr(value), 60)}; for anything else, pass a function in place of the name: "
+                f"{type(value).__name__} {one_line(repr(value), 60)}; for others, pass a function in place of the name: "
                 f"lambda: {makes.format(name=name)}"
             ) from error
 

@@ -167,7 +167,7 @@ def test_a_factory_that_raises_is_named() -> None:
         (millrace.OwnPolicy(Linear, ARRAYS, state_size=-1), "state_size: expected a whole number from 0, got -1"),
         (
             millrace.OwnPolicy(Linear, ARRAYS, kwargs={"sizes": (64, 64)}),  # type: ignore[dict-item]
-            r"policy Linear: argument sizes: expected a number of at most 64 bits, text, True or False, got tuple \(64, 64\)",
+            r"policy Linear: argument sizes: expected a number .* or False, got tuple \(64, 64\)",
         ),
         (millrace.OwnPolicy(Linear, {3: (4, 2)}), "expected text as the name of an array, got 3"),  # type: ignore[dict-item]
         (millrace.OwnPolicy(Linear, ARRAYS, {3: "float32"}), "the name of an array, got 3"),  # type: ignore[dict-item]
