@@ -45,8 +45,8 @@ def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) 
 
 @ALGORITHMS
 def test_bits_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, algo: str) -> None:
-    folders = [run(tmp_path, str(workers), algo=algo, workers=workers) for workers in (1, 2, 4)]
-    assert policy_of(folders[0]) == policy_of(folders[1]) == policy_of(folders[2])
+    folders = [run(tmp_path, str(workers), algo=algo, workers=workers) for workers in (1, 3)]
+    assert policy_of(folders[0]) == policy_of(folders[1])
     for folder in folders:
         for row in read_rows(folder / "metrics.jsonl"):
             own = max(0, row["time/total_timesteps"] - 90)
@@ -109,7 +109,8 @@ def test_the_policy_acts_within_the_bounds_and_so_do_its_episodes(tmp_path: Path
 def test_it_learns_from_prior_data(tmp_path: Path, algo: str, monkeypatch: pytest.MonkeyPatch) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
-    first = run(tmp_path, "recorded", algo=algo, workers=1, record="pendulum/first-v0", steps=1_700)
+    few: dict[str, Any] = {"envs": 2, "lanes": 2, "steps": 450}  # an episode is 200 steps
+    first = run(tmp_path, "recorded", algo=algo, workers=1, record="pendulum/first-v0", **few)
     recorded = minari.load_dataset("pendulum/first-v0")
     actions = np.concatenate([episode.actions for episode in recorded.iterate_episodes()])
     assert np.abs(actions).max() > 1.5, "as the environment took them: Pendulum's bounds are -2 and 2"

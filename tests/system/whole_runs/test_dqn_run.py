@@ -48,21 +48,21 @@ def ratios(folder: Path) -> list[float]:
 )
 def test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:
     policies, found = {}, {}
-    for workers in (1, 2, 4):
+    for workers in (1, 3):
         folder = run(tmp_path, workers=workers, **settings)
         policies[workers] = policy_of(folder)
         found[workers] = ratios(folder)
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["updates"] > 20
-    assert policies[1] == policies[2] == policies[4]
-    assert found[1] == found[2] == found[4]
+    assert policies[1] == policies[3]
+    assert found[1] == found[3]
     assert all(0.8 * BATCH <= 16 * ratio <= BATCH for ratio in found[1])
 
 
 @pytest.mark.parametrize("workers", [1, 4])
 def test_the_replay_ratio_holds_while_collecting_and_learning_overlap(tmp_path: Path, workers: int) -> None:
     """With rollouts up to 4 versions old, a batch may contain a lane twice or not at all. The ratio stays the same."""
-    folder = run(tmp_path, workers=workers, max_lag=4, n_step=3)
+    folder = run(tmp_path, workers=workers, max_lag=4, n_step=3, steps=1_800)
     rows = read_rows(folder / "metrics.jsonl")
     made = rows[-1]["train/n_updates"]
     assert made is not None

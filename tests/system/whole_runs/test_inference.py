@@ -32,11 +32,11 @@ REINFORCE: dict[str, Any] = {"steps": 16_000, "algo": "reinforce", "preset": "no
 @pytest.mark.parametrize(
     ("env", "settings"),
     [
-        ("CartPole-v1", {"steps": 4_000, "n_epochs": 2}),
+        ("CartPole-v1", {"steps": 2_000, "n_epochs": 2}),
         pytest.param("Pendulum-v1", {"steps": 7_000, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
-        ("CartPole-v1", {"steps": 3_000, "core": "lstm", "core_size": 8, "n_epochs": 1, "normalize_observations": True}),
+        ("CartPole-v1", {"steps": 1_500, "core": "lstm", "core_size": 8, "n_epochs": 1, "normalize_observations": True}),
         pytest.param("CartPole-v1", {"steps": 3_000, "algo": "a2c"}, marks=pytest.mark.soak),
-        ("CartPole-v1", {"steps": 2_500, "algo": "dqn"}),
+        ("CartPole-v1", {"steps": 2_000, "algo": "dqn"}),
         pytest.param("CartPole-v1", REINFORCE, marks=pytest.mark.soak),
         pytest.param("CartPole-v1", {"steps": 4_000, "algo": "impala", "max_lag": 0}, marks=pytest.mark.soak),
     ],
@@ -59,11 +59,11 @@ def test_the_weights_equal_those_of_inference_workers(tmp_path: Path, env: str, 
 
 def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     policies = {}
-    for workers, transport in ((1, "ipc"), (2, "tcp"), (3, "inproc"), (5, "ipc")):  # with five workers, one has no lane
-        settings: dict[str, Any] = {"workers": workers, "transport": transport, "steps": 2_500, **SMALL, **IN_LEARNER}
+    for workers, transport in ((1, "inproc"), (3, "tcp"), (5, "ipc")):  # with five workers, one has no lane
+        settings: dict[str, Any] = {"workers": workers, "transport": transport, "steps": 1_500, **SMALL, **IN_LEARNER}
         policies[workers] = policy_of(run(tmp_path, "CartPole-v1", seed=3, **settings))
     assert len(set(policies.values())) == 1
-    other: dict[str, Any] = {"steps": 2_500, **SMALL, **IN_LEARNER}
+    other: dict[str, Any] = {"steps": 1_500, **SMALL, **IN_LEARNER}
     assert policy_of(run(tmp_path, "CartPole-v1", seed=4, **other)) != policies[1], "the seed changes nothing"
 
 

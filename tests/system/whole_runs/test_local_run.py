@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -48,20 +49,26 @@ def inference(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.mark.parametrize(
-    ("env", "settings"),
+    ("env", "settings", "places"),
     [
-        ("CartPole-v1", {"steps": 5_300, "n_epochs": 1}),
-        pytest.param("Pendulum-v1", {"steps": 10_700, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
+        ("CartPole-v1", {"steps": 5_300, "n_epochs": 1}, [(1, "inproc"), (2, "tcp"), (4, "ipc")]),
+        pytest.param(
+            *("Pendulum-v1", {"steps": 10_700, "rollout_steps": 64, "n_epochs": 1}),
+            list(itertools.product((1, 2, 4), ("inproc", "ipc", "tcp"))),
+            marks=pytest.mark.soak,
+        ),
     ],
 )
-def test_the_curve_does_not_depend_on_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
+def test_the_curve_does_not_depend_on_the_number_of_workers(
+    tmp_path: Path, env: str, settings: dict[str, Any], places: list[tuple[int, str]]
+) -> None:
     """20 updates with one seed and the default lanes: the same weights for 1, 2 and 4 workers, over inproc, ipc and tcp."""
     policies: dict[tuple[int | str, str], bytes] = {}
-    for workers in (1, 2, 4):
-        for transport in ("inproc", "ipc", "tcp"):
-            folder = run(tmp_path, env, seed=3, workers=workers, transport=transport, eval_episodes=1, **settings)
-            assert summary(folder)["updates"] >= 20
-            policies[workers, transport] = policy_of(folder)
+    for workers, transport in places:
+        more: dict[str, Any] = {"workers": workers, "transport": transport}
+        folder = run(tmp_path, env, seed=3, eval_episodes=1, **more, **settings)
+        assert summary(folder)["updates"] >= 20
+        policies[workers, transport] = policy_of(folder)
     policies["again", "ipc"] = policy_of(run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings))
     different = {key for key, policy in policies.items() if policy != policies[1, "inproc"]}
     assert not different
@@ -79,7 +86,7 @@ class Uneven(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 def test_with_a_lag_the_curve_does_not_depend_on_who_is_fast(tmp_path: Path) -> None:
     policies, max_lag = set(), 2
-    where: list[tuple[int, Literal["inproc", "ipc"]]] = [(1, "inproc"), (3, "ipc"), (4, "ipc")]
+    where: list[tuple[int, Literal["inproc", "ipc"]]] = [(1, "inproc"), (3, "ipc")]
     for workers, transport in where:
         folder = millrace.train(
             lambda: Uneven(gymnasium.make("CartPole-v1")),
@@ -160,7 +167,7 @@ def test_the_best_policy_of_the_evaluations_is_kept_and_evaluated_again(tmp_path
 
     With some seeds the last one is the best: which seeds these are depends on the processor's last bits.
     """
-    settings: dict[str, Any] = {"steps": 6_000, "eval_every": 500, "eval_episodes": 10, "learning_rate": 0.01}
+    settings: dict[str, Any] = {"steps": 6_000, "eval_every": 500, "eval_episodes": 4, "learning_rate": 0.01}
     for seed in range(3, 8):
         folder = run(tmp_path, "CartPole-v1", seed=seed, **settings)
         if summary(folder)["best"]["env_steps"] < summary(folder)["env_steps"]:
@@ -173,7 +180,7 @@ def test_the_best_policy_of_the_evaluations_is_kept_and_evaluated_again(tmp_path
     best = summary(folder)["best"]
     assert len(evaluations) >= 10
     assert best["chosen_by"] == max(evaluations.values()) == evaluations[best["env_steps"]]
-    assert best["evaluation"]["episodes"] == 10
+    assert best["evaluation"]["episodes"] == 4
     final, kept = (load_policy(folder, which) for which in ("final", "best"))
     assert best["env_steps"] < summary(folder)["env_steps"]
     zeros = [np.zeros((1, 1, 4), np.float32)]
@@ -228,15 +235,15 @@ def test_a_killed_worker_is_replaced_and_the_run_ends_well(
         gone |= killed and (progress.workers_alive == 1 or inference == "learner")
         back |= gone and progress.updates > 6 and progress.workers_alive == 2
         if killed and not back:
-            time.sleep(0.1)  # the other worker's steps must not use up the run before the new one has started
+            time.sleep(0.3)  # the other worker's steps must not use up the run before the new one has started
 
     caplog.set_level("WARNING")
-    folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, inference=inference, **SMALL)
+    folder = run(tmp_path, "CartPole-v1", watch, steps=10_000, inference=inference, **SMALL)
     found = summary(folder)
     assert gone, "nobody noticed that the worker was killed"
     assert back, "the killed worker never came back"
     assert found["stop_reason"] == "all steps done"
-    assert 20_000 - 256 < found["env_steps"] <= 20_000
+    assert 10_000 - 256 < found["env_steps"] <= 10_000
     assert "was killed by SIGKILL" in caplog.text
     balanced(found)
     if inference == "learner":  # it costs only the episodes of its copies
@@ -307,6 +314,7 @@ def test_a_run_learns_with_every_kind_of_space(tmp_path: Path, observation: str,
     settings: dict[str, Any] = {
         "env_kwargs": kwargs,
         "transport": transport,
+        "workers": 1,  # each imports PyTorch if it acts on images
         "rollout_steps": 16,
         "steps": 400,
         "normalize_observations": True,

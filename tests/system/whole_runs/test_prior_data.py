@@ -38,7 +38,7 @@ SMALL: dict[str, Any] = {
     "learning_starts": 300,
     "gradient_steps": 16,
     "eval_episodes": 1,
-    "steps": 1_500,
+    "steps": 1_000,
     "prior": DATASET,
 }
 CLONED: dict[str, Any] = {
