@@ -2,7 +2,7 @@
 
 >>> from millrace.algorithms import PPO
 >>> from millrace.testing import check_algorithm
->>> check_algorithm(PPO, net=(16,), learns=False)
+>>> check_algorithm(PPO, net=(16,), rollout_steps=8, learns=False)
 """
 
 from __future__ import annotations

@@ -46,6 +46,8 @@ def lqr_gain(
         p = (p + p.T) / 2
         if np.abs(p - last).max() <= 1e-10 * np.abs(p).max():
             return np.asarray(gain)
+        if not np.isfinite(p).all():
+            break
     raise ValueError("the Riccati equation did not converge; check the costs and the physical constants")
 
 

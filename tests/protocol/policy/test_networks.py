@@ -77,7 +77,7 @@ def random_weights(spec: PolicySpec, net: ActorCriticNetwork, generator: np.rand
     st.booleans(),
     st.integers(0, 2**32),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_numpy_and_torch_agree(
     observation: str, action: str, activation: Any, net: list[int], normal: bool, seed: int
 ) -> None:

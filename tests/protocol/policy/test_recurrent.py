@@ -268,11 +268,11 @@ def test_values_are_the_same_however_many_columns_are_evaluated_together(monkeyp
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
-    "ppo": {"learning_rate": 3e-3, "learning_rate_schedule": "linear", "batch_size": 128, "n_epochs": 4},
+    "ppo": {"learning_rate": 6e-3, "learning_rate_schedule": "linear", "batch_size": 256, "n_epochs": 4},
     "a2c": {"learning_rate": 2e-2, "optimizer": "adam", "vf_coef": 0.25},
     "impala": {"learning_rate": 2e-2, "optimizer": "adam", "vf_coef": 0.25},
 }
-"""With these, every seed of 0 to 5 gets more than 0.9 with either core, not the tested one alone."""
+"""With these, every seed of 0 to 3 gets more than 0.9 with either core, not the tested one alone."""
 
 
 def learned(name: str, core: Core | None, updates: int) -> float:
@@ -311,11 +311,11 @@ IN_MAKE_TEST = (
     ],
 )
 def test_what_was_shown_is_remembered(name: str, core: Core) -> None:
-    assert learned(name, core, 60) > 0.9
+    assert learned(name, core, 40 if name == "ppo" else 60) > 0.9
 
 
 def test_without_a_core_it_is_not() -> None:
-    assert learned("ppo", None, 60) < 0.6
+    assert learned("ppo", None, 40) < 0.6
 
 
 class Ragged(Scripted):
