@@ -50,11 +50,13 @@ def searched() -> Search:
     return search
 
 
+@pytest.mark.model
 def test_no_rule_is_broken_with_one_fault_of_any_kind(searched: Search) -> None:
     states = len(searched.states)
     assert states > 10_000, f"the model has lost most of its states: {states:,}"
 
 
+@pytest.mark.model
 def test_a_worker_holds_the_versions_that_its_tickets_name(searched: Search) -> None:
     """Else the model would not show what happens when one of two versions is lost."""
     of, held = searched.world.parts, set()
