@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -147,8 +146,8 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
     """CPU cores of each worker, and of the learner"""
     partition: str = ""
     """partition of the cluster; if not given, the cluster's default"""
-    python: Path = Path(sys.executable)
-    """the Python interpreter that has millrace, on every node"""
+    python: Path = Path()
+    """the Python interpreter that has millrace, on every node; if not given, the one that runs this"""
 
 
 class RayFlags(LaunchFlags, frozen=True, kw_only=True):
