@@ -118,7 +118,9 @@ def _call(callback: object, moment: str, progress: Progress) -> object:
     try:
         return method(progress)
     except BaseException as error:
-        error.add_note(one_line(f"raised in {_name(callback, moment)}", 300))
+        note = one_line(f"raised in {_name(callback, moment)}", 300)
+        if note not in getattr(error, "__notes__", ()):  # a function may raise it again when the run ends
+            error.add_note(note)
         raise
 
 

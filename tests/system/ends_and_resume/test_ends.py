@@ -73,7 +73,7 @@ def test_a_watch_that_raises(tmp_path: Path, error: BaseException, max_lag: int)
         run(tmp_path, raises_at(5, error), max_lag=max_lag)
     folder = folder_of(tmp_path / "runs")
     assert caught.value is error
-    assert error.__notes__ == how_to_go_on(folder)
+    assert error.__notes__ == ["raised in watch", *how_to_go_on(folder)]
     assert saved(folder) == 5
     told = summary(folder)
     assert told["stop_reason"] in ("UsersError: no", "interrupted", "SystemExit: 3")
@@ -335,7 +335,8 @@ def test_a_run_that_is_cut_short_while_the_disk_is_full(tmp_path: Path, monkeypa
     if how == "SIGTERM":
         assert "not written: No space left on device" in str(caught.value)
     assert saved(folder_of(tmp_path / "runs")) == 1
-    assert caught.value.__notes__ == how_to_go_on(folder_of(tmp_path / "runs"))
+    notes = caught.value.__notes__
+    assert notes == ["raised in watch"] * (how != "SIGTERM") + how_to_go_on(folder_of(tmp_path / "runs"))
 
 
 NAMES = ["[red]x[/red]", "with space", "öäü ✓ 学", "%s{0}", "a'b\"c", "-dash", "[0-9]*?"]
