@@ -57,9 +57,8 @@ def test_python_m_millrace_says_one_line_without_a_traceback(tmp_path: Path) -> 
 
 
 def test_a_gymnasium_that_is_too_old_is_said_in_one_line(tmp_path: Path) -> None:
-    info = tmp_path / "gymnasium-0.29.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: gymnasium\nVersion: 0.29.1\n")
+    (tmp_path / "gymnasium").mkdir()
+    (tmp_path / "gymnasium" / "__init__.py").write_text('__version__ = "0.29.1"\n')
     done = python(tmp_path, "-m", "millrace", "train", "CartPole-v1")
     assert done.returncode == 2
     assert done.stderr.startswith("millrace: gymnasium 0.29.1 is too old")
