@@ -6,7 +6,10 @@ so its env steps per second are said instead.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+
 from learner.members.membership import Member
+from protocol.messages import WorkerActivity
 
 DOING = {
     "describing": "in construction",
@@ -17,6 +20,7 @@ DOING = {
     "closing": "in close",
 }
 """What a worker does, in words. A worker without a supervisor does not say it."""
+MOST_TOLD = 4  # workers of which one line says what they do
 LONG_S = 2.0  # what takes less time is not worth a word; by default, heartbeats come every second
 
 
@@ -38,3 +42,19 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
     elif row.doing_s >= LONG_S and row.doing in DOING:
         seconds, what = row.doing_s, in_words(row.doing, row.doing_s)
     return seconds, -row.steps_per_s, f"worker {row.worker} on {row.host}: {what}"
+
+
+def what_they_do(
+    members: Iterable[Member], running: Iterable[WorkerActivity], said: Mapping[str, str], now: float
+) -> tuple[str, list[str]]:
+    """What the members do, those that are held up longest first, and then the worker processes that have not joined; and a
+    line for each worker that wrote something.
+
+    `said`: the last line of each worker's log, by its name.
+    """
+    members = list(members)
+    lines = [line for *_, line in sorted((held_up(member, now) for member in members), reverse=True)]
+    joined = {member.hello.worker for member in members}
+    lines += [f"worker {one.worker}: {in_words(one.doing, one.for_s)}" for one in running if one.worker not in joined]
+    more = [f"{len(lines) - MOST_TOLD} more"] if len(lines) > MOST_TOLD else []
+    return ", ".join([*lines[:MOST_TOLD], *more]), [f"{name} wrote: {line}" for name, line in [*said.items()][:MOST_TOLD]]

@@ -31,7 +31,7 @@ from learner.members.events import (
     WorkerRefused,
     describe,
 )
-from learner.members.held_up import held_up, in_words
+from learner.members.held_up import what_they_do
 from learner.members.join_limiter import JoinLimiter
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
@@ -54,7 +54,6 @@ TURN_S = 0.2  # of reading messages, at most, before the caller may go on
 SHORT_TURN_S = 0.003  # at least so much, also in a short turn
 FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
 LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way
-MOST_TOLD = 4  # workers of which one line says what they do
 STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
 
 
@@ -102,7 +101,9 @@ class MemberServer:
         self._link, self._coordinator, self._callbacks, self._processes = link, coordinator, callbacks, processes
         self._membership = coordinator.membership
         self._settings, self._clock = settings or ServerSettings(), clock
-        self._log, self._keys = MemberLog(link, clock), KeyRevocation(link)
+        self._keys = KeyRevocation(link)
+        self.member_log = MemberLog(link, clock)
+        """lines about members, few for each peer"""
         self._remove_silent_from_s = self.listened_s
         self._ask_processes_s = self.listened_s
         self._no_members_since_s = math.inf
@@ -154,10 +155,6 @@ class MemberServer:
             self._callbacks.sent(peer)
         if self._membership.events:
             self._log_events(cause)
-
-    def warn_limited(self, peer: bytes, line: str) -> None:
-        """Warn about what a peer sent; few lines for each peer."""
-        self._log.warn_limited(peer, line)
 
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
         """Call `turn`, which listens, until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`.
@@ -213,14 +210,9 @@ class MemberServer:
 
     def what_workers_do(self) -> str:
         """What the workers do, those that are held up longest first, and what is awaited if there are none."""
-        now, members = self._clock(), self._membership.members.values()
-        lines = [line for *_, line in sorted((held_up(member, now) for member in members), reverse=True)]
-        joined = {member.hello.worker for member in members}
-        running = [each for each in self._processes.running() if each.worker not in joined]
-        lines += [f"worker {each.worker}: {in_words(each.doing, each.for_s)}" for each in running]
-        more = [f"{len(lines) - MOST_TOLD} more"] if len(lines) > MOST_TOLD else []
-        said = [f"{name} wrote: {line}" for name, line in [*self._processes.said().items()][:MOST_TOLD]]
-        return "; ".join([", ".join([*lines[:MOST_TOLD], *more]) or f"waiting for {self.awaited()}", *said])
+        members, processes = self._membership.members.values(), self._processes
+        doing, wrote = what_they_do(members, processes.running(), processes.said(), self._clock())
+        return "; ".join([doing or f"waiting for {self.awaited()}", *wrote])
 
     def awaited(self) -> str:
         """What is awaited without a worker, with the known reasons why workers may be missing."""
@@ -239,7 +231,7 @@ class MemberServer:
         try:
             match message:
                 case BadMessage():
-                    self.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
+                    self.member_log.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
                     return self._coordinator.reject_message(peer, str(message), now)
                 case Inquire():
                     self._link.send(peer, self._status_frames(now))
@@ -313,7 +305,7 @@ class MemberServer:
                 case _:
                     pass
             if self._settings.log_joins or not isinstance(event, WorkerJoined):
-                self._log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
+                self.member_log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
             self._callbacks.event(event)
 
 

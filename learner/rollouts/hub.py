@@ -328,7 +328,7 @@ class Hub:
             validate(message, self.coordinator.run)
         except BadRollout as error:
             why = f"worker {name_for_people(peer)}: rollout of ticket {message.ticket}: {error}"
-            self._server.warn_limited(peer, why)
+            self._server.member_log.warn_limited(peer, why)
             return self.coordinator.reject_rollout(peer, message, why, now)
         waiting = self.coordinator.rollouts.waiting()
         out = self.coordinator.receive(peer, message, now)
