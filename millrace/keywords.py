@@ -358,8 +358,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     """td3: Clip the noise of targets to ± this."""
 
 
-class EvaluateKeywords(TypedDict, total=False):
-    """Keywords of `millrace.evaluate`."""
+class PlayKeywords(TypedDict, total=False):
+    """Keywords of `millrace.evaluate` and `millrace.record`."""
 
     best: bool
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
@@ -373,6 +373,11 @@ class EvaluateKeywords(TypedDict, total=False):
     """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
     max_env_failures: int
     """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
+
+
+class EvaluateKeywords(PlayKeywords, total=False):
+    """Keywords of `millrace.evaluate`."""
+
     seed: int
     """seed of the episodes"""
     copies: int
@@ -383,21 +388,9 @@ class EvaluateKeywords(TypedDict, total=False):
     """film the episodes: an mp4 of each in the folder videos of the run (pip install moviepy pygame-ce)"""
 
 
-class RecordKeywords(TypedDict, total=False):
+class RecordKeywords(PlayKeywords, total=False):
     """Keywords of `millrace.record`."""
 
-    best: bool
-    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
-    workers: int
-    """number of worker processes that play the episodes; the result does not depend on it"""
-    transport: Literal["inproc", "ipc", "tcp"]
-    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
-    bind: str
-    """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
-    inference: Literal["workers", "learner"]
-    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
-    max_env_failures: int
-    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
     npy: str | PathLike[str] | None
     """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
     stochastic: bool

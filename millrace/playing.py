@@ -28,7 +28,7 @@ from protocol.errors import UsageError, did_you_mean
 from protocol.flags.fields import fields_of
 from protocol.flags.values import read_value
 
-NOT_KEYWORDS = ("wrappers",)  # in Python they are `wrappers`
+NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are handed on apart
 ShowPlayed = Callable[[str], None]
 """Gets how far it is, as text."""
 _Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)

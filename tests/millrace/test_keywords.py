@@ -19,7 +19,7 @@ import millrace
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.rollout_config import RolloutConfig
-from millrace.cli.flags import EvaluateFlags, RecordFlags
+from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
 from protocol.flags.field_texts import field_texts
 
 MODULE = Path(millrace.__file__).with_name("keywords.py")
@@ -46,13 +46,20 @@ def module() -> str:
     records = (
         ("RolloutKeywords", "TypedDict", RolloutConfig, in_signature),
         ("TrainKeywords", "RolloutKeywords", Config, (*in_signature, *RolloutConfig.__struct_fields__)),
-        ("EvaluateKeywords", "TypedDict", EvaluateFlags, in_signature),
-        ("RecordKeywords", "TypedDict", RecordFlags, (*in_signature, "steps")),
+        ("PlayKeywords", "TypedDict", PlayFlags, in_signature),
+        ("EvaluateKeywords", "PlayKeywords", EvaluateFlags, (*in_signature, *PlayFlags.__struct_fields__)),
+        ("RecordKeywords", "PlayKeywords", RecordFlags, (*in_signature, *PlayFlags.__struct_fields__, "steps")),
     )
-    functions = ("RolloutService", "train", "evaluate", "record")
+    functions = (
+        "`millrace.RolloutService`",
+        "`millrace.train`",
+        "`millrace.evaluate` and `millrace.record`",
+        "`millrace.evaluate`",
+        "`millrace.record`",
+    )
     parts = [HEAD]
     for (name, base, record, without), function in zip(records, functions, strict=True):
-        parts.append(f'\n\nclass {name}({base}, total=False):\n    """Keywords of `millrace.{function}`."""\n\n')
+        parts.append(f'\n\nclass {name}({base}, total=False):\n    """Keywords of {function}."""\n\n')
         hints, texts = get_type_hints(record, include_extras=True), field_texts(record)
         parts += [entry(field, [hints[field]], text) for field, text in texts.items() if field not in without]
         parts += of_algorithms() if record is Config else ()
