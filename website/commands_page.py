@@ -19,7 +19,7 @@ from millrace.cli.main import main
 
 HEAD = """# Commands
 
-Look here for the flags of a command. This is what `millrace COMMAND --help` prints.
+What `millrace COMMAND --help` prints, for every command.
 [Commands](../how-to/commands.md) shows how they are used. [Settings](settings.md) has a table of the settings of a run.
 
 """

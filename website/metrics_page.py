@@ -17,7 +17,7 @@ from website.tables import anchored
 
 HEAD = """# Metrics
 
-Look here for the meaning of a number in a log. `metrics.jsonl` in the [run folder](run_folder.md) has a row for each update;
+What each number in a log means. `metrics.jsonl` in the [run folder](run_folder.md) has a row for each update;
 `millrace.Run(path).metrics` reads it. TensorBoard shows the same numbers under the same names, and so do the
 [W&B and MLflow callbacks](../how-to/callbacks.md#weights--biases). Names are those of Stable-Baselines3 where it has one.
 A number that does not exist yet is missing or null. `ledger/…` and `stage/…` count from the beginning of the run.

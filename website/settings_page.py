@@ -21,7 +21,7 @@ from website.tables import anchored
 
 HEAD = """# Settings
 
-Look here for the name, the range and the default of a setting. Each setting of a run has one name in three places:
+Every setting of a run, with its range and its default. A setting has one name in three places:
 
 - as a flag of `millrace train` and `millrace learner`, with dashes: `--eval-every 1000`;
 - as a key of a TOML file for `--config`, with underscores: `eval_every = 1000`;

@@ -166,10 +166,11 @@ class SentLanes:
 
     def take(self) -> Ready:
         """The lanes that are ready. They have come back now."""
-        results, losses, all_ready = dict(sorted(self._results.items())), self._losses, self.all_ready
+        ready = Ready(dict(sorted(self._results.items())), self._losses)
         self._results, self._losses = {}, {}
-        self.sent = {} if all_ready else {lane: sent for lane, sent in self.sent.items() if lane not in results}
-        return Ready(results, losses)
+        for lane in ready.results:
+            del self.sent[lane]
+        return ready
 
     def _copies(self, lanes: Iterable[int]) -> list[int]:
         found: list[int] = []

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from millrace.cli.flags import SlurmFlags
 from millrace.launch.launcher_flags import learner_flags
@@ -20,7 +19,6 @@ from protocol.home_folder import expanded
 def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
     """The script for sbatch. `rest` are the user's flags for the learner. Raises `UsageError`."""
     folder = expanded(flags.folder, "folder").absolute()
-    python = sys.executable if flags.python == Path() else str(flags.python)
     for text in (str(folder), flags.time, flags.partition):
         if any(character.isspace() or character in "%\"'\\" for character in text):
             raise UsageError(f"{text!r}: sbatch takes no spaces, quotes or % in its options; choose another name")
@@ -43,7 +41,7 @@ def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
 
 set -u
 folder={shlex.quote(str(folder))}
-millrace=({shlex.quote(python)} -m millrace)
+millrace=({shlex.quote(str(flags.python if flags.python.name else sys.executable))} -m millrace)
 token=$folder/keys/default.token
 [ -e "$token" ] || "${{millrace[@]}}" keys new default --keys "$folder/keys" || exit
 port=$((20000 + SLURM_JOB_ID % 20000))  # a port for each job: other jobs may have this node too

@@ -70,11 +70,12 @@ def find(env_id: str) -> list[str]:
     failed: list[str] = []
     for package in installed_packages():
         for module in package.registering(env_id):
-            if not is_registered(env_id):
-                with _quietly(module, failed):
-                    imported = importlib.import_module(module)
-                    if not is_registered(env_id):  # some have a function of this name, which others would call
-                        getattr(imported, "register_envs", bool)()
+            with _quietly(module, failed):
+                imported = importlib.import_module(module)
+                if not is_registered(env_id):  # some have a function of this name, which others would call
+                    getattr(imported, "register_envs", bool)()
+            if is_registered(env_id):
+                return failed  # the texts of the other packages need not be read
     return failed + load_plugins(env_id)
 
 

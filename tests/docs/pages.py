@@ -32,7 +32,7 @@ def written() -> dict[str, str]:
         *ROOT.glob("docs/**/*.md"),
         *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/README.md")),
     ]
-    paths += [ROOT / "protocol" / "README.md"]
+    paths += [ROOT / "protocol" / "README.md", ROOT / "examples" / "README.md"]
     return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in sorted(paths)}
 
 

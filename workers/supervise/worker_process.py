@@ -39,6 +39,7 @@ WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
 CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments and ended within this time
 KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
+LONGEST_OUTPUT = 1 << 20  # bytes of a log that are read for what it ends with
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -244,11 +245,11 @@ class WorkerProcess:
         return Ending(code, one_line(line), failed=failed, worked=worked)
 
     def _output(self) -> str:
-        """What it has written to its log."""
+        """What it has written to its log, the end of it if that is long: a simulator may write without a limit."""
         with suppress(OSError):  # the log may have been deleted
             if self._log is not None:
                 with self._log.open("rb") as log:
-                    log.seek(self._log_from)
+                    log.seek(max(self._log_from, log.seek(0, os.SEEK_END) - LONGEST_OUTPUT))
                     return log.read().decode(errors="replace")
         return ""
 
