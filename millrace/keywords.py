@@ -99,11 +99,11 @@ class RolloutKeywords(TypedDict, total=False):
     step_timeout_s: float
     """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
     max_env_failures: int
-    """End the run when a lane fails more often than this in a row, without a rollout in between, and at the latest after
-    10 failures in a row; or when, within an hour, more failures than this came after env steps, and as many again for
-    each env copy and each hour since the learner began. A failure is an exception or an unusable result of the
-    environment or of an `OwnPolicy`, or the end of a worker process without an order: the environment may have ended
-    it.
+    """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
+    between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this ×
+    (1 + env copies × hours since the learner began, at most 1). A failure is an exception or an unusable result of the
+    environment or of an `OwnPolicy`, or a worker process that ends without being told to: the environment may have
+    ended it.
     """
 
 

@@ -27,13 +27,15 @@ Every setting of a run, with its range and its default. A setting has one name i
 - as a key of a TOML file for `--config`, with underscores: `eval_every = 1000`;
 - as a keyword of `millrace.train`, with underscores: `eval_every=1000`.
 
-Settings of an algorithm stand in a table of the TOML file that has the algorithm's name, as `[ppo]`. Keyword arguments
-of the environment stand in the tables `[env_kwargs]` and `[eval_env_kwargs]`. A flag wins over `--config`, and `--config`
-wins over a preset. The config.toml of a run folder has every setting of that run.
+In a TOML file, the settings of an algorithm are in a table with the algorithm's name, such as `[ppo]`, and keyword
+arguments of the environment are in the tables `[env_kwargs]` and `[eval_env_kwargs]`. A flag overrides `--config`, and
+`--config` overrides a preset. The file `config.toml` of a run folder has every setting of that run.
 
-A list is written as `--net 64 64` and as `net = [64, 64]`. A setting that may be none is written as `--core none` and as
-`core = "none"`. A setting that is true or false is written as `--shared-net` or `--no-shared-net`, and as
-`shared_net = true`.
+| kind of setting | as a flag | in a TOML file |
+|---|---|---|
+| a list | `--net 64 64` | `net = [64, 64]` |
+| true or false | `--shared-net`, `--no-shared-net` | `shared_net = true` |
+| none, where it is allowed | `--core none` | `core = "none"` |
 
 The column "on resume" says what happens if a [resumed run](../how-to/resume.md) gets another value:
 
@@ -47,7 +49,7 @@ def page() -> str:
     parts = [HEAD + "".join(f"- **{one.name.lower()}**: {one.value}\n" for one in OnResume)]
     parts.append("\n## Basics\n\n" + _table(Config, [name for name in BASIC if name not in LAYERS]))
     parts.append(
-        "\n## Where settings come from\n\nThese flags are no settings: no TOML file and no run folder holds them.\n\n"
+        "\n## Where settings come from\n\nThese flags are no settings, so TOML files and run folders don't contain them.\n\n"
         + _table(RunFlags, LAYERS)
     )
     for title, names in GROUPS.items():
