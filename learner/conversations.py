@@ -11,15 +11,17 @@ import os
 from collections.abc import Callable, Sequence
 
 from learner.config.rollout_config import RolloutConfig
+from learner.env_spaces import EnvSpaces
 from learner.members.describe import DescribeSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import TicketCoordinator
+from protocol.bounds import MAX_FACTS
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import ExtraArray, PolicySpec, RunSpec
+from protocol.specs import ExtraArray, PolicySpec, RunSpec, seat_returns
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import has_zstd
 from protocol.wire.learner_link import LearnerLink
@@ -33,17 +35,21 @@ def rollout_spec(
     rollout_steps: int,
     extras: tuple[ExtraArray, ...] = (),
     *,
-    masked: bool = False,
+    spaces: EnvSpaces,
 ) -> RunSpec:
     """The specification that `Welcome` carries. Raises `UsageError` if it cannot be sent, or settings and policy do not fit.
 
     `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
-    `masked`: whether workers read masks of the allowed actions.
+    `spaces`: those of the environment.
     """
+    masked, seats = spaces.masked, spaces.seats
     if masked and config.vector == "envpool":
         raise UsageError(
             "vector envpool: its environments report no action masks; use --vector loop, or --action-masks none"
         )
+    if seats and config.vector != "loop":
+        raise UsageError(f"vector {config.vector}: {env.id} has several agents, whose copies are looped; use --vector loop")
+    returns = seat_returns(seats) if len(seats) + len(config.info_keys) <= MAX_FACTS else ()
     run = RunSpec(
         env=env,
         policy=policy,
@@ -56,7 +62,9 @@ def rollout_spec(
         images_dtype=config.acting_dtype if policy.convolves else "float32",
         masked=masked,
         extras=extras,
-        facts=config.info_keys,
+        facts=config.info_keys + returns,
+        seats=seats,
+        takes_turns=spaces.takes_turns,
         heartbeat_s=config.heartbeat_s(),
     )
     _check_weights_can_be_sent(env.id, policy, config)

@@ -20,6 +20,10 @@ class EnvSpaces(NamedTuple):
     """Time limit of an episode in env steps; None if there is none, or it is not known."""
     masked: bool = False
     """Whether the run uses action masks. A mask in an observation is not one of `observation`."""
+    seats: tuple[str, ...] = ()
+    """The names of its agents, whose spaces these are; empty if it is gymnasium's."""
+    takes_turns: bool = False
+    """Whether a seat may have to wait for others between two of its actions."""
 
     @staticmethod
     def of_description(env: DescribedEnv, action_masks: Literal["auto", "info", "none"] = "auto") -> EnvSpaces:
@@ -40,7 +44,7 @@ class EnvSpaces(NamedTuple):
             )
         if twice := sorted({path for path in paths if paths.count(path) > 1}):
             raise UsageError(f"observation space: expected a name for each array, got two that are called {twice[0]}")
-        return EnvSpaces(leaves, action, env.max_episode_steps, masked)
+        return EnvSpaces(leaves, action, env.max_episode_steps, masked, env.seats, env.takes_turns)
 
     @staticmethod
     def of_policy(policy: PolicySpec) -> EnvSpaces:

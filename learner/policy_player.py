@@ -39,6 +39,8 @@ class SavedPolicy(NamedTuple):
     """names of the numbers that the run logs of each episode"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
+    seats: tuple[str, ...] = ()
+    """the names of its agents"""
 
 
 def saved_policy(
@@ -52,7 +54,7 @@ def saved_policy(
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     outer = card.wrappers if wrappers is None else wrappers
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
-    return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked)
+    return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked, card.seats)
 
 
 class PolicyPlayer:
@@ -127,6 +129,7 @@ class PolicyPlayer:
             seed=0,
             facts=policy.facts,
             masked=policy.masked,
+            seats=policy.seats,
             heartbeat_s=settings.heartbeat_s(),
         )
         hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)

@@ -111,7 +111,7 @@ Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
 
 def named_environment(config: Config) -> EnvSpec:
     """The environment that the settings name."""
-    return EnvSpec.of(config.env, config.env_kwargs, config.wrappers, config.eval_env_kwargs)
+    return EnvSpec.of(config.env, config.env_kwargs, config.all_wrappers(), config.eval_env_kwargs)
 
 
 def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, describe: Describe) -> KnownEnvironment:

@@ -22,7 +22,10 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
     policy = _policy_spec(config, spaces)
     if algorithm_class(config.algo).whole_episodes:
         _check_room_for_whole_episodes(config, spaces.max_episode_steps)
-    return rollout_spec(config, env, policy, config.algorithm.rollout_steps, masked=spaces.masked)
+    for setting in ("prior", "record"):
+        if spaces.seats and getattr(config, setting):
+            raise UsageError(f"{setting}: expected none, because {config.env} has several agents and a dataset has one")
+    return rollout_spec(config, env, policy, config.algorithm.rollout_steps, spaces=spaces)
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:

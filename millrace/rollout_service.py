@@ -169,7 +169,7 @@ class RolloutService:
         self._window, self._steps_before, self._began_s = EpisodeWindow(), self.env_steps, time.monotonic()
         self._normalizer: Normalizer | None = None
         self._resources = ExitStack()
-        spec = EnvSpec.of(env, config.env_kwargs, wrappers, config.eval_env_kwargs)
+        spec = EnvSpec.of(env, config.env_kwargs, config.all_wrappers(wrappers), config.eval_env_kwargs)
         try:
             with self._interrupts:
                 self._hub, self.run, described = start(

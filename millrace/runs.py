@@ -290,7 +290,7 @@ def train(
     objects |= {} if wrappers is None else {"wrappers": wrappers}
     spec = None
     if not isinstance(env, str) or wrappers is not None:
-        outer = resolved.wrappers if wrappers is None else wrappers
+        outer = resolved.all_wrappers(wrappers)
         spec = EnvSpec.of(
             resolved.env if isinstance(env, str) else env, resolved.env_kwargs, outer, resolved.eval_env_kwargs
         )

@@ -26,6 +26,7 @@ from gymnasium.vector import VectorEnv
 from protocol.bounds import one_line
 from protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of
 from protocol.envs.make_env import made_by_callable, made_by_id, made_without_checker, names_a_function, why_not_made
+from protocol.envs.seats import has_seats, seated
 from protocol.envs.unknown_ids import (
     find,
     ids_of_gymnasium,
@@ -195,7 +196,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
                 "with a token (and not with --no-code), else name it as my_module:MyEnv-v0"
             )
-        if self.factory is None and ":" in self.id and code is AllowedCode.REGISTERED:
+        if self.factory is None and (":" in self.id or names_a_function(self.id)) and code is AllowedCode.REGISTERED:
             return (
                 f"environment {self.id} imports a module, which this worker does not do for a learner it is not sure of; "
                 "give it a token (and not --no-code)"
@@ -218,8 +219,13 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Make one env copy, in its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
 
-        `detail` of the error is the traceback if a constructor raised.
+        An environment of PettingZoo becomes one with seats. `detail` of the error is the traceback if a constructor raised.
         """
+        made = self.make_as_given(render_mode)
+        return seated(made, self.id) if has_seats(made) else made  # type: ignore[no-any-return]
+
+    def make_as_given(self, render_mode: str | None = None) -> Any:
+        """As `make`, but an environment of PettingZoo stays one."""
         kwargs = self.kwargs_of_copy() | ({} if render_mode is None else {"render_mode": render_mode})
         if self.factory is not None:
             return made_by_callable(self.id, self.factory.load(), kwargs)
@@ -247,7 +253,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def _made(self, make: Callable[[str], _Made]) -> _Made:
         """Call `make` with the id. Raises `UsageError`."""
         registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
-        plain = registrar is None and ":" not in self.id
+        plain = registrar is None and ":" not in self.id and not names_a_function(self.id)
         failed = find(self.id) if plain and not is_registered(self.id) else []
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
@@ -295,11 +301,11 @@ class _Factory:
         """
         self._name, self._env, self._wrappers, self._specs = name, env, wrappers, specs
 
-    def __call__(self, render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
+    def __call__(self, render_mode: str | None = None, **kwargs: Scalar) -> Any:
         for spec in self._specs:
             gymnasium.registry.setdefault(spec.id, spec)
         if self._env is None:
-            env = EnvSpec(self._name, kwargs).make(render_mode)
+            env = EnvSpec(self._name, kwargs).make_as_given(render_mode)
         else:
             env = made_by_callable(
                 self._name, self._env, kwargs | ({} if render_mode is None else {"render_mode": render_mode})

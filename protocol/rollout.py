@@ -7,6 +7,17 @@ Hence, for every copy:
     valid[t+1]  ==  not (terminated[t] or truncated[t])
 
 If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay buffer) masks with `valid`.
+
+With several agents, a column is one seat of a copy (`protocol.envs.seats`), and more rows are not valid: those of a seat
+that waits for others, or is not there. A seat's row is the one in which its outcome comes: until then `obs` shows the
+observation in which the seat acted, and `action` and `log_prob` what it did, and the row after it shows what it saw next.
+So the sentence above holds for every valid row, and one rule is added: *a row that is not valid passes through*. What is
+carried from a seat's row to its next one, a return or a recurrent state, is not changed by the rows between. `ended` cuts,
+as ever. `resets` says which steps only reset the copy:
+
+    an ended row is valid, and no later row of that seat is until its copy is reset
+    a step that resets has no valid row
+    if the agents take no turns, a valid row that has not ended is followed by a valid one
 """
 
 from __future__ import annotations
@@ -67,22 +78,32 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     """[T+1, N, choices] bool: which actions were allowed in `obs`; none unless `RunSpec.masked`"""
     extras: tuple[Array, ...] = ()
     """one array [T, N, *shape] for each of `RunSpec.extras`"""
+    resets: Array | None = None
+    """[T+1, N] bool, with seats: whether step t only resets this copy; the last row is of the next rollout's first step. The
+    N of all other arrays is then `RunSpec.columns`. None without seats: it is ~valid"""
 
     @property
     def env_steps(self) -> int:
-        """Number of valid transitions."""
-        return int(np.count_nonzero(self.valid))
+        """Number of steps of env copies, without those that only reset one."""
+        return _env_steps(self.valid, self.resets)
+
+
+def _env_steps(valid: Array, resets: Array | None) -> int:
+    if resets is None:
+        return int(np.count_nonzero(valid))
+    return int(np.count_nonzero(np.atleast_1d(resets)[:-1] == 0))  # also of a rollout that was not checked
 
 
 def rollout_bytes(run: RunSpec) -> int:
     """Number of bytes of all arrays of a rollout of this run."""
-    T, N = run.rollout_steps, run.copies
+    T, N = run.rollout_steps, run.columns
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.observation]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
     if run.masked:
         steps.append((T + 1, (sum(run.policy.action.sizes),), "bool"))
     steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
     flags = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
+    flags += (T + 1) * run.copies if run.seats else 0  # resets
     return flags + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
 
 
@@ -107,17 +128,19 @@ class Batch(msgspec.Struct, frozen=True):
     """[ΣN] True where no state carries over from an earlier rollout: the column's lane has just been started, or a rollout
     between the two was not used"""
     copies: int
-    """N: each lane has this many adjacent columns, or a multiple if the batch has several of its rollouts"""
+    """N: each lane has this many adjacent columns, or a multiple if the batch has several of its rollouts; with seats N · A"""
     episodes: tuple[Episode, ...]
     extras: tuple[Array, ...] = ()
     """one array [T, ΣN, *shape] for each of `RunSpec.extras`"""
     mask: Bools | None = None
     """[T+1, ΣN, choices] which actions were allowed in `obs`; None unless the run uses action masks"""
+    resets: Bools | None = None
+    """[T+1, copies of all lanes] which steps only reset a copy; None unless the environment has seats"""
 
     @property
     def env_steps(self) -> int:
-        """Number of valid transitions."""
-        return int(np.count_nonzero(self.valid))
+        """Number of steps of env copies, without those that only reset one."""
+        return _env_steps(self.valid, self.resets)
 
 
 def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = None) -> Batch:
@@ -149,4 +172,5 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = N
         episodes=tuple(episode for row in rows for episode in row.episodes),
         extras=tuple(side_by_side(arrays) for arrays in zip(*(row.extras for row in rows), strict=True)),
         mask=None if rows[0].mask is None else side_by_side([row.mask for row in rows if row.mask is not None]),
+        resets=None if rows[0].resets is None else side_by_side([row.resets for row in rows if row.resets is not None]),
     )

@@ -21,6 +21,7 @@ MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in a frame of 
 MAX_DEPTH = 8
 MAX_WRAPPERS = 1 << 8  # classes of an environment's wrappers
 MAX_SPACES = 1 << 12  # of an environment, those inside others included, if they have random generators
+MAX_SEATS = 1 << 10  # agents of an environment
 MAX_ELEMENTS = 1 << 24  # of all leaves of a space together
 
 Shape = Annotated[tuple[Natural, ...], Meta(max_length=8)]
@@ -110,6 +111,10 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     """
     wrappers: Annotated[tuple[Line, ...], Meta(max_length=MAX_WRAPPERS)] = ()
     """the classes of the copy's gymnasium wrappers, as `module:Class`, and the wrappers from which these classes derive"""
+    seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
+    """the names of the agents, if the environment has several or takes PettingZoo's form; the spaces are those of each"""
+    takes_turns: bool = False
+    """whether a seat may have to wait for others between two of its actions"""
 
 
 def check_size(description: EnvDescription) -> None:

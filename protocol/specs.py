@@ -210,9 +210,33 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """names of numbers that the environment reports in `info` when an episode ends"""
     extras: tuple[ExtraArray, ...] = ()
     """further arrays of each rollout"""
+    seats: tuple[str, ...] = ()
+    """names of the A agents of each copy; empty if the environment is gymnasium's, which has one"""
+    takes_turns: bool = False
+    """whether a seat may have to wait for others between two of its actions"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
+
+    @property
+    def columns(self) -> int:
+        """N · A, the columns of a rollout: those of a copy's seats are adjacent."""
+        return self.copies * self.seats_of_copy
+
+    @property
+    def info_keys(self) -> tuple[str, ...]:
+        """The facts that an environment reports; the others, the last ones, are the returns of the seats."""
+        return self.facts[: len(self.facts) - len(self.seats)] if self.has_seat_returns else self.facts
+
+    @property
+    def has_seat_returns(self) -> bool:
+        """Whether the return of each seat is a fact of an episode: where there are not too many."""
+        return bool(self.seats) and self.facts[-len(self.seats) :] == seat_returns(self.seats)
+
+    @property
+    def seats_of_copy(self) -> int:
+        """A, 1 for an environment of gymnasium's."""
+        return max(1, len(self.seats))
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
@@ -220,6 +244,11 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
             if called is not None and (why := code.refuses_to_call(f"{what} {called.factory}")):
                 return why
         return self.env.rejection_reason(code)
+
+
+def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:
+    """The names of the returns of these seats among the facts of an episode."""
+    return tuple(f"return_{seat}" for seat in seats)
 
 
 class StepSpec(msgspec.Struct, frozen=True, tag=True):

@@ -41,6 +41,10 @@ class RolloutActions(Protocol):
         """After T steps: those of lane i."""
         ...
 
+    def written(self, i: int) -> list[Array]:
+        """All arrays [T, N, …] of lane i that `act` writes, one row for each step."""
+        ...
+
 
 class Acting(Protocol):
     """A policy as the collector and the evaluator use it."""
@@ -94,7 +98,7 @@ class _BuiltInActing:
 class _BuiltInActions:
     def __init__(self, acting: _BuiltInActing, generators: Sequence[np.random.Generator]) -> None:
         run, self._distribution, self._params_of = acting.run, acting.distribution, acting.params
-        L, T, N, action = len(generators), run.rollout_steps, run.copies, run.policy.action
+        L, T, N, action = len(generators), run.rollout_steps, run.columns, run.policy.action
         self._noise = np.stack([self._distribution.noise(generator, (T, N)) for generator in generators])  # [L, T, N, noise]
         self._params = np.empty((L, T, N, self._distribution.params_size), np.float32)
         self._action = np.empty((L, T, N, *action.shape), action.stored_dtype)
@@ -109,6 +113,9 @@ class _BuiltInActions:
     def columns(self, i: int) -> ActedRows:
         log_prob = self._distribution.log_prob(self._params[i], self._action[i], self._noise[i])
         return ActedRows(self._action[i], log_prob, ())
+
+    def written(self, i: int) -> list[Array]:
+        return [self._params[i], self._action[i], self._noise[i]]
 
 
 class _OwnActing:
@@ -134,7 +141,7 @@ class _OwnActions:
     def __init__(self, acting: _OwnActing, generators: Sequence[np.random.Generator]) -> None:
         run, self._policy, self._generators = acting.run, acting.policy, generators
         self._masked = run.masked
-        lead, action = (len(generators), run.rollout_steps, run.copies), run.policy.action
+        lead, action = (len(generators), run.rollout_steps, run.columns), run.policy.action
         self._action = np.empty((*lead, *action.shape), action.stored_dtype)
         self._extras = [np.empty((*lead, *extra.shape), extra.dtype) for extra in run.extras]
         self._log_prob = np.zeros(lead, np.float32)
@@ -151,6 +158,9 @@ class _OwnActions:
 
     def columns(self, i: int) -> ActedRows:
         return ActedRows(self._action[i], self._log_prob[i], tuple(extra[i] for extra in self._extras))
+
+    def written(self, i: int) -> list[Array]:
+        return [self._action[i], *(array[i] for array in self._written)]
 
 
 def _split(obs: list[Array], masked: bool) -> tuple[list[Array], Bools | None]:

@@ -217,11 +217,20 @@ class ActorCritic(Clones):
         """The observations as the workers' policy saw them."""
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
-        if self.policy.core is not None:  # the states before all T+1 steps; after a row that is not valid, an episode begins
-            keep_state = np.concatenate([np.ones_like(batch.valid[:1]), batch.valid]).astype(np.float32)
-            recurrent = RecurrentInput(self.tensor(batch.state), self.tensor(keep_state))
+        if self.policy.core is not None:
+            recurrent = self.recurrent(batch)
         features, *pixels = (flat_tensor(array, self.net.flat.device) for array in (x, *images))
         return Observations(x.shape[:2], features, tuple(pixels), recurrent)
+
+    def recurrent(self, batch: Batch) -> RecurrentInput:
+        """The states before all T+1 steps. An episode begins after a step that resets; rows between those of a seat pass."""
+        begins, first = ~batch.valid, np.zeros_like(batch.valid[:1])
+        advances = None
+        if batch.resets is not None:
+            begins = np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
+            advances = self.tensor(np.concatenate([batch.valid, first]))
+        keep_state = ~np.concatenate([first, begins])
+        return RecurrentInput(self.tensor(batch.state), self.tensor(keep_state.astype(np.float32)), advances=advances)
 
     def values(self, observations: Observations, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN] under the present weights."""

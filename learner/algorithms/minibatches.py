@@ -43,9 +43,7 @@ class Observations(NamedTuple):
 
     def network_input(self, steps: int, columns: Index, rows: Index) -> NetworkInput:
         """The input for `rows`, which must be the first `steps` steps of `columns` if the policy has a core."""
-        recurrent = self.recurrent
-        if recurrent is not None:
-            recurrent = RecurrentInput(recurrent.initial_state[columns], recurrent.keep_state[:steps, columns])
+        recurrent = None if self.recurrent is None else self.recurrent.part(steps, columns)
         return NetworkInput(self.features[rows], tuple(image[rows] for image in self.images), recurrent)
 
     @torch.no_grad()
@@ -122,10 +120,10 @@ class Minibatch(NamedTuple):
         The recurrent core still runs over all rows of the columns.
         """
         assert self.recurrent is not None
-        state, keep_state, _ = self.recurrent
-        rows = rows_of_columns(len(keep_state), keep_state.shape[1], columns)
+        steps, count = self.recurrent.keep_state.shape
+        rows = rows_of_columns(steps, count, columns)
         selected = used.flatten()[rows]
-        recurrent = RecurrentInput(state[columns], keep_state[:, columns], torch.nonzero(selected)[:, 0])
+        recurrent = self.recurrent.part(steps, columns, torch.nonzero(selected)[:, 0])
         return self.select(rows[selected], rows, recurrent)
 
     def shuffled(self, used: Bools, count: int, generator: torch.Generator | None) -> Iterator[Minibatch]:

@@ -2,7 +2,7 @@
 
 Every function follows the row format (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
 which is the true final observation of a truncated episode. No function adds rewards or values across the end of an episode.
-A row that is not valid gives zero and does not affect other rows, whatever it contains.
+A row that is not valid gives zero and does not affect other rows, whatever it contains: what is carried passes through it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ class EpisodeEnds(NamedTuple):
     terminated: Bools
     truncated: Bools
     valid: Bools
+    with_seats: bool = False
+    """Whether a row that is not valid may stand between two rows of an episode. Else it always follows an end."""
 
     @classmethod
     def of(cls, batch: Batch) -> EpisodeEnds:
         """The episode ends of a batch, without copying its arrays."""
-        return cls(batch.terminated, batch.truncated, batch.valid)
+        return cls(batch.terminated, batch.truncated, batch.valid, batch.resets is not None)
 
     @property
     def ended(self) -> Bools:
@@ -35,7 +37,7 @@ class EpisodeEnds(NamedTuple):
 
     def columns(self, at: slice) -> EpisodeEnds:
         """The episode ends of some env copies (columns of [T, N])."""
-        return EpisodeEnds(self.terminated[:, at], self.truncated[:, at], self.valid[:, at])
+        return EpisodeEnds(self.terminated[:, at], self.truncated[:, at], self.valid[:, at], self.with_seats)
 
 
 def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lambda: float) -> Floats:
@@ -51,8 +53,10 @@ def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lam
     bootstrap = np.where(ends.terminated, np.float32(0), values[1:])
     advantage = np.where(ends.valid, reward + np.float32(gamma) * bootstrap - values[:-1], np.float32(0))
     carried = (ends.valid & ~ends.ended) * np.float32(gamma * gae_lambda)
+    following = advantage[-1]  # of the next valid row; 0 if there is none
     for t in range(T - 2, -1, -1):
-        advantage[t] += carried[t] * advantage[t + 1]
+        advantage[t] += carried[t] * following
+        following = np.where(ends.valid[t], advantage[t], following) if ends.with_seats else advantage[t]
     return advantage
 
 
@@ -87,9 +91,11 @@ def vtrace(
     goes_on[-1] = False
     ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode goes on in this rollout
     vs_minus_v = delta.copy()
+    following = vs_minus_v[-1]  # that of the next valid row
     for t in range(T - 2, -1, -1):
-        ahead[t] = np.where(goes_on[t], vs_minus_v[t + 1], zero)
+        ahead[t] = np.where(goes_on[t], following, zero)
         vs_minus_v[t] += discount * mix * c[t] * ahead[t]
+        following = np.where(ends.valid[t], vs_minus_v[t], following) if ends.with_seats else vs_minus_v[t]
     target = np.where(ends.valid, vs_minus_v + values[:-1], zero)
     return target, delta + rho * discount * mix * ahead
 
@@ -111,5 +117,6 @@ def discounted_return(reward: Floats, ends: EpisodeEnds, gamma: float, start: Do
     last, ended = start, ends.ended
     for t in range(len(reward)):
         returns[t] = np.where(ends.valid[t], reward[t] + gamma * last, 0)
-        last = np.where(ended[t], 0, returns[t])
+        passes = ~ends.valid[t] & ends.with_seats
+        last = np.where(passes, last, np.where(ended[t], 0, returns[t]))
     return returns, last

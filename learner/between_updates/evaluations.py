@@ -101,7 +101,9 @@ class Evaluations:
         (parameters, buffers), spec, folder = self._state.best_policy, self._run.spec, self._run.folder
         folder.writes.write(
             "best policy",
-            lambda: folder.write_policy(spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked),
+            lambda: folder.write_policy(
+                spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked, spec.seats
+            ),
         )
 
     def of_newest(self) -> Evaluation | None:

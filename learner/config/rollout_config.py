@@ -5,6 +5,7 @@ A training run has these settings and those of `Config`. A `RolloutService` that
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -14,11 +15,13 @@ from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
 from protocol.bounds import Count, Natural
 from protocol.env_spec import Scalar
+from protocol.envs.wrappers import WrapperLike
 from protocol.flags.fields import Flag, NotNegative, Positive
 from protocol.specs import Vector
 from protocol.wire.weight_dtypes import ActingDtype
 
 HEARTBEAT_S = 1.0
+SEAT_ID = "protocol.envs.seats:seat_id"
 STALL_TIMEOUT_S = 600.0
 
 
@@ -39,6 +42,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Wrappers of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
     literals: "my_module:Scale(by=0.5)". The first one is the innermost.
     """
+    seat_id: Fixed[bool] = False
+    """Of an environment of several agents: tell each agent in its observations which one it is."""
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""
     workers: Free[Count] = 2
@@ -133,6 +138,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     env copies × hours since the learner began, at most 1). A failure is an exception or an unusable result of the
     environment or of an `OwnPolicy`, or a worker process that ends without being told to: the environment may have ended it.
     """
+
+    def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:
+        """The wrappers of every env copy, or these in place of `wrappers`, with the one of `seat_id`."""
+        return [*(self.wrappers if given is None else given), *([SEAT_ID] if self.seat_id else [])]
 
     def call_timeouts(self) -> CallTimeouts:
         """How long a call of an env copy may take."""

@@ -26,7 +26,7 @@ from protocol.random_streams import Purpose, env_seed
 from protocol.rollout import Episode
 from protocol.rows.played import reason_to_reject
 from protocol.rows.rollout_checks import LARGEST_REWARD, wrong_facts
-from protocol.specs import PolicySpec
+from protocol.specs import RunSpec
 
 FIRST_TICKET = 1 << 52
 HELD_AT_ONCE = 2  # tickets of one worker: while the learner takes the answer to one, the worker plays the other
@@ -100,13 +100,13 @@ def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) ->
 class EvaluationDealer:
     """The tickets of the evaluation that is pending, if there is one."""
 
-    def __init__(self, policy: PolicySpec, facts: int = 0) -> None:
-        """`policy`: that of the run, which says what rows look like. `facts`: how many numbers each episode has."""
+    def __init__(self, run: RunSpec) -> None:
+        """`run` says what rows and episodes look like."""
         self.held: dict[int, Member] = {}
         """the tickets that workers hold, by number"""
         self.most_copies: int | None = None
         """most env copies that play, on all workers together, unless one worker has more; None: no limit"""
-        self._policy, self._facts = policy, facts
+        self._run = run
         self.beside = False
         """whether the pending evaluation is beside training"""
         self._most_workers = 0  # that play, if there is a limit of copies; 0: as many as it allows
@@ -229,7 +229,7 @@ class EvaluationDealer:
         come = self._rows.setdefault(index, {}).setdefault(rows.episode, [])
         if rows.first_step != _end(come):
             return ""
-        if why := reason_to_reject(rows, come, self._policy, self._plan.most_steps, self._plan.send_frames):
+        if why := reason_to_reject(rows, come, self._run, self._plan.most_steps, self._plan.send_frames):
             return f"rows of ticket {rows.ticket}: {why}"
         come.append(rows)
         return ""
@@ -268,12 +268,13 @@ class EvaluationDealer:
         if len(answer.episodes) != seeds or len(answer.cut) != seeds:
             return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
         for episode in answer.episodes:
-            if why := wrong_facts(episode, self._facts):
+            if why := wrong_facts(episode, len(self._run.facts)):
                 return f"episode: {why}"
             if episode.length > most:
                 return f"expected episodes of at most {most} steps, got {episode.length}"
-            if not abs(episode.reward) <= episode.length * LARGEST_REWARD:  # false for NaN too
-                return f"expected a return that {episode.length} rewards can give, got {episode.reward}"
+            rewards = episode.length * self._run.seats_of_copy
+            if not abs(episode.reward) <= rewards * LARGEST_REWARD:  # false for NaN too
+                return f"expected a return that {rewards} rewards can give, got {episode.reward}"
         return ""
 
 

@@ -140,7 +140,7 @@ class RolloutDealer:
 
     def invalid(self, rollout: Rollout) -> None:
         """Count a rollout that cannot be used."""
-        steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
+        steps = rollout.env_steps if rollout.valid.dtype == bool else 0
         self.ledger.transitions_received += steps
         self.ledger.transitions_invalid += steps
 

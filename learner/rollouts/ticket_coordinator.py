@@ -59,7 +59,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     ) -> None:
         """`ledger` and `incarnations` come from a checkpoint."""
         self.rollouts = RolloutDealer(run.lanes, max_lag, ledger, incarnations)
-        self.evaluation = EvaluationDealer(run.policy, len(run.facts))
+        self.evaluation = EvaluationDealer(run)
         lanes = self.rollouts.lanes
         membership = Membership(run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, lanes))
         super().__init__(membership, worker_timeout_s)

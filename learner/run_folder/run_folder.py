@@ -55,6 +55,7 @@ from learner.run_folder.run_format import (
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
 from protocol.bounds import MAX_FACTS, Line, Name, one_line
+from protocol.space_spec import MAX_SEATS
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
@@ -103,6 +104,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """whether the environment says which actions are allowed"""
     eval_env_kwargs: dict[str, Scalar] = {}
     """keyword arguments of evaluation copies, in addition to `env_kwargs` or in place of those of the same name"""
+    seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
+    """the names of the environment's agents; empty if it is gymnasium's"""
 
 
 class RunSettings(Protocol):
@@ -263,11 +266,12 @@ class RunFolder:
         which: Which = "final",
         facts: tuple[str, ...] = (),
         masked: bool = False,
+        seats: tuple[str, ...] = (),
     ) -> None:
         """Write the arrays and policy.json.
 
         `parameters` [P] begins with the acting part; the rest (the critic) is not written. `facts`: names of the numbers
-        that the run logs of each episode. `masked`: whether the run uses action masks.
+        that the run logs of each episode. `masked`: whether the run uses action masks. `seats`: the environment's agents.
         """
         acting, _ = parameter_layout(spec)
         arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
@@ -282,6 +286,7 @@ class RunFolder:
             facts=facts,
             masked=masked,
             eval_env_kwargs=env.eval_kwargs,
+            seats=seats,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))

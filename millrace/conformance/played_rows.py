@@ -40,7 +40,7 @@ class PlayedRows:
         before = self.rows[rows.episode]
         if rows.first_step != (at := sum(len(some.reward) for some in before)):
             raise Broken(rules.ROWS_FIRST, f"rows of episode {rows.episode} from step {at}", f"from step {rows.first_step}")
-        if why := reason_to_reject(rows, before, self._run.policy, order.most_steps, order.send_frames):
+        if why := reason_to_reject(rows, before, self._run, order.most_steps, order.send_frames):
             raise Broken(rules.EPISODE_ROWS, "rows as in the table", why)
         for one, other in zip(before[-1].obs if before else (), rows.obs, strict=bool(before)):
             if one[-1].tobytes() != other[0].tobytes():

@@ -57,7 +57,7 @@ def start(
         described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
         spaces = EnvSpaces.of_description(described, config.action_masks)
         policy_spec = policy.spec(spaces.observation, spaces.action)
-        run = rollout_spec(config, env, policy_spec, rollout_steps, policy.extra_arrays, masked=spaces.masked)
+        run = rollout_spec(config, env, policy_spec, rollout_steps, policy.extra_arrays, spaces=spaces)
         hub = open_hub(config, run, link, processes, check_interrupt, past=past)
         hub.wait_for(workers)
     return hub, run, described

@@ -15,10 +15,11 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from protocol.arrays import Array
 from protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
 from protocol.envs.advice.space_advice import observation_advice
+from protocol.envs.seats import SeatedEnv
 from protocol.envs.space_generators import generator_states, restore_generators
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError, first_line
-from protocol.space_spec import MAX_WRAPPERS, EnvDescription, check_size
+from protocol.space_spec import MAX_SEATS, MAX_WRAPPERS, EnvDescription, check_size
 from protocol.wire import plain_values
 
 MAX_METADATA_BYTES = 1 << 16
@@ -39,6 +40,10 @@ class DescribedEnv:
     render_mode: str | None = None
     wrappers: frozenset[str] = frozenset()
     """as `class_name`, the classes of which its wrappers are instances"""
+    seats: tuple[str, ...] = ()
+    """the names of its agents, if it is an environment with seats; its spaces are those of each seat"""
+    takes_turns: bool = False
+    """whether a seat may have to wait for others between two of its actions"""
 
 
 def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
@@ -56,6 +61,8 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
         render_mode=one_line(env.render_mode or "", MAX_NAME),
         generators=generator_states(env.observation_space, env.action_space),
         wrappers=_wrappers(env)[:MAX_WRAPPERS],
+        seats=_seats(env),
+        takes_turns=isinstance(env, SeatedEnv) and env.takes_turns,
     )
     try:
         check_size(description)
@@ -84,7 +91,17 @@ def read_description(description: EnvDescription) -> DescribedEnv:
         max_episode_steps=description.longest_episode or None,
         render_mode=description.render_mode or None,
         wrappers=frozenset(description.wrappers),
+        seats=description.seats,
+        takes_turns=description.takes_turns,
     )
+
+
+def _seats(env: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
+    if not isinstance(env, SeatedEnv):
+        return ()
+    if len(env.seats) > MAX_SEATS:
+        raise UsageError(f"environment: expected at most {MAX_SEATS} agents, got {len(env.seats)}")
+    return tuple(one_line(seat, MAX_NAME) for seat in env.seats)
 
 
 def class_name(kind: type) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,20 +15,31 @@ from protocol.envs.advice.atari_ids import preprocessed
 from protocol.envs.advice.missing_modules import what_to_install
 from protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
 from protocol.envs.found_names import attribute
+from protocol.envs.seats import has_seats
 from protocol.envs.unknown_ids import most_similar, what_to_write
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
 from protocol.errors import UsageError, first_line
 
 
 def names_a_function(env_id: str) -> bool:
-    """Whether a worker looks for a function or a class of this name: `module:name`, where the name has no version."""
+    """Whether a worker looks for a function or a class of this name: `module:name`, where the name has no version.
+
+    Also `package.module_v1`, as PettingZoo names its environments: modules with a function `parallel_env` or `env`.
+    """
     _, colon, name = env_id.partition(":")
-    return bool(colon) and all(word.isidentifier() for word in name.split("."))
+    return all(word.isidentifier() for word in name.split(".")) if colon else _names_a_module(env_id)
 
 
-def made_by_id(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+def _names_a_module(env_id: str) -> bool:
+    return re.fullmatch(r"[^\W\d]\w*(\.\w+)*\.\w+_v\d+", env_id) is not None
+
+
+def made_by_id(env_id: str, kwargs: dict[str, Any]) -> Any:
     """Make the environment of an id, or call the function or class that a name names."""
     module_name, _, name = env_id.partition(":")
+    if _names_a_module(env_id):
+        module = importlib.import_module(env_id)
+        return made_by_callable(env_id, getattr(module, "parallel_env", None) or module.env, kwargs)
     if names_a_function(env_id):
         function = attribute(importlib.import_module(module_name), name)
         if callable(function) and name not in gymnasium.registry:
@@ -47,8 +59,11 @@ def made_without_checker(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gy
     return made
 
 
-def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """What a user's callable returns. Raises `UsageError` if that is no environment, or it asks for an unknown id."""
+def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> Any:
+    """What a user's callable returns: a `gymnasium.Env`, or an environment of PettingZoo.
+
+    Raises `UsageError` if that is no environment, or it asks for an unknown id.
+    """
     parameter = takes_copy(factory, kwargs)
     copy = [being_made.get() or FIRST_COPY] if parameter else []
     try:
@@ -66,17 +81,17 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
             "pass the id itself or gymnasium.spec(id) instead of a callable, or let it make module:id, where the module "
             "registers it"
         ) from error
-    if isinstance(made, gymnasium.Env):
+    if isinstance(made, gymnasium.Env) or has_seats(made):
         return made
     if is_of_old_gym(made):
         advice = f"; {instead_of_object(made)}"
-    elif hasattr(made, "possible_agents"):
-        advice = "; it has several agents: return a gymnasium.Env with one action and one reward for all of them"
     elif hasattr(made, "num_envs"):
         advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
     else:
         advice = ""
-    raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}{advice}")
+    raise UsageError(
+        f"env factory {name}: expected it to return a gymnasium.Env, or one of PettingZoo's, got {type(made).__name__}{advice}"
+    )
 
 
 def why_not_made(

@@ -16,10 +16,11 @@ import gymnasium
 
 from protocol.bounds import one_line
 from protocol.envs.found_names import found_by_others, in_main, last_part, name_of
+from protocol.envs.seats import has_seats
 from protocol.errors import UsageError, first_line
 from protocol.own_module import own_callable
 
-Wrapper = Callable[..., gymnasium.Env[Any, Any]]
+Wrapper = Callable[..., Any]
 WrapperLike = str | Wrapper
 """`module:Class`, with or without plain arguments, or what takes an environment and returns one."""
 MAX_WRAPPER_NAME = 1000
@@ -103,8 +104,8 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
     return found
 
 
-def wrap(env: gymnasium.Env[Any, Any], wrapper: WrapperLike) -> gymnasium.Env[Any, Any]:
-    """The environment in this wrapper. Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised."""
+def wrap(env: Any, wrapper: WrapperLike) -> Any:
+    """The environment in this wrapper: of gymnasium, or of PettingZoo for its environments. Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised."""
     name = wrapper_name(wrapper)
     try:
         made: object = _found(wrapper)(env) if isinstance(wrapper, str) else wrapper(env)
@@ -118,7 +119,7 @@ def wrap(env: gymnasium.Env[Any, Any], wrapper: WrapperLike) -> gymnasium.Env[An
         raise UsageError(line, traceback.format_exc()) from error
     except Exception as error:
         raise UsageError(f"wrapper {name}: {type(error).__name__}: {first_line(error)}", traceback.format_exc()) from error
-    if not isinstance(made, gymnasium.Env):
+    if not (isinstance(made, gymnasium.Env) or has_seats(made)):
         raise UsageError(f"wrapper {name}: expected it to return a gymnasium.Env, got {type(made).__name__}")
     return made
 

@@ -39,6 +39,12 @@ class RecurrentInput(NamedTuple):
     initial_state: Tensor  # [C, S] float32, before the first step
     keep_state: Tensor  # [T, C] float32: 0 where an episode begins and the state is reset, else 1
     output_rows: Tensor | None = None  # [B] int64, the rows of T · C to return; None: all
+    advances: Tensor | None = None  # [T, C] bool: False where the row leaves the state as it was; None: it never does
+
+    def part(self, steps: int, columns: Tensor | slice, output_rows: Tensor | None = None) -> RecurrentInput:
+        """That of the first steps of some columns."""
+        advances = None if self.advances is None else self.advances[:steps, columns]
+        return RecurrentInput(self.initial_state[columns], self.keep_state[:steps, columns], output_rows, advances)
 
 
 def refuse_second_derivatives() -> None:
@@ -244,14 +250,17 @@ class FlatNetwork:
     def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
         """Inputs [T · C, D] -> the core's outputs [T · C, H] and its last state [C, S]; see `recurrent.py`."""
         weights = [self.parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
-        found, state = [], recurrent.initial_state
-        for step, keep in zip(x.view(*recurrent.keep_state.shape, -1), recurrent.keep_state.unsqueeze(-1), strict=True):
-            state = state * keep
+        found, state, advances = [], recurrent.initial_state, recurrent.advances
+        keeps = recurrent.keep_state.unsqueeze(-1)
+        for t, (step, keep) in enumerate(zip(x.view(*recurrent.keep_state.shape, -1), keeps, strict=True)):
+            before = state = state * keep
             if self.spec.core == "lstm":
                 h, c = torch.lstm_cell(step, state.chunk(2, -1), *weights)
                 state = torch.cat((h, c), -1)
             else:
                 h = state = torch.gru_cell(step, state, *weights)
+            if advances is not None:
+                state = torch.where(advances[t, :, None], state, before)
             found.append(h)
         return torch.cat(found), state
 

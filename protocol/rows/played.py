@@ -10,13 +10,14 @@ from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows
 from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
-from protocol.specs import PolicySpec
+from protocol.specs import RunSpec
 
 
 def reason_to_reject(
-    rows: EpisodeRows, before: Sequence[EpisodeRows], policy: PolicySpec, most_steps: int, with_frames: bool
+    rows: EpisodeRows, before: Sequence[EpisodeRows], run: RunSpec, most_steps: int, with_frames: bool
 ) -> str:
     """What is wrong with these rows; empty if they can be used. `before`: the earlier rows of their episode."""
+    policy, seats = run.policy, (len(run.seats),) if run.seats else ()
     if before and (before[-1].terminated[-1] or before[-1].truncated[-1]):
         return "expected none after the end of their episode"
     L = len(rows.reward) if rows.reward.ndim == 1 else 0
@@ -24,13 +25,13 @@ def reason_to_reject(
         return f"expected 1 to {most_steps - rows.first_step} rows, got reward {list(rows.reward.shape)}"
     action = policy.action
     expected = [
-        Expected("action", rows.action, (L, *action.shape), action.stored_dtype, action),
+        Expected("action", rows.action, (L, *seats, *action.shape), action.stored_dtype, action),
         Expected("reward", rows.reward, (L,), "float64"),
         Expected("terminated", rows.terminated, (L,), "bool"),
         Expected("truncated", rows.truncated, (L,), "bool"),
     ]
-    axes = ("row",)
-    if why := wrong_observation(rows.obs, policy.observation, (L + 1,), axes) or wrong_arrays(expected, axes):
+    axes = ("row", "seat") if seats else ("row",)
+    if why := wrong_observation(rows.obs, policy.observation, (L + 1, *seats), axes) or wrong_arrays(expected, axes):
         return why
     if (rows.terminated | rows.truncated)[:-1].any():
         return "expected an end only in the last row"

@@ -18,7 +18,7 @@ LARGEST_REWARD = float(np.finfo(np.float32).max)
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
-    T, N = run.rollout_steps, run.copies
+    T, N = run.rollout_steps, run.columns
     action = run.policy.action
     expected = [
         Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),
@@ -33,6 +33,10 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")
     if rollout.mask is not None:
         expected.append(Expected("mask", rollout.mask, (T + 1, N, sum(action.sizes)), "bool"))
+    if (rollout.resets is not None) != bool(run.seats):
+        raise BadRollout(f"resets: expected {'some' if run.seats else 'none'}")
+    if rollout.resets is not None:
+        expected.append(Expected("resets", rollout.resets, (T + 1, run.copies), "bool"))
     if len(rollout.extras) != len(run.extras):
         raise BadRollout(f"extras: expected {len(run.extras)} arrays, got {len(rollout.extras)}")
     for extra, array in zip(run.extras, rollout.extras, strict=True):
@@ -44,20 +48,47 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
     if rollout.mask is not None:
         _check_mask(rollout.mask, rollout, action)
     ended = rollout.terminated | rollout.truncated
-    if np.count_nonzero(rollout.valid[1:] == ended[:-1]):
+    if rollout.resets is not None:
+        _check_seats(rollout.valid, ended, rollout.resets, run)
+        count = int(np.count_nonzero(rollout.resets[1:]))
+    elif np.count_nonzero(rollout.valid[1:] == ended[:-1]):
         t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
         raise BadRollout(f"valid: expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
-    if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
-        raise BadRollout(f"episodes: expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
+    else:
+        count = int(np.count_nonzero(ended & rollout.valid))
+    if len(rollout.episodes) != count:
+        raise BadRollout(f"episodes: expected {count}, got {len(rollout.episodes)}")
     steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
     for episode in rollout.episodes:
         whole = 0 < episode.length <= steps_so_far and 0 <= episode.seconds < math.inf
-        if not (whole and abs(episode.reward) <= episode.length * LARGEST_REWARD):  # false for NaN too
+        if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # false for NaN too
             raise BadRollout(
                 f"episode: expected a finite return of 1 to {steps_so_far} float32 rewards and a duration, got {episode}"
             )
         if why := wrong_facts(episode, len(run.facts)):
             raise BadRollout(f"episode: {why}")
+
+
+def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:
+    """Raise `BadRollout` if the rows of seats break the law of `protocol.rollout`. Arrays [T, N·A], `resets` [T+1, N]."""
+    reset = np.repeat(resets, run.seats_of_copy, axis=1)  # [T+1, N·A]
+    gone, plays = np.zeros_like(reset), np.zeros_like(reset)  # the seat has left this episode; it has a row in it
+    for t in range(len(valid)):
+        gone[t + 1] = (gone[t] | ended[t]) & ~reset[t]
+        plays[t + 1] = (plays[t] & ~reset[t] | valid[t]) & ~ended[t]
+    idle = plays[:-1] & ~valid if not run.takes_turns else np.zeros_like(valid)
+    for wrong, expected in (
+        (ended & ~valid, "an end only in a valid row"),
+        (valid & reset[:-1], "no valid row in a step that resets the copy"),
+        (valid & gone[:-1], "no valid row of a seat that has left its episode"),
+        (plays & reset, "the end of each seat before a step that resets the copy"),
+        (idle, "a valid row after one that has not ended"),
+        (reset[1:] & reset[:-1], "a step of the episode after one that resets the copy"),
+    ):
+        if wrong.any():
+            t, column = np.argwhere(wrong)[0]
+            n, seat = divmod(int(column), run.seats_of_copy)
+            raise BadRollout(f"valid: expected {expected}, got none at step {t}, copy {n}, {run.seats[seat]}")
 
 
 def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec) -> None:

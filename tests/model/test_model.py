@@ -115,7 +115,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, TicketedLane, Ticket, LanePlacement
     assert [type(each) for each in objects] == [*types, Rounds, Session, _SessionState, HeldRollouts, RolloutLane]
     assert {type(each): set(vars(each)) for each in objects} == known
-    assert set(vars(EvaluationDealer(settings.run.policy))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
+    assert set(vars(EvaluationDealer(settings.run))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
     assert set(vars(HeldEvaluations())) == evaluating_worker.SAVED
     stepping = of_vector_env.Learner(Stepping(workers=1, lanes=1, calls=(), faults=0), 0, 0.0).coordinator
     assert type(stepping) is OrderCoordinator

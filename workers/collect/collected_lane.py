@@ -19,11 +19,13 @@ from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from protocol.wire.plain_values import pack, unpack
+from workers.collect.seat_rows import SeatRows
 from workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.facts import Facts
 from workers.copies.row_writers import ObservationWriter
+from workers.copies.seated_copies import SeatedCopies
 
 
 class CollectedLane:
@@ -34,9 +36,11 @@ class CollectedLane:
         self.incarnation = incarnation
         self.copies = copies
         self.generator = generator(run.seed, Purpose.ACTIONS, number, incarnation)
-        self.obs = tuple(np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))  # [N, *leaf] each
-        self.state = zero_state(run.policy, run.copies)  # [N, S] recurrent state of the policy
+        self.obs = tuple(np.empty((run.columns, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))  # [N, *leaf] each
+        self.state = zero_state(run.policy, run.columns)  # [N, S] recurrent state of the policy
+        self.state_before = self.state  # of this rollout
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
+        self.seats = SeatRows(run) if run.seats else None
         self._run = run
         self._seeds = copy_seeds(run.seed, number, incarnation, run.copies)
         self._return = [0.0] * run.copies  # of the running episodes, as are the next two
@@ -45,7 +49,7 @@ class CollectedLane:
         self._attributes = b""  # that were set in the copies
         self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended in this rollout
         self._no_facts = (math.nan,) * len(run.facts)
-        self.writer = ObservationWriter(stored_leaves(run), run.copies)
+        self.writer = ObservationWriter(stored_leaves(run), run.columns, run.seats)
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
         """Set these attributes in all copies unless they are set. Raises `EnvironmentFailed` if a copy has none."""
@@ -70,6 +74,13 @@ class CollectedLane:
         except CopyFailed as error:
             raise environment_failed(self.number, error, "first reset") from error
         self._start_s = [perf_counter()] * len(self._start_s)
+        if self.seats is not None:
+            assert isinstance(self.copies, SeatedCopies)
+            self.seats.start(self.copies.columns, self._start_s[0])
+
+    def begin(self) -> None:
+        """A rollout begins."""
+        self.state_before = self.state if self.seats is None else self.seats.begin(self.state)
 
     def close(self) -> None:
         """Close the copies. Raises nothing."""
@@ -86,6 +97,8 @@ class CollectedLane:
         `reward` [T, N] float64 is raw; it is set to 0 in rows that are not valid. `done` [T, N] is terminated or truncated.
         `step_end_s` [T] is when each step ended. The seconds of an episode count from the end of the copy's last episode.
         """
+        if self.seats is not None:
+            return self.seats.valid, self.seats.episodes
         valid = ~np.concatenate([self.ended[None], done[:-1]])
         reward[~valid] = 0.0
         self.ended = done[-1].copy()

@@ -36,6 +36,7 @@ from workers.copies.env_loop import Pulse
 from workers.copies.envpool_copies import EnvpoolCopies
 from workers.copies.open_lanes import OpenLanes
 from workers.copies.row_writers import write_numbers
+from workers.copies.seated_copies import SeatedCopies
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.copy_slots import make_copy
 
@@ -55,6 +56,9 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
             return VectorCopies(env, run.facts, masked=run.masked)
         case "envpool":
             return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
+        case "loop" if run.seats:
+            makes, seats = [run.env.make] * run.copies, run.seats_of_copy
+            return SeatedCopies(makes, pulse, seats, run.info_keys, masked=run.masked, first=first)
         case "loop":
             return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked, first=first)
 
@@ -122,6 +126,7 @@ class Collector:
         lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
         for lane in lanes:
             lane.set_attributes(self.env_attributes, pulse)
+            lane.begin()
         rows = self._new_rows(lanes)
         actions = self._acting.begin([lane.generator for lane in lanes])
         try:
@@ -159,7 +164,7 @@ class Collector:
         return lane
 
     def _new_rows(self, lanes: Sequence[CollectedLane]) -> _CollectedRows:
-        L, T, N = len(lanes), self._run.rollout_steps, self._run.copies
+        L, T, N = len(lanes), self._run.rollout_steps, self._run.columns
         obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in self._stored)
         for i, lane in enumerate(lanes):
             for array, leaf in zip(obs, lane.obs, strict=True):
@@ -178,7 +183,10 @@ class Collector:
     ) -> None:
         """Step all lanes T times."""
         is_recurrent = rows.state.size > 0
-        resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
+        resets = np.zeros((len(lanes), self._run.columns), bool)  # [L, N] row t is not valid
+        with_seats = [(i, lane.seats) for i, lane in enumerate(lanes) if lane.seats is not None]
+        if not with_seats:
+            resets[:] = [lane.ended for lane in lanes]
         lane_numbers = [lane.number for lane in lanes]
         stages = self.stages
         views = [  # of every lane
@@ -189,7 +197,11 @@ class Collector:
             pulse()
             began = perf_counter()
             with np.errstate(all="ignore"):  # a NaN is reported once the rollout is complete
-                taken = self._to_env_action(actions.act(t, [leaf[:, t] for leaf in rows.obs], rows.state))
+                before = rows.state.copy() if with_seats else rows.state
+                chosen = actions.act(t, [leaf[:, t] for leaf in rows.obs], rows.state)
+                for i, seats in with_seats:
+                    seats.acted(t, actions.written(i), before[i], rows.state[i])
+                taken = self._to_env_action(chosen)
             acted = perf_counter()
             self._step_all(lane_numbers, taken, pulse)
             for i, (lane, numbers, obs) in enumerate(views):
@@ -199,11 +211,13 @@ class Collector:
                     lane.writer.write(obs, t + 1, row.leaves)
                 except CopyFailed as error:
                     raise environment_failed(lane.number, error, f"step {t}") from error
-                if row.facts:
+                if lane.seats is not None:
+                    lane.seats.stepped(t, row, rows.state[i], perf_counter())
+                elif row.facts:
                     lane.keep_facts(t, row.facts)
                 if (lost := row.lost) is not None:
                     _truncate_lost(rows, i, lane, t, lost)
-            if is_recurrent:
+            if is_recurrent and not with_seats:
                 rows.state[resets] = 0.0
                 resets = rows.terminated[:, t] | rows.truncated[:, t]
             ended = perf_counter()
@@ -230,8 +244,9 @@ class Collector:
         check_acted(lane.number, "action", acted.action, obs)
         check_acted(lane.number, "log_prob", acted.log_prob, obs)
         lane.obs = tuple(array[-1].copy() for array in obs)
-        before, lane.state = lane.state, rows.state[i].copy()
-        self.steps += int(np.count_nonzero(valid))
+        lane.state = rows.state[i].copy()
+        resets = None if lane.seats is None else lane.seats.resets
+        self.steps += int(np.count_nonzero(valid if resets is None else ~resets[:-1]))
         return Rollout(
             session=session,
             lane=lane.number,
@@ -245,10 +260,11 @@ class Collector:
             terminated=rows.terminated[i],
             truncated=rows.truncated[i],
             valid=valid,
-            state=before,
+            state=lane.state_before,
             episodes=episodes,
             mask=obs[-1] if self._run.masked else None,
             extras=acted.extras,
+            resets=resets,
         )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import OrderEnforcing
 
-from protocol.arrays import Array
+from protocol.arrays import Array, Bools, Doubles
 from protocol.envs.action_masks import without_mask
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from protocol.envs.vectorized import check_resets_next_step
@@ -39,6 +39,19 @@ from workers.envs.reset_ahead import ResetAhead
 Leaves = Sequence[Any]
 
 
+class SeatColumns(NamedTuple):
+    """What a step of N copies means for their N · A columns."""
+
+    complete: Bools
+    """[N · A] whether a row of the seat is complete"""
+    acts: Bools
+    """[N · A] whether the next step takes the seat's action"""
+    outside: Doubles
+    """[N · A] rewards outside of any row"""
+    over: Bools
+    """[N] whether the copy's episode is over: its next step only resets it"""
+
+
 class StepResult(NamedTuple):
     """Result of one step of N copies; `workers/copies/row_writers.py` writes each part into an array [N, …]."""
 
@@ -51,6 +64,8 @@ class StepResult(NamedTuple):
     new copies"""
     facts: Facts = {}
     """of the episodes that ended in this step, if the run asks for facts"""
+    columns: SeatColumns | None = None
+    """of copies with seats; the arrays above have N · A entries then"""
 
 
 class EnvCopies(Protocol):

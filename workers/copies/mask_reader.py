@@ -31,13 +31,14 @@ class MaskReader:
         self._action = action_spec(action)
         self._choices = choices(self._action)
         self._in_observation = has_mask(observation, action)
-        self._all = np.ones(self._choices, bool)
+        self.everything = np.ones(self._choices, bool)
+        """the mask that allows every action"""
         self._where = "its observation" if self._in_observation else "info"
 
     def read(self, n: int, observation: Any, info: Mapping[str, Any], terminated: Any, truncated: Any) -> Bools:
         """The mask [choices] of copy `n` after a step or a reset. Raises `CopyFailed`."""
         if terminated:
-            return self._all
+            return self.everything
         source = observation if self._in_observation else info
         value = source.get(MASK) if isinstance(source, Mapping) else None
         return self._mask(n, value, bool(truncated))
@@ -68,14 +69,14 @@ class MaskReader:
         by_copy = dict(infos)
         of = range(len(observations)) if stepped is None else stepped
         return [
-            self.read(n, observation, by_copy.get(n, _NONE), terminated[n], truncated[n]) if n in of else self._all
+            self.read(n, observation, by_copy.get(n, _NONE), terminated[n], truncated[n]) if n in of else self.everything
             for n, observation in enumerate(observations)
         ]
 
     def _mask(self, n: int, value: Any, ended: bool) -> Bools:
         if value is None:
             if ended:
-                return self._all
+                return self.everything
             raise self._wrong(n, "none")
         array = _as_array(value)
         if array is None or array.size != self._choices or array.dtype.name not in DTYPES:
@@ -85,7 +86,7 @@ class MaskReader:
             raise self._wrong(n, f"the value {array.max() if array.max() > 1 else array.min()}")
         if no_choice(mask, self._action):
             if ended:
-                return self._all
+                return self.everything
             raise self._wrong(n, f"one without a choice, {one_line(str(mask.astype(int).tolist()), 100)}")
         return mask
 

@@ -92,10 +92,12 @@ class LeafWriter:
 
 
 class ObservationWriter:
-    """Writes the observations of N copies, which have these leaves. Each method raises `CopyFailed`."""
+    """Writes the observations of N columns, which have these leaves. Each method raises `CopyFailed`."""
 
-    def __init__(self, leaves: Iterable[Leaf], copies: int) -> None:
-        self._writers = [LeafWriter(leaf, copies) for leaf in leaves]
+    def __init__(self, leaves: Iterable[Leaf], columns: int, seats: Sequence[str] = ()) -> None:
+        """`seats`: names of the seats of a copy, for errors; none: a column is a copy."""
+        self._writers = [LeafWriter(leaf, columns) for leaf in leaves]
+        self._seats = seats
 
     def joined(self, arrays: Iterable[Array]) -> list[Array]:
         """Views of arrays [*rows, N, *leaf] for `write`."""
@@ -104,13 +106,26 @@ class ObservationWriter:
     def write(self, joined: Iterable[Array], t: int, leaves: Iterable[Any]) -> None:
         """Write those of all copies into row `t` of `joined` arrays."""
         for writer, array, values in zip(self._writers, joined, leaves, strict=True):
-            writer.write(array[t], values)
+            try:
+                writer.write(array[t], values)
+            except CopyFailed as error:
+                raise self._of_seat(error) from error
 
-    def write_some(self, arrays: Iterable[Array], copies: Sequence[int], leaves: Iterable[Any]) -> None:
-        """Write those of these copies into arrays [N, *leaf]. `leaves`: values that have theirs at their numbers."""
+    def _of_seat(self, error: CopyFailed) -> CopyFailed:
+        """The error of a column, which names its copy and its seat."""
+        if not self._seats or error.copy is None:
+            return error
+        copy, seat = divmod(error.copy, len(self._seats))
+        return CopyFailed(copy, error.doing, f"{self._seats[seat]}, {error.line}")
+
+    def write_some(self, arrays: Iterable[Array], columns: Sequence[int], leaves: Iterable[Any]) -> None:
+        """Write those of these columns into arrays [N, *leaf]. `leaves`: values that have theirs at their numbers."""
         for writer, array, values in zip(self._writers, arrays, leaves, strict=True):
-            for n in copies:
-                writer.write_one(array, n, values[n])
+            for n in columns:
+                try:
+                    writer.write_one(array, n, values[n])
+                except CopyFailed as error:
+                    raise self._of_seat(error) from error
 
 
 def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any]) -> tuple[Sequence[Any], ...]:

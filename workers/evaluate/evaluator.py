@@ -1,7 +1,7 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
-Rule: an order has k seeds, so k env copies are stepped together, and the policy always sees a batch [1, k, ...]. A copy
-whose episode has ended stays in the batch and is not stepped. The copies are apart from the lanes of training. They are
+Rule: an order has k seeds, so k env copies are stepped together, and the policy always sees a batch [1, k · A, ...], where A
+is the number of seats of a copy. A copy whose episode has ended stays in the batch and is not stepped. The copies are apart from the lanes of training. They are
 opened once, and reset with a seed before each episode.
 """
 
@@ -33,6 +33,7 @@ from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResul
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import Pulse
 from workers.copies.row_writers import ObservationWriter, write_numbers
+from workers.copies.seated_copies import SeatedCopies
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.evaluate.episode_rows import RowSender, SendRows, as_frame
 
@@ -61,7 +62,13 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
     with warnings.catch_warnings():
         if render_mode is not None:
             warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
-        copies = LoopedCopies([make] * count, pulse, run.facts, masked=run.masked, first=EnvCopy(evaluation=True))
+        first = EnvCopy(evaluation=True)
+        if run.seats:
+            copies: LoopedCopies = SeatedCopies(
+                [make] * count, pulse, run.seats_of_copy, run.info_keys, masked=run.masked, first=first
+            )
+        else:
+            copies = LoopedCopies([make] * count, pulse, run.facts, masked=run.masked, first=first)
     modes = copies.envs[0].metadata.get("render_modes", [])
     if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
         copies.close()
@@ -83,7 +90,7 @@ class Evaluator:
         self._run, self._open_copies = run, open_copies
         self._acting = acting_of(run, policy)
         self._stored = stored_leaves(run)
-        self._writer = ObservationWriter(self._stored, 1)
+        self._writer = ObservationWriter(self._stored, 1, run.seats)
         self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
@@ -114,47 +121,61 @@ class Evaluator:
 
     def _play(self, order: Evaluate, send: SendRows, pulse: Pulse) -> Evaluated | None:
         """The answer; None if a worker was lost, and with it copies whose episodes had not ended."""
-        k, policy = len(order.seeds), self._run.policy
+        k, A, policy = len(order.seeds), self._run.seats_of_copy, self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
-        obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in self._stored)
-        numbers = np.zeros(k), np.zeros(k, bool), np.zeros(k, bool)
-        state, drawn = zero_state(policy, 1, k), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
-        returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
-        no_facts = (math.nan,) * len(self._run.facts)
+        obs = tuple(np.empty((1, k * A, *leaf.shape), leaf.dtype) for leaf in self._stored)
+        numbers = np.zeros(k * A), np.zeros(k * A, bool), np.zeros(k * A, bool)
+        state, drawn = zero_state(policy, 1, k * A), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
+        returns, lengths, cut, seconds = np.zeros((k, A)), [0] * k, [False] * k, [0.0] * k
+        no_facts = (math.nan,) * len(self._run.info_keys)
         facts = [no_facts] * k
         senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
         running, t = list(range(k)), 0
         began_s = perf_counter()
         self._write(obs, running, copies.reset(order.seeds, pulse), 0, "first reset")
+        if isinstance(copies, SeatedCopies):
+            returns += copies.columns.outside[: k * A].reshape(k, A)
         for n, sender in enumerate(senders):
             self._observe(sender, obs, n, copies)
         while running:
             pulse()
             with np.errstate(all="ignore"):
+                before = state.copy()
                 chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
+                if isinstance(copies, SeatedCopies):
+                    waits = ~copies.columns.acts[: k * A]
+                    state[0][waits] = before[0][waits]
                 taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=False)
             self._check_acted(chosen, running, obs, t)
             # The actions are a new array at each step, because an environment may keep its action.
             try:
-                step = copies.step(taken[running], pulse, running)
+                step = copies.step(
+                    taken.reshape(k, A, *taken.shape[1:])[running].reshape(-1, *taken.shape[1:]), pulse, running
+                )
                 if step.lost is not None and step.lost[running].any():
                     return None
-                write_numbers(numbers, slice(None), (step.reward[:k], step.terminated[:k], step.truncated[:k]))
+                write_numbers(
+                    numbers, slice(None), (step.reward[: k * A], step.terminated[: k * A], step.truncated[: k * A])
+                )
             except CopyFailed as error:
                 raise environment_failed(None, error, f"step {t}") from error
             check_rewards(None, numbers[0][None], t)
-            rewards: list[float] = numbers[0].tolist()
+            rewards, ends, cuts = (array.reshape(k, A) for array in numbers)
+            if (columns := step.columns) is not None:
+                rewards, ends = rewards + columns.outside[: k * A].reshape(k, A), columns.over[:k, None]
+                cuts = np.zeros_like(ends)
             self._write(obs, running, step.leaves, t + 1, f"step {t}")
             ended = set[int]()
             for n in running:
                 returns[n] += rewards[n]
                 lengths[n] += 1
-                terminated, truncated = bool(numbers[1][n]), bool(numbers[2][n])
+                terminated, truncated = bool(ends[n, 0]), bool(cuts[n, 0])
                 over = terminated or truncated
                 cut[n] = not over and lengths[n] >= order.most_steps
                 if senders:
                     self._observe(senders[n], obs, n, copies)
-                    senders[n].step(chosen[n], rewards[n], terminated, truncated or cut[n])
+                    acted = chosen.reshape(k, A, *chosen.shape[1:])[n] if self._run.seats else chosen[n]
+                    senders[n].step(acted, float(rewards[n].sum()), terminated, truncated or cut[n])
                 if over or cut[n]:
                     ended.add(n)
                     seconds[n], facts[n] = perf_counter() - began_s, step.facts.get(n, no_facts)
@@ -162,7 +183,10 @@ class Evaluator:
             t += 1
             if ended:
                 running = [n for n in running if n not in ended]
-        episodes = tuple(Episode(*figures) for figures in zip(returns, lengths, seconds, facts, strict=True))
+        if self._run.has_seat_returns:
+            facts = [(*of_info, *of_seats) for of_info, of_seats in zip(facts, returns.tolist(), strict=True)]
+        totals = returns.sum(1).tolist()
+        episodes = tuple(Episode(*figures) for figures in zip(totals, lengths, seconds, facts, strict=True))
         return Evaluated(order.session, order.ticket, episodes, tuple(cut))
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
@@ -176,10 +200,15 @@ class Evaluator:
         check_spaces(self._run, copies)
         return copies
 
+    def _columns(self, copies: Sequence[int]) -> Sequence[int]:
+        """The columns of the seats of these copies."""
+        A = self._run.seats_of_copy
+        return copies if A == 1 else [column for n in copies for column in range(n * A, (n + 1) * A)]
+
     def _write(self, obs: tuple[Array, ...], copies: Sequence[int], leaves: Leaves, t: int, doing: str) -> None:
         """Write the observations of these copies to their places in the batch: number `t` of their episodes."""
         try:
-            self._writer.write_some([array[0] for array in obs], copies, leaves)
+            self._writer.write_some([array[0] for array in obs], self._columns(copies), leaves)
         except CopyFailed as error:
             raise environment_failed(None, error, doing) from error
         check_observed(None, self._stored, obs, t)
@@ -187,8 +216,8 @@ class Evaluator:
     def _check_acted(self, chosen: Array, running: Sequence[int], obs: tuple[Array, ...], t: int) -> None:
         """As in training. The action of a copy whose episode has ended does not count."""
         if chosen.dtype.kind == "f":
-            acted = np.zeros_like(chosen)
-            acted[running] = chosen[running]
+            acted, columns = np.zeros_like(chosen), self._columns(running)
+            acted[columns] = chosen[columns]
             check_acted(None, "action", acted[None], obs, t)
 
     def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
@@ -197,4 +226,5 @@ class Evaluator:
         except ValueError as error:
             raise environment_failed(None, f"copy {n}, {error}") from error
         shown = obs[: len(self._run.policy.observation)]  # without the mask
-        sender.observe([leaf[0, n] for leaf in shown], frame)
+        A = self._run.seats_of_copy
+        sender.observe([leaf[0, n * A : (n + 1) * A] if self._run.seats else leaf[0, n] for leaf in shown], frame)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "held", "_played", "_rows", "beside"}
 """What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_policy", "_facts", "_on_rows", "most_copies", "_most_workers"}
+NOT_SAVED = {"_run", "_on_rows", "most_copies", "_most_workers"}
 
 
 class EvaluatingLearner(Learner):

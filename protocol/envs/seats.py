@@ -1,0 +1,267 @@
+"""Environments with several agents: PettingZoo's parallel and AEC interfaces, as one environment with A seats.
+
+A seat is an agent's place in an env copy, in the order of `possible_agents`. Its agent may act at every step, have the move
+only now and then, leave before the others, or come later.
+
+Rule: a seat's row is the span from one of its actions to its next observation: what follows when it has the move again, or
+its last one. `SeatStep.complete` marks the step in which that observation comes. Until then the seat waits, and shows the
+observation in which it acted. Rewards belong to the row in which they fall; those outside of any row count in the return alone.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any, ClassVar, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from protocol.errors import UsageError
+
+SEAT = "seat"
+"""The key of the seat's number in an observation, with `--seat-id`."""
+_NO_INFO: Mapping[str, Any] = {}
+
+
+class SeatStep(NamedTuple):
+    """What one step of a copy means for each of its A seats. The lists are new each time."""
+
+    observations: list[Any]
+    """what each seat saw last; a value of the space before it has seen anything"""
+    infos: list[Mapping[str, Any]]
+    """of the seats that got an observation in this step; empty for the others"""
+    reward: list[float]
+    """of the rows that are complete, the sum since the seat acted; 0 for the others"""
+    terminated: list[bool]
+    truncated: list[bool]
+    """of the rows that are complete, whether the seat's part of the episode ends with it"""
+    complete: list[bool]
+    """whether a row of the seat is complete"""
+    acts: list[bool]
+    """whether the next step takes the seat's action"""
+    outside: list[float]
+    """rewards outside of any row: before the seat's first action, or after its end"""
+
+
+class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
+    """One env copy with A seats. `reset` and `step` return a `SeatStep` in place of the observation.
+
+    `step` takes an action for each seat; those of seats that don't act are ignored. It returns 0 as the reward, and
+    `terminated` when no agent is left.
+    """
+
+    takes_turns: ClassVar[bool]
+    """Whether a seat may have to wait for others between two of its actions."""
+
+    def __init__(self, env: Any, name: str) -> None:
+        """`env`: a PettingZoo environment, called `name` in errors.
+
+        Raises `UsageError` unless all agents have the same spaces.
+        """
+        self.env, self.metadata = env, getattr(env, "metadata", {})
+        self.render_mode = getattr(env, "render_mode", None)
+        self.agents = list(env.possible_agents)
+        self.seats = tuple(map(str, self.agents))
+        self.seat_of = {agent: number for number, agent in enumerate(self.agents)}
+        self._tells_seats = getattr(env, "tells_seats", False)
+        observation, self.action_space = (
+            _common([kind(agent) for agent in self.agents], self.seats, what, name, padded)
+            for kind, what, padded in (
+                (env.observation_space, "observation", "pad_observations_v0"),
+                (env.action_space, "action", "pad_action_space_v0"),
+            )
+        )
+        self.observation_space = _with_seat(observation, len(self.seats)) if self._tells_seats else observation
+        self._before = [self._seen(seat, _any_value(observation)) for seat in range(len(self.seats))]
+
+    def _seen(self, seat: int, observation: Any) -> Any:
+        """What a seat sees, with its number if it is to know it."""
+        if not self._tells_seats:
+            return observation
+        return {**(observation if isinstance(observation, dict) else {"observation": observation}), SEAT: np.int64(seat)}
+
+    def _nothing(self) -> SeatStep:
+        """A step in which nothing has happened yet."""
+        A = len(self.seats)
+        return SeatStep(
+            list(self._before), [_NO_INFO] * A, [0.0] * A, [False] * A, [False] * A, [False] * A, [False] * A, [0.0] * A
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[SeatStep, dict[str, Any]]:
+        """Begin an episode."""
+        found = self._nothing()
+        self._begin(found, {"seed": seed} if options is None else {"seed": seed, "options": options})
+        if True not in found.acts:
+            raise RuntimeError("expected an agent that acts after reset, got none")
+        self._last = list(found.observations)
+        return found, {}
+
+    def step(self, action: Sequence[Any]) -> tuple[SeatStep, float, bool, bool, dict[str, Any]]:
+        """Step the copy with an action for each seat."""
+        found = self._nothing()._replace(observations=self._last)
+        over = self._advance(action, found)
+        self._last = list(found.observations)
+        return found, 0.0, over, False, {}
+
+    @abstractmethod
+    def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
+        """Reset the environment, and write into `found` what follows."""
+
+    @abstractmethod
+    def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
+        """Step the environment, and write into `found` what follows. Returns whether the episode is over."""
+
+    def render(self) -> Any:
+        """What the environment renders."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+
+class ParallelSeats(SeatedEnv):
+    """All agents that are present act at every step (`pettingzoo.ParallelEnv`)."""
+
+    takes_turns = False
+
+    def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
+        observations, infos = self.env.reset(**keywords)
+        self._present = [agent for agent in self.agents if agent in self.env.agents]
+        for agent in self._present:
+            self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+
+    def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
+        given = {agent: actions[self.seat_of[agent]] for agent in self._present}
+        observations, rewards, terminated, truncated, infos = self.env.step(given)
+        for agent in self._present:
+            seat = self.seat_of[agent]
+            found.complete[seat], found.reward[seat] = True, float(rewards[agent])
+            found.terminated[seat], found.truncated[seat] = bool(terminated[agent]), bool(truncated[agent])
+            if (
+                agent in observations or not terminated[agent]
+            ):  # nobody learns from the last observation of a task that ended
+                found.observations[seat] = self._seen(seat, observations[agent])
+            found.infos[seat] = infos.get(agent, _NO_INFO)
+        for agent, reward in rewards.items():
+            if agent not in given:
+                found.outside[self.seat_of[agent]] = float(reward)
+        ended = {agent for agent in self._present if terminated[agent] or truncated[agent]}
+        here = set(self.env.agents) - ended
+        if lost := [agent for agent in self._present if agent not in here and agent not in ended]:
+            raise RuntimeError(f"agent {lost[0]} left, expected it to be terminated or truncated in its last step")
+        came = [agent for agent in here if agent not in given]
+        self._present = [agent for agent in self.agents if agent in here]
+        for agent in self._present:
+            if agent in came:
+                self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+            else:
+                found.acts[self.seat_of[agent]] = True
+        return not self._present
+
+    def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Mapping[str, Any]) -> None:
+        seat = self.seat_of[agent]
+        found.observations[seat], found.infos[seat], found.acts[seat] = self._seen(seat, observation), info, True
+
+
+class TurnSeats(SeatedEnv):
+    """One agent acts at a time (`pettingzoo.AECEnv`): a step is its action, and the departure of those whose part ended."""
+
+    takes_turns = True
+
+    def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
+        self.env.reset(**keywords)
+        self._waits = [False] * len(self.seats)
+        self._next(found)
+
+    def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
+        seat = self.seat_of[self.env.agent_selection]
+        self._waits[seat] = True
+        self.env.step(actions[seat])
+        return self._next(found)
+
+    def _next(self, found: SeatStep) -> bool:
+        """Let agents whose part has ended leave, and find who has the move. Returns whether nobody is left."""
+        while self.env.agents:
+            agent = self.env.agent_selection
+            seat = self.seat_of[agent]
+            observation, reward, terminated, truncated, info = self.env.last()
+            if self._waits[seat]:
+                found.complete[seat], found.reward[seat] = True, float(reward)
+                found.terminated[seat], found.truncated[seat] = bool(terminated), bool(truncated)
+                self._waits[seat] = False
+            else:
+                found.outside[seat] = float(reward)
+            if observation is not None:  # a copy: the seat shows it until it has the move again
+                found.observations[seat] = self._seen(seat, deepcopy(observation))
+            found.infos[seat] = info
+            if not (terminated or truncated):
+                found.acts[seat] = True
+                return False
+            self.env.step(None)
+        if True in self._waits:
+            who = self.seats[self._waits.index(True)]
+            raise RuntimeError(f"agent {who} left, expected it to be selected once more when its part had ended")
+        return True
+
+
+def has_seats(made: object) -> bool:
+    """Whether an object is an environment of several agents in one of PettingZoo's interfaces."""
+    return hasattr(made, "possible_agents") and callable(getattr(made, "observation_space", None))
+
+
+def seat_id(env: Any) -> Any:
+    """A wrapper of a PettingZoo environment: observations tell each seat its number, under the key `seat`.
+
+    It must be the outermost wrapper. Raises `UsageError` for an environment without seats.
+    """
+    if not has_seats(env):
+        raise UsageError(f"seat_id: expected an environment of PettingZoo's, got {type(env).__name__}")
+    env.tells_seats = True
+    return env
+
+
+def seated(made: Any, name: str) -> SeatedEnv:
+    """A PettingZoo environment as an environment with seats. Raises `UsageError`."""
+    if not made.possible_agents:
+        raise UsageError(f"environment {name}: expected at least one agent in its possible_agents, got none")
+    kind = TurnSeats if hasattr(made, "agent_iter") else ParallelSeats
+    return kind(made, name)
+
+
+def _common(
+    found: Sequence[gymnasium.Space[Any]], seats: Sequence[str], what: str, name: str, padded: str
+) -> gymnasium.Space[Any]:
+    """The space that all agents have. Raises `UsageError` if there is none."""
+    for space, seat in zip(found, seats, strict=True):
+        if space != found[0]:
+            raise UsageError(
+                f"environment {name}: expected one {what} space for all agents, got {found[0]} for {seats[0]} and {space} "
+                f"for {seat}; if they differ in size, --wrappers supersuit:{padded} pads them"
+            )
+    return found[0]
+
+
+def _with_seat(space: gymnasium.Space[Any], count: int) -> spaces.Dict:
+    inner = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+    return spaces.Dict([*inner.items(), (SEAT, spaces.Discrete(count))])
+
+
+def _any_value(space: gymnasium.Space[Any]) -> Any:
+    """A value of the space, always the same."""
+    match space:
+        case spaces.Dict():
+            return {key: _any_value(inner) for key, inner in space.spaces.items()}
+        case spaces.Tuple():
+            return tuple(map(_any_value, space.spaces))
+        case spaces.Box():
+            return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high).astype(space.dtype)
+        case spaces.Discrete():
+            return space.dtype.type(space.start)
+        case spaces.MultiDiscrete():
+            return space.start.copy()
+        case _:
+            return np.zeros(space.shape or (), space.dtype)

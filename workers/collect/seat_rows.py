@@ -1,0 +1,88 @@
+"""The rows of a lane whose env copies have seats: which are valid, and what a seat did that waits for its outcome.
+
+Rule: a seat's row is the one in which its outcome comes (`protocol.envs.seats`). Until then each row repeats what was
+written when the seat acted: action, log-probability, and the state of the policy before it. So the row is whole wherever
+rollouts are cut, and a rollout may hold an action that older weights chose, with its log-probability under those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from protocol.arrays import Array, Bools, Floats
+from protocol.policy.recurrent import zero_state
+from protocol.rollout import Episode
+from protocol.specs import RunSpec
+from workers.copies.env_copies import SeatColumns, StepResult
+from workers.copies.facts import Facts
+
+
+class SeatRows:
+    """What a lane of N copies with A seats each keeps from step to step, and the rows of the present rollout."""
+
+    def __init__(self, run: RunSpec) -> None:
+        self._run, self._seats = run, run.seats_of_copy
+        columns = run.columns
+        self.acts: Bools
+        """[N · A] whether the next step takes the seat's action"""
+        self._waits = np.zeros(columns, bool)  # [N · A] it has acted, and its row is not complete
+        self._held: list[Array] = []  # what the policy wrote when each seat acted last
+        self._held_state = zero_state(run.policy, columns)  # [N · A, S] before that
+        self._resets = np.zeros(run.copies, bool)  # [N] the next step only resets the copy
+        self._return = np.zeros((run.copies, self._seats))  # of the running episodes, as is the next
+        self._length = np.zeros(run.copies, np.int64)
+        self._start_s = np.zeros(run.copies)
+
+    def start(self, first: SeatColumns, now_s: float) -> None:
+        """All copies were reset."""
+        self.acts = first.acts
+        self._return += first.outside.reshape(self._return.shape)
+        self._start_s[:] = now_s
+
+    def begin(self, state: Floats) -> Floats:
+        """A rollout begins, with the policy in this state [N · A, S]. Returns the state before the first rows."""
+        T, run = self._run.rollout_steps, self._run
+        self.valid = np.zeros((T, run.columns), bool)
+        self.resets = np.zeros((T + 1, run.copies), bool)
+        self.resets[0] = self._resets
+        self._episodes: list[Episode] = []
+        return np.where(self._waits[:, None], self._held_state, state)
+
+    def acted(self, t: int, written: Sequence[Array], before: Floats, state: Floats) -> None:
+        """The policy has written its row t for all columns, and was in the state `before`. Only some seats act."""
+        if not self._held:
+            self._held = [np.zeros_like(array[0]) for array in written]
+        for array, held in zip(written, self._held, strict=True):
+            held[self.acts] = array[t][self.acts]
+            array[t] = held
+        self._held_state[self.acts] = before[self.acts]
+        state[~self.acts] = before[~self.acts]
+        self._waits |= self.acts
+
+    def stepped(self, t: int, row: StepResult, state: Floats, now_s: float) -> None:
+        """Step t has returned this. Sets the policy's state to zeros where an episode begins."""
+        assert row.columns is not None
+        complete, self.acts, outside, over = row.columns
+        self.valid[t] = complete
+        self._waits &= ~complete
+        self._return += (np.asarray(row.reward, np.float64) + outside).reshape(self._return.shape)
+        self._length += ~self._resets
+        state[np.repeat(self._resets, self._seats)] = 0.0
+        self.resets[t + 1] = self._resets = over
+        for n in np.flatnonzero(over).tolist():
+            self._episodes.append(self._ended(n, row.facts, now_s))
+
+    def _ended(self, n: int, facts: Facts, now_s: float) -> Episode:
+        """The episode of copy n, which is over."""
+        of_seats: list[float] = self._return[n].tolist()
+        named = (*facts.get(n, ()), *(of_seats if self._run.has_seat_returns else ()))
+        episode = Episode(sum(of_seats), int(self._length[n]), now_s - float(self._start_s[n]), named)
+        self._return[n], self._length[n], self._start_s[n] = 0.0, 0, now_s
+        return episode
+
+    @property
+    def episodes(self) -> tuple[Episode, ...]:
+        """Those that ended in this rollout, ordered by step, then by copy."""
+        return tuple(self._episodes)

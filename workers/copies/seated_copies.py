@@ -1,0 +1,82 @@
+"""A loop over N env copies with A seats each: N · A columns, those of a copy side by side.
+
+Rule: a column shows the mask of the last observation in which its seat acts; all actions are allowed while it has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from protocol.arrays import Array, Bools
+from protocol.envs.seats import SeatStep
+from protocol.envs.which_copy import FIRST_COPY, EnvCopy
+from workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
+from workers.copies.env_loop import Pulse
+from workers.copies.facts import facts_of_info
+from workers.copies.row_writers import read_leaves
+
+
+class SeatedCopies(LoopedCopies):
+    """A loop over N environments with seats; see `LoopedCopies`."""
+
+    def __init__(
+        self,
+        makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]],
+        pulse: Pulse,
+        seats: int,
+        facts: Sequence[str] = (),
+        *,
+        masked: bool = False,
+        first: EnvCopy = FIRST_COPY,
+    ) -> None:
+        """`seats`: A. `facts`: without those of the seats' returns. For the rest, see `LoopedCopies`."""
+        super().__init__(makes, pulse, facts, masked=masked, first=first)
+        self._seats = seats
+        self._allowed: list[Bools | None] = [None] * (self.count * seats)  # None: every action
+        self.columns: SeatColumns
+
+    def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
+        """Start episodes in all copies, or in the first ones, with a seed for each. `columns` says who acts."""
+        copies = range(len(seeds))
+        self._allowed = [None] * (self.count * self._seats)
+        self._loop.reset(copies, seeds, self._observations, pulse)
+        return self._result(copies).leaves
+
+    def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
+        """Step with actions [N · A, *action], or with those of some copies. The result has a row for each column."""
+        of_copies = actions.reshape(-1, self._seats, *actions.shape[1:])
+        self._loop.step(of_copies, self._observations, pulse, copies)
+        return self._result(range(self.count) if copies is None else copies)
+
+    def _result(self, stepped: Sequence[int]) -> StepResult:
+        """What the last step of these copies returned. The others, and copies that were never reset, show their last step."""
+        steps: list[SeatStep] = [step for step in self._observations if step is not None]
+        observations, infos, reward, terminated, truncated, complete, acts, outside = (
+            [value for step in steps for value in step[k]] for k in range(len(SeatStep._fields))
+        )
+        leaves: Leaves = read_leaves(self._read, observations) if self._nested else (observations,)
+        if self._masks is not None:
+            for n in stepped:
+                for column in range(n * self._seats, (n + 1) * self._seats):
+                    if acts[column] or complete[column]:
+                        ends = not acts[column]
+                        given = observations[column], infos[column], ends and terminated[column], ends
+                        self._allowed[column] = self._masks.read(column, *given)
+            everything = self._masks.everything
+            allowed = self._allowed[: len(acts)]
+            leaves = (*leaves, [everything if mask is None else mask for mask in allowed])
+        over = np.array(self._loop.terminated[: len(steps)], bool)
+        self.columns = SeatColumns(np.array(complete, bool), np.array(acts, bool), np.array(outside, np.float64), over)
+        facts = {n: self._facts_of(steps[n]) for n in stepped if over[n]} if self._facts else {}
+        return StepResult(leaves, reward, terminated, truncated, facts=facts, columns=self.columns)
+
+    def _facts_of(self, last: SeatStep) -> tuple[float, ...]:
+        """Of each fact, the mean over the seats that report it in the last step of a copy's episode; NaN if none does."""
+        of_seats = np.array([facts_of_info(self._facts, info) for info in last.infos])
+        there = ~np.isnan(of_seats)
+        sums = np.where(there, of_seats, 0).sum(0)
+        return tuple(np.where(there.any(0), sums / np.maximum(there.sum(0), 1), np.nan).tolist())
