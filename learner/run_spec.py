@@ -25,6 +25,8 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
     for setting in ("prior", "record"):
         if spaces.seats and getattr(config, setting):
             raise UsageError(f"{setting}: expected none, because {config.env} has several agents and a dataset has one")
+    if spaces.seats and config.inference == "learner":
+        raise UsageError(f"inference learner: {config.env} has several agents, whose workers act; use --inference workers")
     return rollout_spec(config, env, policy, config.algorithm.rollout_steps, spaces=spaces)
 
 

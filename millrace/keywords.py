@@ -19,6 +19,8 @@ class RolloutKeywords(TypedDict, total=False):
     """
     eval_env_kwargs: Mapping[str, bool | int | float | str]
     """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
+    seat_id: bool
+    """Of an environment of several agents: tell each agent in its observations which one it is."""
     seed: int
     """Seed of all random numbers of the run."""
     workers: int

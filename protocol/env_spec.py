@@ -222,7 +222,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         An environment of PettingZoo becomes one with seats. `detail` of the error is the traceback if a constructor raised.
         """
         made = self.make_as_given(render_mode)
-        return seated(made, self.id) if has_seats(made) else made  # type: ignore[no-any-return]
+        return seated(made, self.id) if has_seats(made) else made
 
     def make_as_given(self, render_mode: str | None = None) -> Any:
         """As `make`, but an environment of PettingZoo stays one."""

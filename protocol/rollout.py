@@ -128,7 +128,7 @@ class Batch(msgspec.Struct, frozen=True):
     """[ΣN] True where no state carries over from an earlier rollout: the column's lane has just been started, or a rollout
     between the two was not used"""
     copies: int
-    """N: each lane has this many adjacent columns, or a multiple if the batch has several of its rollouts; with seats N · A"""
+    """N, with seats N · A: each lane has so many adjacent columns, or a multiple if the batch has several of its rollouts"""
     episodes: tuple[Episode, ...]
     extras: tuple[Array, ...] = ()
     """one array [T, ΣN, *shape] for each of `RunSpec.extras`"""

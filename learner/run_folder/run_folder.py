@@ -55,12 +55,12 @@ from learner.run_folder.run_format import (
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
 from protocol.bounds import MAX_FACTS, Line, Name, one_line
-from protocol.space_spec import MAX_SEATS
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from protocol.policy.possible import why_impossible
+from protocol.space_spec import MAX_SEATS
 from protocol.specs import PolicySpec
 
 POLICY_FORMAT = 1

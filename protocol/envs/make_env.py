@@ -89,9 +89,8 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
         advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
     else:
         advice = ""
-    raise UsageError(
-        f"env factory {name}: expected it to return a gymnasium.Env, or one of PettingZoo's, got {type(made).__name__}{advice}"
-    )
+    expected = "an environment of gymnasium or PettingZoo"
+    raise UsageError(f"env factory {name}: expected it to return {expected}, got {type(made).__name__}{advice}")
 
 
 def why_not_made(

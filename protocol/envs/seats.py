@@ -3,9 +3,9 @@
 A seat is an agent's place in an env copy, in the order of `possible_agents`. Its agent may act at every step, have the move
 only now and then, leave before the others, or come later.
 
-Rule: a seat's row is the span from one of its actions to its next observation: what follows when it has the move again, or
-its last one. `SeatStep.complete` marks the step in which that observation comes. Until then the seat waits, and shows the
-observation in which it acted. Rewards belong to the row in which they fall; those outside of any row count in the return alone.
+Rule: a row of a seat is the span from one of its actions to its next observation, in which it has the move again or which
+is its last. `SeatStep.complete` marks the step in which that observation comes. Until then the seat waits, and shows the
+observation in which it acted. Rewards belong to the row in which they fall; those outside of any count in the return alone.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
                 (env.action_space, "action", "pad_action_space_v0"),
             )
         )
-        self.observation_space = _with_seat(observation, len(self.seats)) if self._tells_seats else observation
+        seen: gymnasium.Space[Any] = _with_seat(observation, len(self.seats)) if self._tells_seats else observation
+        self.observation_space = seen
         self._before = [self._seen(seat, _any_value(observation)) for seat in range(len(self.seats))]
 
     def _seen(self, seat: int, observation: Any) -> Any:

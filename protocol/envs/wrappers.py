@@ -105,7 +105,10 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
 
 
 def wrap(env: Any, wrapper: WrapperLike) -> Any:
-    """The environment in this wrapper: of gymnasium, or of PettingZoo for its environments. Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised."""
+    """The environment in this wrapper: one of gymnasium, or of PettingZoo for its environments.
+
+    Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised.
+    """
     name = wrapper_name(wrapper)
     try:
         made: object = _found(wrapper)(env) if isinstance(wrapper, str) else wrapper(env)
@@ -120,7 +123,9 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
     except Exception as error:
         raise UsageError(f"wrapper {name}: {type(error).__name__}: {first_line(error)}", traceback.format_exc()) from error
     if not (isinstance(made, gymnasium.Env) or has_seats(made)):
-        raise UsageError(f"wrapper {name}: expected it to return a gymnasium.Env, got {type(made).__name__}")
+        raise UsageError(
+            f"wrapper {name}: expected it to return an environment of gymnasium or PettingZoo, got {type(made).__name__}"
+        )
     return made
 
 

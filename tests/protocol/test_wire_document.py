@@ -154,6 +154,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (space_spec, "MAX_LEAVES"): "arrays of an observation or an action",
     (space_spec, "MAX_DEPTH"): "levels of Dict and Tuple spaces",
     (space_spec, "MAX_WRAPPERS"): "classes of an environment's wrappers",
+    (space_spec, "MAX_SEATS"): "agents of an environment",
     (space_spec, "MAX_SPACES"): "random generators of an environment's spaces",
     (space_spec, "MAX_ELEMENTS"): "elements of all arrays of a space together",
     (env_spec, "MAX_CALLABLE_BYTES"): "bytes of a pickled callable",

@@ -57,8 +57,8 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         case "envpool":
             return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
         case "loop" if run.seats:
-            makes, seats = [run.env.make] * run.copies, run.seats_of_copy
-            return SeatedCopies(makes, pulse, seats, run.info_keys, masked=run.masked, first=first)
+            makes = [run.env.make] * run.copies
+            return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, first=first)
         case "loop":
             return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked, first=first)
 

@@ -15,6 +15,7 @@ from protocol.arrays import Array, Bools
 from protocol.envs.seats import SeatStep
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
+from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Pulse
 from workers.copies.facts import facts_of_info
 from workers.copies.row_writers import read_leaves
@@ -27,16 +28,16 @@ class SeatedCopies(LoopedCopies):
         self,
         makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]],
         pulse: Pulse,
-        seats: int,
+        seats: Sequence[str],
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
         first: EnvCopy = FIRST_COPY,
     ) -> None:
-        """`seats`: A. `facts`: without those of the seats' returns. For the rest, see `LoopedCopies`."""
+        """`seats`: the names of the A agents. `facts`: without the returns of seats. For the rest, see `LoopedCopies`."""
         super().__init__(makes, pulse, facts, masked=masked, first=first)
-        self._seats = seats
-        self._allowed: list[Bools | None] = [None] * (self.count * seats)  # None: every action
+        self._names, self._seats = seats, len(seats)
+        self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: every action
         self.columns: SeatColumns
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
@@ -53,25 +54,31 @@ class SeatedCopies(LoopedCopies):
         return self._result(range(self.count) if copies is None else copies)
 
     def _result(self, stepped: Sequence[int]) -> StepResult:
-        """What the last step of these copies returned. The others, and copies that were never reset, show their last step."""
+        """What the last step of these copies returned. The others show their last step; copies never reset are left out."""
         steps: list[SeatStep] = [step for step in self._observations if step is not None]
         observations, infos, reward, terminated, truncated, complete, acts, outside = (
-            [value for step in steps for value in step[k]] for k in range(len(SeatStep._fields))
+            [value for of_copy in of_copies for value in of_copy] for of_copies in zip(*steps, strict=True)
         )
         leaves: Leaves = read_leaves(self._read, observations) if self._nested else (observations,)
         if self._masks is not None:
             for n in stepped:
-                for column in range(n * self._seats, (n + 1) * self._seats):
-                    if acts[column] or complete[column]:
-                        ends = not acts[column]
-                        given = observations[column], infos[column], ends and terminated[column], ends
-                        self._allowed[column] = self._masks.read(column, *given)
+                for seat, name in enumerate(self._names):
+                    column = n * self._seats + seat
+                    if not (acts[column] or complete[column]):
+                        continue
+                    over = not acts[column]
+                    try:
+                        self._allowed[column] = self._masks.read(
+                            n, observations[column], infos[column], over and terminated[column], over
+                        )
+                    except CopyFailed as error:
+                        raise CopyFailed(n, error.doing, f"{name}, {error.line}") from error
             everything = self._masks.everything
             allowed = self._allowed[: len(acts)]
             leaves = (*leaves, [everything if mask is None else mask for mask in allowed])
-        over = np.array(self._loop.terminated[: len(steps)], bool)
-        self.columns = SeatColumns(np.array(complete, bool), np.array(acts, bool), np.array(outside, np.float64), over)
-        facts = {n: self._facts_of(steps[n]) for n in stepped if over[n]} if self._facts else {}
+        ended = np.array(self._loop.terminated[: len(steps)], bool)
+        self.columns = SeatColumns(np.array(complete, bool), np.array(acts, bool), np.array(outside, np.float64), ended)
+        facts = {n: self._facts_of(steps[n]) for n in stepped if ended[n]} if self._facts else {}
         return StepResult(leaves, reward, terminated, truncated, facts=facts, columns=self.columns)
 
     def _facts_of(self, last: SeatStep) -> tuple[float, ...]:

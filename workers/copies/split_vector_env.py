@@ -114,7 +114,7 @@ class SplitVectorEnv:
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""
         assert self._result is not None
-        leaves, reward, terminated, truncated, lost, facts = self._result
+        leaves, reward, terminated, truncated, lost, facts, _ = self._result
         lost = None if lost is None else lost[copies]
         own = {n - copies.start: facts[n] for n in range(copies.start, copies.stop) if n in facts} if facts else {}
         return StepResult(

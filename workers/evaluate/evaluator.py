@@ -1,8 +1,8 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
 Rule: an order has k seeds, so k env copies are stepped together, and the policy always sees a batch [1, k · A, ...], where A
-is the number of seats of a copy. A copy whose episode has ended stays in the batch and is not stepped. The copies are apart from the lanes of training. They are
-opened once, and reset with a seed before each episode.
+is the number of seats of a copy. A copy whose episode has ended stays in the batch and is not stepped. The copies are apart
+from the lanes of training. They are opened once, and reset with a seed before each episode.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
         first = EnvCopy(evaluation=True)
         if run.seats:
             copies: LoopedCopies = SeatedCopies(
-                [make] * count, pulse, run.seats_of_copy, run.info_keys, masked=run.masked, first=first
+                [make] * count, pulse, run.seats, run.info_keys, masked=run.masked, first=first
             )
         else:
             copies = LoopedCopies([make] * count, pulse, run.facts, masked=run.masked, first=first)
@@ -149,9 +149,7 @@ class Evaluator:
             self._check_acted(chosen, running, obs, t)
             # The actions are a new array at each step, because an environment may keep its action.
             try:
-                step = copies.step(
-                    taken.reshape(k, A, *taken.shape[1:])[running].reshape(-1, *taken.shape[1:]), pulse, running
-                )
+                step = copies.step(taken[self._columns(running)], pulse, running)
                 if step.lost is not None and step.lost[running].any():
                     return None
                 write_numbers(

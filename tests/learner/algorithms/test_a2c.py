@@ -94,7 +94,9 @@ def test_a_constant_baseline_changes_nothing_that_is_normalized() -> None:
     one, other = a2c(**FREE, normalize_advantage=True), reinforce(**FREE, baseline=False)
     constant_critic(one, 5.0)
     rows = whole(batch(one, 0))
-    returns = Rows(rows.reward, np.full((len(rows.reward) + 1, rows.reward.shape[1]), 5.0), *EpisodeEnds.of(rows))
+    returns = Rows(
+        rows.reward, np.full((len(rows.reward) + 1, rows.reward.shape[1]), 5.0), rows.terminated, rows.truncated, rows.valid
+    )
     errors = Errors(advantage=2 * float(gae_tolerance(returns, FREE["gamma"], 1.0).max()))
     only_step(one, rows, errors).assert_is(only_step(other, rows).gradient, slice(one.net.acting_size))
 

@@ -12,7 +12,6 @@ from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import ActorCritic, Estimates
 from learner.algorithms.impala import IMPALA
 from learner.algorithms.minibatches import Minibatch
-from learner.algorithms.returns import EpisodeEnds
 from learner.config.hyperparameters import A2CConfig, IMPALAConfig
 from protocol.arrays import Array
 from protocol.rollout import Batch
@@ -39,7 +38,7 @@ def test_on_rows_of_the_newest_weights_its_gradient_is_a2cs(spec: PolicySpec, la
     other, others_twin = (A2C(config, spec, total_steps=10_000, seed=0) for _ in range(2))
     rows = batch(one, 0)
     found, expected = estimated(twin, rows), estimated(others_twin, rows)
-    returns = Rows(rows.reward, expected.values, *EpisodeEnds.of(rows))
+    returns = Rows(rows.reward, expected.values, rows.terminated, rows.truncated, rows.valid)
     of_log_prob = log_prob_error(one, rows)
     of_target, of_advantage = vtrace_tolerances(on_policy(returns), GAMMA, lam, log_ratio_error=of_log_prob)
     assert_within(found.target[rows.valid], expected.target[rows.valid], 2 * of_target[rows.valid])  # both are rounded
@@ -83,7 +82,7 @@ def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spe
     log_ratio = log_prob.detach().numpy().reshape(rows.valid.shape) - rows.log_prob
     values = value.detach().numpy().reshape(len(rows.valid) + 1, -1)
     bars = GAMMA, 0.8, 1.2, 0.9
-    o = OffPolicy(Rows(rows.reward, values, *EpisodeEnds.of(rows)), log_ratio)
+    o = OffPolicy(Rows(rows.reward, values, rows.terminated, rows.truncated, rows.valid), log_ratio)
     target, advantage = (torch.from_numpy(each).flatten().float() for each in slow_vtrace(o, *bars))
     policy_loss = -(log_prob * advantage)[valid].mean()
     value_loss = (value[: len(target)] - target)[valid].square().mean()

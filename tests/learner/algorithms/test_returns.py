@@ -147,7 +147,9 @@ def test_discounted_return_goes_on_where_the_last_rollout_stopped() -> None:
     generator = np.random.default_rng(0)
     reward = generator.normal(size=(10, 3)).astype(np.float32)
     ends = EpisodeEnds(*lawful(generator.random((10, 3)) < 0.2, np.zeros((10, 3), bool), np.ones(3, bool)))
-    earlier, later = (EpisodeEnds(*(each[part] for each in ends)) for part in (slice(4), slice(4, None)))
+    earlier, later = (
+        EpisodeEnds(ends.terminated[part], ends.truncated[part], ends.valid[part]) for part in (slice(4), slice(4, None))
+    )
     whole, end = discounted_return(reward, ends, GAMMA, np.zeros(3))
     first, middle = discounted_return(reward[:4], earlier, GAMMA, np.zeros(3))
     second, last = discounted_return(reward[4:], later, GAMMA, middle)

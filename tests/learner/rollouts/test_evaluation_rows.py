@@ -137,7 +137,8 @@ def test_an_answer_that_no_player_gives_is_a_strike(changes: dict[str, object]) 
 @pytest.mark.parametrize("facts", [(), (1.0, 2.0), (math.inf,)])
 def test_an_answer_with_wrong_facts_is_a_strike(facts: tuple[float, ...]) -> None:
     played = Played()
-    played.learner.coordinator.evaluation._facts = 1
+    dealer = played.learner.coordinator.evaluation
+    dealer._run = msgspec.structs.replace(dealer._run, facts=("a number",))
     answer = played.answer(1)
     episodes = tuple(msgspec.structs.replace(episode, facts=facts) for episode in answer.episodes)
     played.learner.says(A, msgspec.structs.replace(answer, episodes=episodes))
@@ -204,6 +205,8 @@ def test_no_row_follows_the_end_of_an_episode(flag: str) -> None:
 
 
 def test_rows_may_have_a_part_without_elements() -> None:
-    row, empty = Played().rows(0), np.zeros((2, 0), bool)
+    played, empty = Played(), np.zeros((2, 0), bool)
+    row, run = played.rows(0), played.learner.coordinator.run
     policy = PolicySpec((Leaf("", "box", (0,), "bool"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
-    assert reason_to_reject(msgspec.structs.replace(row, obs=(empty,)), [], policy, MOST_STEPS, with_frames=False) == ""
+    run = msgspec.structs.replace(run, policy=policy)
+    assert reason_to_reject(msgspec.structs.replace(row, obs=(empty,)), [], run, MOST_STEPS, with_frames=False) == ""

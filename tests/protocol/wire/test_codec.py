@@ -203,9 +203,9 @@ def test_a_default_stands_at_the_end_alone() -> None:
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
     assert defaults == {
         Hello: (False,), Alive: (None,),
-        Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ()),
+        Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
     }  # fmt: skip
-    assert Rollout.__struct_fields__[-3:] == ("episodes", "mask", "extras")
+    assert Rollout.__struct_fields__[-4:] == ("episodes", "mask", "extras", "resets")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import pytest
 import millrace
 from learner.config.layers import resolve
 from learner.conversations import rollout_spec
+from learner.env_spaces import EnvSpaces
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import MillraceError, UsageError
@@ -77,9 +78,10 @@ def test_envpool_has_no_masks_and_is_refused() -> None:
     env = InInfo()
     policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
     config = resolve("Any-v0", preset="none", vector="envpool")
+    spaces = EnvSpaces.of_policy(policy)
     with pytest.raises(UsageError, match="vector envpool: its environments report no action masks; use --vector loop"):
-        rollout_spec(config, EnvSpec("Any-v0"), policy, 8, masked=True)
-    assert rollout_spec(config, EnvSpec("Any-v0"), policy, 8).vector == "envpool"
+        rollout_spec(config, EnvSpec("Any-v0"), policy, 8, spaces=spaces._replace(masked=True))
+    assert rollout_spec(config, EnvSpec("Any-v0"), policy, 8, spaces=spaces).vector == "envpool"
 
 
 @pytest.mark.parametrize(("kind", "deterministic"), [(InInfo, True), (InInfo, False), (InObservation, True), (Parts, False)])

@@ -1,0 +1,181 @@
+"""Environments of several agents in PettingZoo's two forms, with random histories that they write down themselves.
+
+Who has the move, who leaves and how, and all rewards are drawn from the seed, so that histories hold every case: agents that
+move twice in a row, wait for long, never move, leave early, terminated or truncated, and rewards between their moves, before
+the first and after the last. `told` is what each agent lived through, in its own time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+AGENTS = ("a", "b", "c")
+
+
+@dataclass
+class Lived:
+    """One agent's part of an episode. Entry k of each list is its k-th action, and what came of it."""
+
+    seen: list[float] = field(default_factory=list)
+    did: list[int] = field(default_factory=list)
+    reward: list[float] = field(default_factory=list)
+    step: list[int] = field(default_factory=list)
+    """the number of the step in which its outcome came"""
+    saw: list[float] = field(default_factory=list)
+    terminated: bool = False
+    truncated: bool = False
+    total: float = 0.0
+    """of all rewards, also those of no action"""
+
+
+class _Told:
+    """The parts that both forms share."""
+
+    possible_agents = AGENTS
+    metadata: dict[str, Any] = {}
+    render_mode = None
+
+    def __init__(self, most_steps: int = 12) -> None:
+        self.most_steps = most_steps
+        self.told: list[dict[str, Lived]] = []
+        self._generator = np.random.default_rng(0)
+        self._observed = 0
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return spaces.Box(0, np.inf, (1,), np.float32)
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        return spaces.Discrete(3)
+
+    def _begin(self, seed: int | None) -> None:
+        if seed is not None:
+            self._generator = np.random.default_rng(seed)
+        self.agents = [agent for agent in AGENTS if self._generator.random() < 0.9] or [AGENTS[0]]
+        self.steps = 0
+        self._lived = {agent: Lived() for agent in AGENTS}
+        self.told.append(self._lived)
+        self._pending: dict[str, tuple[np.ndarray, int]] = {}
+        self._due = dict.fromkeys(AGENTS, 0.0)
+
+    def _observation(self) -> np.ndarray:
+        """Each one is a number of its own."""
+        self._observed += 1
+        return np.array([self._observed], np.float32)
+
+    def _act(self, agent: str, seen: np.ndarray, action: Any) -> None:
+        self._pending[agent] = seen, int(action)
+        self._due[agent] = 0.0
+
+    def _rewards(self, agents: list[str]) -> dict[str, float]:
+        found = {}
+        for agent in agents:
+            found[agent] = float(np.float32(self._generator.normal())) if self._generator.random() < 0.7 else 0.0
+            self._due[agent] += found[agent]
+            self._lived[agent].total += found[agent]
+        return found
+
+    def _outcome(self, agent: str, saw: np.ndarray, terminated: bool, truncated: bool) -> None:
+        if agent not in self._pending:
+            return
+        lived, (seen, action) = self._lived[agent], self._pending.pop(agent)
+        lived.seen.append(float(seen[0]))
+        lived.did.append(action)
+        lived.reward.append(self._due[agent])
+        lived.step.append(self.steps - 1)
+        lived.saw.append(float(saw[0]))
+        lived.terminated, lived.truncated = terminated, truncated
+
+    def _end(self) -> tuple[bool, bool]:
+        """Terminated, truncated or both."""
+        return ((True, False), (False, True), (True, True))[self._generator.integers(3)]
+
+    def render(self) -> None:
+        return None
+
+    def close(self) -> None:
+        pass
+
+
+class RandomGame(_Told):
+    """One agent acts at a time: PettingZoo's AEC form."""
+
+    def agent_iter(self) -> None:
+        """Present in this form alone."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        self._begin(seed)
+        self.rewards = self._rewards(self.agents) if self._generator.random() < 0.2 else dict.fromkeys(self.agents, 0.0)
+        self._cumulative = dict(self.rewards)
+        self.terminations, self.truncations = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, False)
+        self._shown: dict[str, np.ndarray] = {}
+        self._choose()
+
+    def _choose(self) -> None:
+        self.agent_selection = str(self._generator.choice(self.agents))
+        self._show(self.agent_selection)
+
+    def _show(self, agent: str) -> None:
+        self._shown[agent] = self._observation()
+        self._outcome(agent, self._shown[agent], self.terminations[agent], self.truncations[agent])
+
+    def last(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        agent = self.agent_selection
+        return self._shown[agent], self._cumulative[agent], self.terminations[agent], self.truncations[agent], {}
+
+    def step(self, action: Any) -> None:
+        agent = self.agent_selection
+        if self.terminations[agent] or self.truncations[agent]:
+            assert action is None
+            self.agents.remove(agent)
+        else:
+            self._act(agent, self._shown[agent], action)
+            self._cumulative[agent] = 0.0
+            for who, reward in self._rewards(self.agents).items():
+                self._cumulative[who] += reward
+            self.steps += 1
+            over = self.steps >= self.most_steps or self._generator.random() < 0.05
+            for who in self.agents:
+                if over or self._generator.random() < 0.06:
+                    self.terminations[who], self.truncations[who] = self._end()
+        gone = [who for who in self.agents if self.terminations[who] or self.truncations[who]]
+        if gone:
+            self.agent_selection = gone[0]
+            self._show(gone[0])
+        elif self.agents:
+            self._choose()
+
+
+class RandomCrowd(_Told):
+    """All agents that are there act at the same time: PettingZoo's parallel form. Some come later."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        self._begin(seed)
+        self._was_here = set(self.agents)
+        self._shown = {agent: self._observation() for agent in self.agents}
+        return dict(self._shown), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        assert list(actions) == [agent for agent in AGENTS if agent in self.agents]
+        for agent, action in actions.items():
+            self._act(agent, self._shown[agent], action)
+        outside = [agent for agent in AGENTS if agent not in self.agents and self._generator.random() < 0.1]
+        rewards = self._rewards([*self.agents, *outside])
+        self.steps += 1
+        over = self.steps >= self.most_steps or self._generator.random() < 0.05
+        ends = {agent: self._end() if over or self._generator.random() < 0.08 else (False, False) for agent in self.agents}
+        shown = {}
+        for agent, (terminated, truncated) in ends.items():
+            shown[agent] = self._shown[agent] = self._observation()
+            self._outcome(agent, self._shown[agent], terminated, truncated)
+        self.agents = [agent for agent in self.agents if not any(ends[agent])]
+        late = [agent for agent in AGENTS if agent not in self._was_here]
+        if self.agents and late and self._generator.random() < 0.3:
+            self._was_here.add(late[0])
+            self.agents.append(late[0])
+            shown[late[0]] = self._shown[late[0]] = self._observation()
+        ended = [{agent: both[k] for agent, both in ends.items()} for k in (0, 1)]
+        return shown, rewards, *ended, {}

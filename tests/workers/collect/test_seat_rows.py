@@ -1,0 +1,234 @@
+"""Rows of env copies with seats: each is what one agent lived through, in its own time, wherever rollouts are cut."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.algorithms.returns import EpisodeEnds, complete, discounted_return, gae, vtrace
+from protocol.arrays import Array
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.rollout import Batch, Rollout, stack_rollouts
+from protocol.rows.rollout_checks import validate
+from protocol.specs import PolicySpec, RunSpec, seat_returns
+from tests.support.in_process.collectors import collect, random_collector
+from tests.support.users_code.seat_envs import AGENTS, Lived, RandomCrowd, RandomGame
+from workers.collect.collector import Collector
+
+FORMS: dict[str, Any] = {"turns": RandomGame, "together": RandomCrowd}
+GAMMA, LAMBDA, RHO, C = 0.9, 0.8, 1.1, 0.9
+A = len(AGENTS)
+
+
+def seated_run(form: str, T: int, N: int, **policy: Any) -> RunSpec:
+    env = FORMS[form]()
+    spec = PolicySpec((*observation_leaves(env.observation_space("a")),), action_spec(env.action_space("a")), **policy)
+    name = EnvSpec(f"tests.support.users_code.seat_envs:{FORMS[form].__name__}")
+    turns, facts = form == "turns", seat_returns(AGENTS)
+    return RunSpec(name, spec, T, N, lanes=8, seed=1, seats=AGENTS, takes_turns=turns, facts=facts)
+
+
+def collected(run: RunSpec, number: int, lane: int = 0) -> tuple[Collector, list[Rollout]]:
+    collector = random_collector(run)
+    rollouts = [collect(collector, run, k, lanes=[lane])[0] for k in range(number)]
+    for rollout in rollouts:
+        validate(rollout, run)
+    return collector, rollouts
+
+
+def in_own_time(collector: Collector, lane: int, rows: int) -> list[tuple[int, int, Lived]]:
+    """What each agent lived through: the column, the row of its episode's first step, and its part."""
+    found = []
+    for n, env in enumerate(collector.lanes[lane].copies.envs):  # type: ignore[attr-defined]
+        start = 0
+        for episode in env.env.told:
+            found += [(n * A + seat, start, episode[agent]) for seat, agent in enumerate(AGENTS)]
+            steps = 1 + max((step for lived in episode.values() for step in lived.step), default=rows)
+            start += steps + 1  # the row after the last one resets the copy
+    return found
+
+
+def joined(rollouts: list[Rollout]) -> dict[str, Array]:
+    """The rows of consecutive rollouts, as those of one."""
+    names = ("action", "log_prob", "reward", "terminated", "truncated", "valid")
+    found = {name: np.concatenate([getattr(rollout, name) for rollout in rollouts]) for name in names}
+    found["obs"] = np.concatenate([*(rollout.obs[0][:-1] for rollout in rollouts), rollouts[-1].obs[0][-1:]])
+    found["resets"] = np.concatenate([*(rollout.resets[:-1] for rollout in rollouts), rollouts[-1].resets[-1:]])  # type: ignore[index]
+    return found
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_row_is_what_an_agent_lived_through(form: str) -> None:
+    run = seated_run(form, T=7, N=40)
+    collector, rollouts = collected(run, 6)
+    rows, seen = joined(rollouts), 0
+    for column, start, lived in in_own_time(collector, 0, 42):
+        for k, step in enumerate(lived.step):
+            if (t := start + step) >= 42:
+                break
+            seen += 1
+            assert rows["valid"][t, column]
+            assert rows["obs"][t, column] == lived.seen[k]
+            assert rows["obs"][t + 1, column] == lived.saw[k]
+            assert rows["action"][t, column] == lived.did[k]
+            assert rows["reward"][t, column] == pytest.approx(lived.reward[k], abs=1e-6)
+            last = k == len(lived.step) - 1
+            assert rows["terminated"][t, column] == (last and lived.terminated)
+            assert rows["truncated"][t, column] == (last and lived.truncated)
+    assert seen == np.count_nonzero(rows["valid"]) > 1000
+    assert not rows["reward"][~rows["valid"]].any()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_returns_of_episodes_count_every_reward(form: str) -> None:
+    run = seated_run(form, T=30, N=20)
+    collector, rollouts = collected(run, 2)
+    episodes = [episode for rollout in rollouts for episode in rollout.episodes]
+    envs = [seated.env for seated in collector.lanes[0].copies.envs]  # type: ignore[attr-defined]
+    told = [each for env in envs for each in env.told[: -1 if env.agents else None]]
+    expected = sorted(tuple(each[agent].total for agent in AGENTS) for each in told)
+    np.testing.assert_allclose(sorted(episode.facts for episode in episodes), expected, atol=1e-9)
+    for episode in episodes:
+        assert episode.reward == pytest.approx(sum(episode.facts))
+    running = sum(env.steps for env in envs if env.agents)
+    steps = running + sum(episode.length for episode in episodes)
+    assert sum(rollout.env_steps for rollout in rollouts) == collector.steps == steps
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("core", [None, "gru"])
+def test_rows_do_not_depend_on_where_rollouts_are_cut(form: str, core: Any) -> None:
+    """One version acts in all of them, so the rows, and the states before them, are the same."""
+    _, whole = collected(seated_run(form, T=24, N=5, core=core), 1)
+    expected = joined(whole)
+    for T in (1, 2, 3, 8):
+        _, parts = collected(seated_run(form, T=T, N=5, core=core), 24 // T)
+        found = joined(parts)
+        for name in expected:
+            if name in ("log_prob", "action"):
+                valid = expected["valid"]
+                np.testing.assert_array_equal(found[name][valid], expected[name][valid], err_msg=name)
+            else:
+                np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+
+
+# ----------------------------------------------------------------------------------------- returns, in each agent's own time
+
+
+def value(obs: Any) -> Any:
+    return np.sin(np.asarray(obs, np.float64) * 1.7).astype(np.float32)
+
+
+def log_ratio(obs: Any) -> Any:
+    return (0.4 * np.cos(np.asarray(obs, np.float64) * 2.3)).astype(np.float32)
+
+
+class OwnTime:
+    """The estimates of one agent's part of an episode, from definitions, in float64. Rollouts are cut every T rows."""
+
+    def __init__(self, start: int, lived: Lived, T: int, rows: int) -> None:
+        self.rows = [start + step for step in lived.step if start + step < rows]
+        self.advantage, self.target, self.pg = {}, {}, {}
+        ahead = vs_ahead = 0.0
+        following = -1
+        for k in reversed(range(len(self.rows))):
+            t, last = self.rows[k], k == len(lived.step) - 1
+            v, v_next = float(value(lived.seen[k])), float(value(lived.saw[k]))
+            ended = last and (lived.terminated or lived.truncated)
+            bootstrap = 0.0 if last and lived.terminated else v_next
+            delta = lived.reward[k] + GAMMA * bootstrap - v
+            if ended or following // T != t // T or following < 0:
+                ahead = vs_ahead = 0.0
+            self.advantage[t] = ahead = delta + GAMMA * LAMBDA * ahead
+            ratio = np.exp(float(log_ratio(lived.seen[k])))
+            rho, c = min(RHO, ratio), LAMBDA * min(C, ratio)
+            self.pg[t] = rho * (delta + GAMMA * LAMBDA * vs_ahead)
+            vs_ahead = rho * delta + GAMMA * c * vs_ahead
+            self.target[t] = vs_ahead + v
+            following = t
+        total, self.past = 0.0, {}
+        for t, reward in zip(self.rows, lived.reward, strict=False):
+            self.past[t] = total = reward + GAMMA * total
+
+
+def cut(rows: dict[str, Array], T: int) -> list[tuple[slice, EpisodeEnds]]:
+    count = len(rows["valid"]) // T
+    flags = rows["terminated"], rows["truncated"], rows["valid"]
+    parts = [slice(i * T, (i + 1) * T) for i in range(count)]
+    return [(part, EpisodeEnds(flags[0][part], flags[1][part], flags[2][part], with_seats=True)) for part in parts]
+
+
+def check_returns(form: str, copies: int, lane: int) -> int:
+    """Compare at every T. Returns the number of rows that were compared at T = 1."""
+    rows_of_all = 24
+    run = seated_run(form, T=rows_of_all, N=copies)
+    collector, rollouts = collected(run, 1, lane)
+    rows, compared = joined(rollouts), 0
+    lives = in_own_time(collector, lane, rows_of_all)
+    obs = rows["obs"][..., 0]
+    values, ratios = value(obs), log_ratio(obs[:-1])
+    for T in range(1, rows_of_all + 1):
+        whole = rows_of_all // T * T
+        advantage, target, pg = (np.full((whole, copies * A), np.nan) for _ in range(3))
+        past, last = np.full((whole, copies * A), np.nan), np.zeros(copies * A)
+        for part, ends in cut(rows, T):
+            reward = rows["reward"][part]
+            v = values[part.start : part.stop + 1]
+            advantage[part] = gae(reward, v, ends, GAMMA, LAMBDA)
+            target[part], pg[part] = vtrace(reward, v, ratios[part], ends, GAMMA, LAMBDA, RHO, C)
+            past[part], last = discounted_return(reward, ends, GAMMA, last)
+        expected = {name: np.zeros_like(advantage) for name in ("advantage", "target", "pg", "past")}
+        for column, start, lived in lives:
+            own = OwnTime(start, lived, T, whole)
+            for name, table in expected.items():
+                for t, number in getattr(own, name).items():
+                    table[t, column] = number
+            compared += len(own.rows) if T == 1 else 0
+        # Twenty float32 operations on numbers below 30: each rounds by 2e-6 at most.
+        for name, found in (("advantage", advantage), ("target", target), ("pg", pg), ("past", past)):
+            np.testing.assert_allclose(found, expected[name], atol=1e-4, err_msg=f"{name} at T {T}")
+    return compared
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_returns_equal_those_in_each_agents_own_time_at_every_cut(form: str) -> None:
+    assert check_returns(form, 60, 0) > 1000
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("form", FORMS)
+def test_so_do_those_of_ten_thousand_histories(form: str) -> None:
+    compared = sum(check_returns(form, 500, lane) for lane in range(5)) + sum(
+        check_returns(form, 1250, 5 + k) for k in range(2)
+    )
+    assert compared > 100_000
+
+
+def test_a_monte_carlo_return_is_known_where_the_seats_part_ends_within_the_rollout() -> None:
+    valid = np.array([[1, 0], [0, 1], [1, 1], [0, 0]], bool)
+    terminated = np.array([[0, 0], [0, 0], [1, 0], [0, 0]], bool)
+    ends = EpisodeEnds(terminated, np.zeros_like(valid), valid, with_seats=True)
+    assert complete(ends).tolist() == [[True, False], [False, False], [True, False], [False, False]]
+
+
+# ------------------------------------------------------------------------------------------------------ what is refused
+
+
+def broken(rollout: Rollout, **changes: Any) -> Rollout:
+    return msgspec.structs.replace(rollout, **changes)
+
+
+def batch_of(form: str, **policy: Any) -> tuple[RunSpec, Batch]:
+    run = seated_run(form, T=32, N=4, **policy)
+    _, rollouts = collected(run, 1)
+    return run, stack_rollouts(rollouts)
+
+
+def test_a_batch_counts_steps_of_copies() -> None:
+    run, batch = batch_of("turns")
+    assert batch.resets is not None
+    assert batch.env_steps == run.rollout_steps * run.copies - np.count_nonzero(batch.resets[:-1])
