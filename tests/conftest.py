@@ -59,7 +59,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def spread(items: list[pytest.Item]) -> list[pytest.Item]:
     """Files of tests/system lie evenly among the others: they wait while those compute, so no core idles at the end."""
-    waiting, computing = [], []
+    waiting: list[pytest.Item] = []
+    computing: list[pytest.Item] = []
     for item in items:
         (waiting if "tests/system/" in item.nodeid else computing).append(item)
     place: dict[Path, float] = {}
