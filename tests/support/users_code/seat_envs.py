@@ -179,3 +179,91 @@ class RandomCrowd(_Told):
             shown[late[0]] = self._shown[late[0]] = self._observation()
         ended = [{agent: both[k] for agent, both in ends.items()} for k in (0, 1)]
         return shown, rewards, *ended, {}
+
+
+class Unequal(RandomCrowd):
+    """One agent has more actions than the others."""
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        return spaces.Discrete(3 if agent == "a" else 4)
+
+
+MOVES = {"short": 3, "long": 6}
+CHAIN_REWARD = {"short": (1.0, -1.0, 2.0), "long": (0.5, 0.0, 1.0, -2.0, 0.0, 3.0)}
+
+
+class _Chain:
+    """Each agent makes a number of moves, then it leaves. What it does makes no difference, so its values are known."""
+
+    possible_agents = tuple(MOVES)
+    metadata: dict[str, Any] = {}
+    render_mode = None
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return spaces.Box(0, 1, (sum(MOVES.values()),), np.float32)
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        return spaces.Discrete(2)
+
+    def observe(self, agent: str) -> np.ndarray:
+        """Who it is and how many moves it has made; all zeros when it has made them all."""
+        found = np.zeros(sum(MOVES.values()), np.float32)
+        if (made := self.made[agent]) < MOVES[agent]:
+            found[(0 if agent == "short" else MOVES["short"]) + made] = 1
+        return found
+
+    def close(self) -> None:
+        pass
+
+
+class ChainCrowd(_Chain):
+    """Both move at the same time."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        self.agents, self.made = list(MOVES), dict.fromkeys(MOVES, 0)
+        return {agent: self.observe(agent) for agent in self.agents}, {}
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        rewards = {agent: CHAIN_REWARD[agent][self.made[agent]] for agent in actions}
+        for agent in actions:
+            self.made[agent] += 1
+        over = {agent: self.made[agent] == MOVES[agent] for agent in actions}
+        self.agents = [agent for agent in self.agents if not over[agent]]
+        return {agent: self.observe(agent) for agent in actions}, rewards, over, dict.fromkeys(actions, False), {}
+
+
+class ChainGame(_Chain):
+    """They take turns until one has left."""
+
+    def agent_iter(self) -> None:
+        """Present in this form alone."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        self.agents, self.made = list(MOVES), dict.fromkeys(MOVES, 0)
+        self.due = dict.fromkeys(MOVES, 0.0)
+        self.agent_selection = "short"
+
+    def _over(self, agent: str) -> bool:
+        return self.made[agent] == MOVES[agent]
+
+    def last(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        agent = self.agent_selection
+        return self.observe(agent), self.due[agent], self._over(agent), False, {}
+
+    def step(self, action: Any) -> None:
+        agent = self.agent_selection
+        if self._over(agent):
+            self.agents.remove(agent)
+        else:
+            self.due[agent] = CHAIN_REWARD[agent][self.made[agent]]
+            self.made[agent] += 1
+        others = [each for each in self.agents if each != agent]
+        self.agent_selection = others[0] if others else agent
+
+
+def values_of_the_chain(gamma: float) -> list[float]:
+    """The value of each of the chain's observations, by the place of its 1."""
+    found: list[float] = []
+    for rewards in CHAIN_REWARD.values():
+        found += [sum(gamma**j * reward for j, reward in enumerate(rewards[k:])) for k in range(len(rewards))]
+    return found

@@ -1,0 +1,131 @@
+"""Runs with several agents, whole: known values, the same bits for any number of workers, resuming, evaluations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import millrace
+from learner.algorithms import algorithm_class
+from learner.config.hyperparameters import PPOConfig
+from learner.config.layers import resolve
+from learner.policy_player import saved_policy
+from learner.run_folder import checkpoint
+from millrace.launch.training import train
+from protocol.arrays import Floats
+from protocol.errors import UsageError
+from protocol.policy.policy import make_policy
+from protocol.policy.recurrent import zero_state
+from tests.support.users_code.seat_envs import CHAIN_REWARD, MOVES, values_of_the_chain
+from tests.system.stage.run_folders import policy_of
+
+ENVS = "tests.support.users_code.seat_envs:"
+GAMMA = 0.9
+
+
+SMALL: dict[str, Any] = {"preset": "none", "transport": "inproc", "seed": 1, "workers": 1, "eval_episodes": 1}
+RAW: dict[str, Any] = {"gamma": GAMMA, "normalize_observations": False, "normalize_rewards": False}
+
+
+def trained(path: Path, env: str, resume: Path | None = None, **settings: Any) -> Path:
+    return train(resolve(f"{ENVS}{env}", resume=resume, run_dir=str(path), **SMALL | settings), resume, lambda _: None)
+
+
+def each_observation() -> Floats:
+    return np.eye(sum(MOVES.values()), dtype=np.float32)
+
+
+def value_of_each(run: Path) -> Floats:
+    """What the critic of a run of PPO says of each observation of the chain."""
+    algorithm = algorithm_class("ppo")(PPOConfig(), saved_policy(run).spec, total_steps=1, seed=1)
+    algorithm.load_state_dict(checkpoint.newest(run)[0].state["algorithm"])
+    with torch.no_grad():
+        return algorithm.net.value(torch.from_numpy(each_observation())).numpy()  # type: ignore[attr-defined, no-any-return]
+
+
+def best_of_each(run: Path) -> Floats:
+    """What a run of DQN says of the better action in each."""
+    saved = saved_policy(run)
+    policy = make_policy(saved.spec)
+    policy.load(saved.parameters, saved.buffers)
+    obs = each_observation()[None]
+    return np.asarray(policy([obs], zero_state(saved.spec, *obs.shape[:2]))[0, :, :2].max(-1))  # the last is ε
+
+
+@pytest.mark.parametrize("env", ["ChainGame", "ChainCrowd"])
+def test_ppo_reaches_the_known_values_of_agents_of_which_one_leaves(tmp_path: Path, env: str) -> None:
+    settings: dict[str, Any] = {"learning_rate": 5e-3, "learning_rate_schedule": "linear", "rollout_steps": 32}
+    run = trained(tmp_path, env, steps=5_000, n_epochs=4, **RAW, **settings)
+    np.testing.assert_allclose(value_of_each(run), values_of_the_chain(GAMMA), atol=0.01)
+
+
+@pytest.mark.parametrize(("env", "n_step"), [("ChainGame", 1), ("ChainCrowd", 1), ("ChainCrowd", 3)])
+def test_so_does_dqn(tmp_path: Path, env: str, n_step: int) -> None:
+    settings: dict[str, Any] = {"learning_rate": 3e-3, "learning_starts": 200, "gradient_steps": 64, "target_every": 100}
+    run = trained(
+        tmp_path, env, algo="dqn", steps=5_000, rollout_steps=32, epsilon_end=1.0, n_step=n_step, **RAW, **settings
+    )
+    np.testing.assert_allclose(best_of_each(run), values_of_the_chain(GAMMA), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("env", "settings"),
+    [
+        ("RandomGame", {"max_lag": 1, "normalize_observations": True}),
+        ("RandomGame", {"core": "gru", "net": (8,), "n_epochs": 1}),
+        ("RandomCrowd", {"algo": "impala", "max_lag": 2}),
+        ("RandomCrowd", {"algo": "dqn", "n_step": 3, "learning_starts": 200}),
+    ],
+)
+def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
+    settings |= {"steps": 1_500, "rollout_steps": 16}
+    policies = [policy_of(trained(tmp_path / str(n), env, workers=n, **settings)) for n in (1, 3)]
+    assert policies[0] == policies[1]
+
+
+def test_an_episode_has_the_return_of_each_agent_and_their_sum(tmp_path: Path) -> None:
+    run = trained(tmp_path, "ChainGame", steps=500, rollout_steps=16, eval_episodes=3)
+    totals = {agent: sum(rewards) for agent, rewards in CHAIN_REWARD.items()}
+    summary = json.loads((run / "summary.json").read_text())
+    for returns, facts in (
+        (summary["return_mean_100"], summary["facts_100"]),
+        (summary["evaluation"]["return_mean"], summary["evaluation"]["facts"]),
+    ):
+        assert returns == sum(totals.values())
+        assert {name: each["mean"] for name, each in facts.items()} == {f"return_{agent}": totals[agent] for agent in totals}
+    assert summary["evaluation"]["length_mean"] == sum(MOVES.values())
+
+
+@pytest.mark.parametrize("env", ["ChainGame", "ChainCrowd"])
+def test_each_agent_can_be_told_which_one_it_is(tmp_path: Path, env: str) -> None:
+    run = trained(tmp_path, env, steps=300, rollout_steps=16, seat_id=True)
+    leaves = saved_policy(run).spec.observation
+    assert [(leaf.path, leaf.kind, leaf.sizes) for leaf in leaves] == [
+        ("observation", "box", ()),
+        ("seat", "discrete", (2,)),
+    ]
+    assert millrace.evaluate(run, episodes=1).facts["return_long"].mean == sum(CHAIN_REWARD["long"])
+
+
+@pytest.mark.parametrize(
+    ("env", "settings", "says"),
+    [
+        ("ChainGame", {"inference": "learner"}, "inference learner: .*ChainGame has several agents, whose workers act"),
+        ("ChainGame", {"record": "a/b-v0"}, "record: expected none, because .*ChainGame has several agents"),
+        (
+            "Unequal",
+            {},
+            "expected one action space for all agents, got .* for a and .* for b; .*supersuit:pad_action_space_v0",
+        ),
+    ],
+)
+def test_what_several_agents_cannot_have_is_refused_in_a_line(
+    tmp_path: Path, env: str, settings: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(UsageError, match=says):
+        trained(tmp_path, env, steps=300, **settings)
