@@ -196,6 +196,7 @@ class _Chain:
     """Each agent makes a number of moves, then it leaves. What it does makes no difference, so its values are known."""
 
     possible_agents = tuple(MOVES)
+    made: dict[str, int]
     metadata: dict[str, Any] = {}
     render_mode = None
 
