@@ -1,12 +1,11 @@
 """The same weights in Stable-Baselines3's policies give the same actions, values, log-probabilities and entropies.
 
-An implementation that others wrote is the judge of ours: layout, activations, distributions, and the page that tells a user
-how to take a policy there (docs/how-to/policies.md), whose code runs here as it stands.
+An implementation that others wrote is the judge of ours: layout, activations, distributions, and the example that takes a
+policy there (examples/policy_in_sb3.py).
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.dqn.policies import DQNPolicy
 
+from examples.policy_in_sb3 import stable_baselines3_actor
+
 OBSERVATION = spaces.Box(-np.inf, np.inf, (4,))
 ACTIONS: dict[str, spaces.Space[Any]] = {
     "discrete": spaces.Discrete(5),
@@ -48,7 +49,6 @@ ACTIONS: dict[str, spaces.Space[Any]] = {
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 TOLERANCE = 1e-5
 ROWS = 64
-PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "policies.md"
 
 
 class Trunk(BaseFeaturesExtractor):
@@ -226,20 +226,11 @@ def test_action_values_are_theirs(activation: str) -> None:
     np.testing.assert_array_equal(other.predict(obs, deterministic=True)[0], greedy)
 
 
-# -------------------------------------------------------------------- a run folder, by the page's own code
-
-
-def page_code() -> dict[str, Any]:
-    """What the example of docs/how-to/policies.md for Stable-Baselines3 defines."""
-    examples = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    (code,) = (each for each in examples if "def stable_baselines3_actor" in each)
-    found: dict[str, Any] = {}
-    exec(compile(code, str(PAGE), "exec"), found)
-    return found
+# ----------------------------------------------------------------------------------------- a run folder, by the example
 
 
 @pytest.mark.parametrize(("env", "activation", "normal"), [("CartPole-v1", "tanh", False), ("Pendulum-v1", "relu", True)])
-def test_the_page_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, activation: str, normal: bool) -> None:
+def test_the_example_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, activation: str, normal: bool) -> None:
     made = gymnasium.make(env)
     spec = PolicySpec(
         observation_leaves(made.observation_space),
@@ -253,7 +244,7 @@ def test_the_page_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, act
     count = sum(int(np.prod(leaf.shape)) for leaf in spec.observation)
     buffers = np.random.default_rng(3).uniform(0.5, 2, 2 * count).astype(np.float32) if normal else np.zeros(0, np.float32)
     RunFolder(tmp_path).write_policy(spec, EnvSpec(env), net.flat.numpy(), buffers)
-    act = page_code()["stable_baselines3_actor"](tmp_path)
+    act = stable_baselines3_actor(tmp_path)
 
     ours, over, write = make_policy(spec), distribution(spec), make_action_converter(spec.action)
     ours.load(net.flat.numpy()[: net.acting_size], buffers)

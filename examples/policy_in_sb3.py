@@ -1,0 +1,60 @@
+"""The weights of a run in Stable-Baselines3's MlpPolicy: `python examples/policy_in_sb3.py` (needs stable-baselines3).
+
+For array observations and the default networks of PPO, A2C, IMPALA and REINFORCE. The files of a run contain no critic, so
+the value estimates of this policy mean nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+import millrace
+
+
+def stable_baselines3_actor(run: str | os.PathLike[str]) -> Callable[[Any], Any]:
+    """A function from an observation to the greedy action, by Stable-Baselines3's policy with the weights of a run."""
+    card = json.loads((Path(run) / "policy.json").read_text())
+    arrays = load_file(Path(run) / "policy.safetensors")
+    spec = card["policy"]
+    env = gymnasium.make(card["env"], **card["env_kwargs"])  # if the environment is your own, register it first
+    policy = ActorCriticPolicy(
+        env.observation_space,
+        env.action_space,
+        lambda _: 0.0,
+        net_arch={"pi": spec["net"], "vf": spec["net"]},
+        activation_fn={"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[spec["activation"]],
+    )
+    env.close()
+
+    state = policy.state_dict()
+    for i in range(len(spec["net"])):
+        for kind in ("weight", "bias"):  # every second layer of their Sequential is an activation
+            state[f"mlp_extractor.policy_net.{2 * i}.{kind}"] = arrays[f"actor.{i}.{kind}"]
+    for kind in ("weight", "bias"):
+        state[f"action_net.{kind}"] = arrays[f"actor.out.{kind}"]
+    if "actor.log_std" in arrays:
+        state["log_std"] = arrays["actor.log_std"]
+    policy.load_state_dict(state)
+
+    def act(observation: Any) -> Any:
+        if "observation_mean" in arrays:
+            mean, std = arrays["observation_mean"].numpy(), arrays["observation_std"].numpy()
+            observation = np.clip((observation - mean) / std, -10, 10)
+        return policy.predict(observation, deterministic=True)[0]
+
+    return act
+
+
+if __name__ == "__main__":
+    trained = millrace.train("CartPole-v1", steps=5_000, eval_episodes=5)
+    print(stable_baselines3_actor(trained)(np.array([0.0, 0.1, 0.0, -0.1], np.float32)))
