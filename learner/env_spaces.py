@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
+
+from gymnasium import spaces
 
 from protocol.envs.action_masks import has_mask, without_mask
 from protocol.envs.description import DescribedEnv
-from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.envs.spaces import action_spec, observation_leaves, with_last
 from protocol.errors import UsageError
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -24,10 +27,17 @@ class EnvSpaces(NamedTuple):
     """The names of its agents, whose spaces these are; empty if it is gymnasium's."""
     takes_turns: bool = False
     """Whether a seat may have to wait for others between two of its actions."""
+    critic: tuple[Leaf, ...] = ()
+    """Further arrays of an observation, which only the critic sees."""
 
     @staticmethod
-    def of_description(env: DescribedEnv, action_masks: Literal["auto", "info", "none"] = "auto") -> EnvSpaces:
-        """Those that a worker described. Raises `UsageError` if a policy cannot use them."""
+    def of_description(
+        env: DescribedEnv, action_masks: Literal["auto", "info", "none"] = "auto", critic_keys: Sequence[str] = ()
+    ) -> EnvSpaces:
+        """Those that a worker described. Raises `UsageError` if a policy cannot use them.
+
+        `critic_keys`: of a Dict observation, which only the critic sees.
+        """
         observation, action = env.observation_space, action_spec(env.action_space)
         if action_masks == "info" and action.kind not in ("discrete", "multidiscrete"):
             raise UsageError(
@@ -36,7 +46,17 @@ class EnvSpaces(NamedTuple):
         masked = action_masks == "info" or (action_masks == "auto" and has_mask(observation, env.action_space))
         if masked:
             observation = without_mask(observation, env.action_space)
-        leaves = observation_leaves(observation)
+        keys = observation.spaces.keys() if isinstance(observation, spaces.Dict) else ()
+        if not all(key in keys for key in critic_keys) or (critic_keys and len(keys) == len(critic_keys)):
+            raise UsageError(
+                f"critic_keys {' '.join(critic_keys)}: expected keys of a Dict observation, and one more for the actor, got "
+                f"{env.observation_space}"
+            )
+        everything = observation_leaves(with_last(observation, critic_keys))
+        critic = tuple(leaf for leaf in everything if leaf.path.partition("/")[0] in critic_keys)
+        if any(leaf.is_image for leaf in critic):
+            raise UsageError(f"critic_keys {' '.join(critic_keys)}: expected arrays that are no images, got {observation}")
+        leaves = everything[: len(everything) - len(critic)]
         paths = [leaf.path for leaf in leaves]
         if not leaves:
             raise UsageError(
@@ -44,9 +64,9 @@ class EnvSpaces(NamedTuple):
             )
         if twice := sorted({path for path in paths if paths.count(path) > 1}):
             raise UsageError(f"observation space: expected a name for each array, got two that are called {twice[0]}")
-        return EnvSpaces(leaves, action, env.max_episode_steps, masked, env.seats, env.takes_turns)
+        return EnvSpaces(leaves, action, env.max_episode_steps, masked, env.seats, env.takes_turns, critic)
 
     @staticmethod
     def of_policy(policy: PolicySpec) -> EnvSpaces:
         """Those that a policy was made for."""
-        return EnvSpaces(policy.observation, policy.action, None)
+        return EnvSpaces(policy.observation, policy.action, None, critic=policy.critic)

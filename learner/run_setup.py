@@ -95,9 +95,15 @@ def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]
         raise
 
 
+def _spaces(config: Config, env: DescribedEnv) -> EnvSpaces:
+    return EnvSpaces.of_description(env, config.action_masks, config.critic_keys)
+
+
 def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: DescribedEnv) -> None:
     """Raises `UsageError` if an environment with `eval_env_kwargs` has other spaces than one without them."""
-    expected, got = (EnvSpaces.of_description(env, config.action_masks) for env in (training, evaluation))
+    expected, got = (
+        EnvSpaces.of_description(env, config.action_masks, config.critic_keys) for env in (training, evaluation)
+    )
     if (expected.observation, expected.action) != (got.observation, got.action):
         raise UsageError(
             f"eval_env_kwargs: expected the spaces of training, {training.observation_space} and {training.action_space}, "
@@ -132,7 +138,11 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
 
         def accept(found: DescribedEnv) -> None:
             if resume is not None and policy is not None:
-                check_spaces(resume.run, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found, config.action_masks))
+                check_spaces(
+                    resume.run,
+                    EnvSpaces.of_policy(policy),
+                    _spaces(config, found),
+                )
 
         described = describe(DescribeSpec(env, config.vector, heartbeat_s=config.heartbeat_s()), check_interrupt, accept)
         evaluation = described
@@ -141,7 +151,7 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
             evaluation = describe(spec, check_interrupt, lambda found: None)
             check_evaluation_spaces(config, described, evaluation)
         imports.wait(check_interrupt)
-    spaces = EnvSpaces.of_description(described, config.action_masks)
+    spaces = _spaces(config, described)
     if spaces.masked:
         log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
     if env.factory is None and not env.wrappers and (ours := preprocessed(env.id)):

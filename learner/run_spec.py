@@ -22,16 +22,22 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
     policy = _policy_spec(config, spaces)
     if algorithm_class(config.algo).whole_episodes:
         _check_room_for_whole_episodes(config, spaces.max_episode_steps)
-    for setting in ("prior", "record"):
-        if spaces.seats and getattr(config, setting):
-            raise UsageError(f"{setting}: expected none, because {config.env} has several agents and a dataset has one")
-    if spaces.seats and config.inference == "learner":
-        raise UsageError(f"inference learner: {config.env} has several agents, whose workers act; use --inference workers")
+    for given, why in ((spaces.seats, f"{config.env} has several agents"), (spaces.critic, "the run has critic_keys")):
+        for setting in ("prior", "record"):
+            if given and getattr(config, setting):
+                raise UsageError(f"{setting}: expected none, because {why}, which a dataset has not")
+        if given and config.inference == "learner":
+            raise UsageError(f"inference learner: {why}, and workers must act; use --inference workers")
     return rollout_spec(config, env, policy, config.algorithm.rollout_steps, spaces=spaces)
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:
     policy = algorithm_class(config.algo).policy_spec(config.algorithm, spaces.observation, spaces.action)
+    if spaces.critic:
+        if policy.head != "actor_critic" or policy.shared_net:
+            got = f"{config.algo} with shared_net" if policy.shared_net else config.algo
+            raise UsageError(f"critic_keys: expected an algorithm whose critic is a network of its own, got {got}")
+        policy = msgspec.structs.replace(policy, critic=spaces.critic)
     if config.algorithm.encoder is not None:
         encoder = describe_encoder(config.algorithm.encoder, spaces.observation, spaces.action)
         policy = msgspec.structs.replace(policy, encoder=encoder)

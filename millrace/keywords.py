@@ -21,6 +21,10 @@ class RolloutKeywords(TypedDict, total=False):
     """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
     seat_id: bool
     """Of an environment of several agents: tell each agent in its observations which one it is."""
+    critic_keys: Sequence[str]
+    """Keys of a Dict observation that only the critic sees: a policy acts without them (ppo, a2c, impala, reinforce). For
+    PettingZoo, state is the environment's state().
+    """
     seed: int
     """Seed of all random numbers of the run."""
     workers: int

@@ -97,7 +97,7 @@ def _env_steps(valid: Array, resets: Array | None) -> int:
 def rollout_bytes(run: RunSpec) -> int:
     """Number of bytes of all arrays of a rollout of this run."""
     T, N = run.rollout_steps, run.columns
-    leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.observation]
+    leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
     if run.masked:
         steps.append((T + 1, (sum(run.policy.action.sizes),), "bool"))

@@ -133,6 +133,18 @@ class PolicySpec(msgspec.Struct, frozen=True):
     """number of units of the core"""
     own: OwnPolicySpec | None = None
     """a policy written by the user, in place of all that the fields after `action` describe"""
+    critic: tuple[Leaf, ...] = ()
+    """further arrays of an observation, which only the critic sees: rows hold them after the others"""
+
+    @property
+    def seen(self) -> tuple[Leaf, ...]:
+        """All arrays of an observation that rows hold."""
+        return (*self.observation, *self.critic)
+
+    @property
+    def critic_keys(self) -> tuple[str, ...]:
+        """The keys of a Dict observation that only the critic sees."""
+        return tuple(dict.fromkeys(leaf.path.partition("/")[0] for leaf in self.critic))
 
     @property
     def state_size(self) -> int:

@@ -79,10 +79,9 @@ class _BuiltInActing:
 
     def params(self, obs: Sequence[Array], state: Floats) -> Floats:
         """The distribution parameters [L, N, P]. Updates state."""
-        if not self.run.masked:
-            return self.policy(obs, state)
-        *leaves, mask = obs
-        return forbid(self.policy(leaves, state), mask)
+        leaves = obs[: len(self.run.policy.observation)]
+        params = self.policy(leaves, state)
+        return forbid(params, obs[-1]) if self.run.masked else params
 
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
         return _BuiltInActions(self, generators)

@@ -249,7 +249,7 @@ class ActorCritic(Clones):
 
     def weights(self) -> tuple[Floats, Floats]:
         """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
-        return self.net.flat[: self.net.acting_size].cpu().numpy().copy(), self.statistics.copy()
+        return self.net.flat[: self.net.acting_size].cpu().numpy().copy(), self.normalizer.published(self.statistics).copy()
 
     def other_state(self) -> dict[str, Any]:
         """See `GradientDescent`."""

@@ -21,7 +21,6 @@ from learner.algorithms.kernels.optimizer_step import load_state, state_of
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from protocol.arrays import Array, Floats
 from protocol.errors import RunError, UsageError
-from protocol.policy.features import features
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
@@ -88,7 +87,7 @@ class GradientDescent(Algorithm):
         if self.config.normalize_rewards:
             self.rewards.count(batch)
         if self.policy.normalize_observations:
-            self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+            self.normalizer.update(self.normalizer.raw(batch.obs)[:-1], batch.valid)
 
     def scaled(self, reward: Floats) -> Floats:
         """Rewards as the critic learns them."""

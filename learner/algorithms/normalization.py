@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from msgspec.structs import replace
 
 from learner.algorithms.returns import EpisodeEnds, discounted_return
 from protocol.arrays import Array, Doubles, Floats
-from protocol.policy.features import CLIP, features, leaf_of_features, normalize
+from protocol.policy.features import CLIP, feature_size, features, leaf_of_features, normalize
 from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
@@ -73,7 +74,9 @@ class ObservationNormalizer:
     """Means and standard deviations of the features of Box observations. One-hot and binary features are not normalized."""
 
     def __init__(self, spec: PolicySpec) -> None:
-        self._spec, self._enabled = spec, spec.normalize_observations
+        self._acting = feature_size(spec)
+        self._spec = spec = replace(spec, observation=spec.seen, critic=())
+        self._enabled = spec.normalize_observations
         leaves = leaf_of_features(spec)
         self._box_features = np.array([leaf.kind == "box" for leaf in leaves], bool)
         self._is_float64 = np.array([leaf.dtype == "float64" for leaf in leaves], bool)
@@ -85,9 +88,17 @@ class ObservationNormalizer:
 
         `published`: `buffers` as workers act with them, which may be older than what was counted.
         """
-        raw = features(self._spec, leaves)
+        raw = self.raw(leaves)
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
         return x, [array for leaf, array in zip(self._spec.observation, leaves, strict=True) if leaf.is_image]
+
+    def raw(self, leaves: Sequence[Array]) -> Array:
+        """Features [..., D] of leaves [..., *leaf], not normalized."""
+        return features(self._spec, leaves)
+
+    def published(self, buffers: Floats) -> Floats:
+        """The part of `buffers` that workers need to act: without the features that only the critic sees."""
+        return np.concatenate([half[: self._acting] for half in np.split(buffers, 2)]) if self._enabled else buffers
 
     def update(self, raw: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""

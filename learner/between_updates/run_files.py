@@ -67,7 +67,7 @@ class RunFiles:
     def write_images(self, batch: Batch) -> None:
         """Write what the policy sees in the batch of the first update."""
         if self._state.version == 1:
-            images = image_samples(batch.obs, self._spec.policy.observation)
+            images = image_samples(batch.obs, self._spec.policy.seen)
             self._folder.writes.write("images", lambda: self._folder.write_images(images))
 
     def save(self) -> None:

@@ -39,7 +39,7 @@ BASIC = (
 GROUPS = {
     "evaluation": ("eval_env_kwargs", "eval_workers", "eval_copies", "eval_max_steps", "info_keys"),
     "workers": (
-        "lanes", "max_lag", "vector", "seat_id", "action_masks", "inference", "acting_dtype", "torch_threads",
+        "lanes", "max_lag", "vector", "seat_id", "critic_keys", "action_masks", "inference", "acting_dtype", "torch_threads",
         "max_env_copies", "min_workers", "launched_workers",
     ),
     "network": ("transport", "bind", "advertise", "keys", "insecure"),

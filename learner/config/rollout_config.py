@@ -15,13 +15,14 @@ from learner.config.resume_rules import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
 from protocol.bounds import Count, Natural
 from protocol.env_spec import Scalar
+from protocol.envs.seats import STATE
 from protocol.envs.wrappers import WrapperLike
 from protocol.flags.fields import Flag, NotNegative, Positive
 from protocol.specs import Vector
 from protocol.wire.weight_dtypes import ActingDtype
 
 HEARTBEAT_S = 1.0
-SEAT_ID = "protocol.envs.seats:seat_id"
+SEAT_ID, WITH_STATE = "protocol.envs.seats:seat_id", "protocol.envs.seats:with_state"
 STALL_TIMEOUT_S = 600.0
 
 
@@ -44,6 +45,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     seat_id: Fixed[bool] = False
     """Of an environment of several agents: tell each agent in its observations which one it is."""
+    critic_keys: Annotated[Fixed[tuple[str, ...]], Flag("KEY ...")] = ()
+    """Keys of a Dict observation that only the critic sees: a policy acts without them (ppo, a2c, impala, reinforce). For
+    PettingZoo, state is the environment's state().
+    """
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""
     workers: Free[Count] = 2
@@ -140,8 +145,12 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
 
     def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:
-        """The wrappers of every env copy, or these in place of `wrappers`, with the one of `seat_id`."""
-        return [*(self.wrappers if given is None else given), *([SEAT_ID] if self.seat_id else [])]
+        """The wrappers of every env copy, or these in place of `wrappers`, with those that other settings ask for."""
+        return [
+            *(self.wrappers if given is None else given),
+            *([SEAT_ID] if self.seat_id else []),
+            *([WITH_STATE] if STATE in self.critic_keys else []),
+        ]
 
     def call_timeouts(self) -> CallTimeouts:
         """How long a call of an env copy may take."""

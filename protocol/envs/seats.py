@@ -21,8 +21,8 @@ from gymnasium import spaces
 
 from protocol.errors import UsageError
 
-SEAT = "seat"
-"""The key of the seat's number in an observation, with `--seat-id`."""
+SEAT, STATE = "seat", "state"
+"""Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""
 _NO_INFO: Mapping[str, Any] = {}
 
 
@@ -66,7 +66,8 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         self.agents = list(env.possible_agents)
         self.seats = tuple(map(str, self.agents))
         self.seat_of = {agent: number for number, agent in enumerate(self.agents)}
-        self._tells_seats = getattr(env, "tells_seats", False)
+        self._tells_seats, shows_state = (getattr(env, name, False) for name in ("tells_seats", "shows_state"))
+        self._state_space = _state_space(env, name) if shows_state else None
         observation, self.action_space = (
             _common([kind(agent) for agent in self.agents], self.seats, what, name, padded)
             for kind, what, padded in (
@@ -74,15 +75,25 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
                 (env.action_space, "action", "pad_action_space_v0"),
             )
         )
-        seen: gymnasium.Space[Any] = _with_seat(observation, len(self.seats)) if self._tells_seats else observation
+        more: dict[str, gymnasium.Space[Any]] = {SEAT: spaces.Discrete(len(self.seats))} if self._tells_seats else {}
+        if self._state_space is not None:
+            more[STATE] = self._state_space
+        seen: gymnasium.Space[Any] = spaces.Dict({**_parts(observation), **more}) if more else observation
         self.observation_space = seen
-        self._before = [self._seen(seat, _any_value(observation)) for seat in range(len(self.seats))]
+        self._before = [
+            self._seen(seat, _any_value(observation), state=_any_value(self._state_space)) for seat in range(len(self.seats))
+        ]
 
-    def _seen(self, seat: int, observation: Any) -> Any:
-        """What a seat sees, with its number if it is to know it."""
-        if not self._tells_seats:
+    def _seen(self, seat: int, observation: Any, state: Any = None) -> Any:
+        """What a seat sees, with its number if it is to know it, and the environment's state if its critic is to."""
+        if not self._tells_seats and self._state_space is None:
             return observation
-        return {**(observation if isinstance(observation, dict) else {"observation": observation}), SEAT: np.int64(seat)}
+        found = dict(observation) if isinstance(observation, dict) else {"observation": observation}
+        if self._tells_seats:
+            found[SEAT] = np.int64(seat)
+        if self._state_space is not None:
+            found[STATE] = np.array(self.env.state() if state is None else state)
+        return found
 
     def _nothing(self) -> SeatStep:
         """A step in which nothing has happened yet."""
@@ -225,6 +236,29 @@ def seat_id(env: Any) -> Any:
     return env
 
 
+def with_state(env: Any) -> Any:
+    """A wrapper: observations of a PettingZoo environment hold its `state()`, under the key `state`.
+
+    It must come after all wrappers of PettingZoo's. Environments of gymnasium's stay as they are.
+    """
+    if has_seats(env):
+        env.shows_state = True
+    return env
+
+
+def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
+    """That of `env.state()`. Raises `UsageError` if it has none."""
+    try:
+        space: gymnasium.Space[Any] | None = getattr(env, "state_space", None)
+        if space is not None:
+            return space
+        env.reset()
+        state = np.asarray(env.state())
+    except (NotImplementedError, AttributeError) as error:
+        raise UsageError(f"environment {name}: critic_keys state: expected a method state(), and it has none") from error
+    return spaces.Box(-np.inf, np.inf, state.shape, state.dtype.type)
+
+
 def seated(made: Any, name: str) -> SeatedEnv:
     """A PettingZoo environment as an environment with seats. Raises `UsageError`."""
     if not made.possible_agents:
@@ -246,14 +280,15 @@ def _common(
     return found[0]
 
 
-def _with_seat(space: gymnasium.Space[Any], count: int) -> spaces.Dict:
-    inner = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-    return spaces.Dict([*inner.items(), (SEAT, spaces.Discrete(count))])
+def _parts(space: gymnasium.Space[Any]) -> dict[str, gymnasium.Space[Any]]:
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
 
 
-def _any_value(space: gymnasium.Space[Any]) -> Any:
+def _any_value(space: gymnasium.Space[Any] | None) -> Any:
     """A value of the space, always the same."""
     match space:
+        case None:
+            return None
         case spaces.Dict():
             return {key: _any_value(inner) for key, inner in space.spaces.items()}
         case spaces.Tuple():

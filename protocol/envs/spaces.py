@@ -79,6 +79,13 @@ def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
             raise UsageError(f"observation space {space}{where} is not supported; supported are {OBSERVATIONS}")
 
 
+def with_last(space: gymnasium.Space[Any], keys: Sequence[str]) -> gymnasium.Space[Any]:
+    """A Dict space with these keys at its end; any other space, or none of the keys, as it is."""
+    if not keys or not isinstance(space, spaces.Dict):
+        return space
+    return spaces.Dict([*((k, v) for k, v in space.spaces.items() if k not in keys), *((k, space.spaces[k]) for k in keys)])
+
+
 def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
     """Describe the action. Raises `UsageError` for a space that is not supported."""
     match space:

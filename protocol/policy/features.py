@@ -22,6 +22,11 @@ def feature_size(spec: PolicySpec) -> int:
     return sum(_leaf_features(leaf) for leaf in spec.observation if not leaf.is_image)
 
 
+def critic_size(spec: PolicySpec) -> int:
+    """The number of features that only the critic sees. For the critic, they stand behind the others."""
+    return sum(map(_leaf_features, spec.critic))
+
+
 def _leaf_features(leaf: Leaf) -> int:
     return sum(leaf.sizes) if leaf.sizes else math.prod(leaf.shape)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.policy.distributions import distribution
-from protocol.policy.features import feature_size
+from protocol.policy.features import critic_size, feature_size
 from protocol.policy.recurrent import core_shapes
 from protocol.specs import Leaf, PolicySpec
 
@@ -106,7 +106,7 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
     acting += _linear("actor.out", last, outputs, 0.01)
     if action.kind == "box":
         acting.append(Field("actor.log_std", (outputs,), 0))
-    critic, last = ([], last) if spec.shared_net else _hidden("critic", width, spec.net)
+    critic, last = ([], last) if spec.shared_net else _hidden("critic", width + critic_size(spec), spec.net)
     return tuple(acting), (*critic, *_linear("critic.out", last, 1, 1.0))
 
 

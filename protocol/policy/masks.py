@@ -26,7 +26,7 @@ def choices(action: ActionSpec) -> int:
 
 def stored_leaves(run: RunSpec) -> tuple[Leaf, ...]:
     """The arrays of an observation as workers store them: in a masked run the mask is one more, the last."""
-    leaves = run.policy.observation
+    leaves = run.policy.seen
     return (*leaves, Leaf(MASK, "multibinary", (choices(run.policy.action),), "bool")) if run.masked else leaves
 
 

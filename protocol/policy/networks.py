@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from protocol.policy.encoder import make_encoder
+from protocol.policy.features import feature_size
 from protocol.policy.layout import (
     CRITICS,
     LOG_STD_BOUNDS,
@@ -270,7 +271,7 @@ class ActorCriticNetwork(FlatNetwork):
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
-        trunk = hidden_names(spec)
+        trunk, self._acting_features = hidden_names(spec), feature_size(spec)
         self._trunk = self.layers(trunk) if spec.shared_net else []
         self._actor = self.layers(["actor.out"] if spec.shared_net else [*trunk, "actor.out"])
         self._critic = self.layers(["critic.out"] if spec.shared_net else [*hidden_names(spec, "critic"), "critic.out"])
@@ -282,21 +283,31 @@ class ActorCriticNetwork(FlatNetwork):
         return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
 
     def _common(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None) -> Tensor:
-        h = self.inputs(x, images)
+        h = self.inputs(x[:, : self._acting_features], images)
         if recurrent is not None:
             h, _ = self.core(h, recurrent)
             h = h if recurrent.output_rows is None else h[recurrent.output_rows]
         return self.hidden(h, self._trunk)
+
+    def _value(self, h: Tensor, x: Tensor, recurrent: RecurrentInput | None) -> Tensor:
+        """V [B] of what the actor sees, `h`, and the features behind it."""
+        if self.spec.critic:
+            more = x[:, self._acting_features :]
+            rows = None if recurrent is None else recurrent.output_rows
+            h = torch.cat((h, more if rows is None else more[rows]), -1)
+        return self.mlp(h, self._critic)[:, 0]
 
     def forward(
         self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None
     ) -> tuple[Tensor, Tensor]:
         """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B].
 
+        Behind the D features come those that only the critic sees, if there are any.
+
         With a core, x and images are [T · C, …], and `recurrent` says where episodes begin and which B rows to return.
         """
         h = self._common(x, images, recurrent)
-        return self._params(h), self.mlp(h, self._critic)[:, 0]
+        return self._params(h), self._value(h, x, recurrent)
 
     def params(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
         """Distribution params [B, P] alone."""
@@ -304,7 +315,7 @@ class ActorCriticNetwork(FlatNetwork):
 
     def value(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
         """Value [B] alone."""
-        return self.mlp(self._common(x, images, recurrent), self._critic)[:, 0]
+        return self._value(self._common(x, images, recurrent), x, recurrent)
 
     def evaluate(
         self,

@@ -41,7 +41,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"extras: expected {len(run.extras)} arrays, got {len(rollout.extras)}")
     for extra, array in zip(run.extras, rollout.extras, strict=True):
         expected.append(Expected(f"extra {extra.name}", array, (T, N, *extra.shape), extra.dtype))
-    if why := wrong_observation(rollout.obs, run.policy.observation, (T + 1, N)) or wrong_arrays(expected):
+    if why := wrong_observation(rollout.obs, run.policy.seen, (T + 1, N)) or wrong_arrays(expected):
         raise BadRollout(why)
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")

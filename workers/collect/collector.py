@@ -48,19 +48,18 @@ StepAll = Callable[[Sequence[int], Array, Pulse], None]
 
 def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
     """The env copies of a lane in this process, of the kind that the run asks for."""
-    first = EnvCopy(lane * run.copies, lane)
+    first, makes, keys = EnvCopy(lane * run.copies, lane), [run.env.make] * run.copies, run.policy.critic_keys
     match run.vector:
         case "native":
             with activity().during(MAKING):
                 env = make_copy(first, lambda: make_native(run.env, run.copies))
-            return VectorCopies(env, run.facts, masked=run.masked)
+            return VectorCopies(env, run.facts, masked=run.masked, critic_keys=keys)
         case "envpool":
             return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
         case "loop" if run.seats:
-            makes = [run.env.make] * run.copies
-            return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, first=first)
+            return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first)
         case "loop":
-            return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked, first=first)
+            return LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
 
 
 def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:

@@ -19,7 +19,7 @@ from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array, Bools, Doubles
 from protocol.envs.action_masks import without_mask
-from protocol.envs.spaces import action_spec, make_flatten, observation_leaves
+from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
@@ -96,7 +96,7 @@ class EnvCopies(Protocol):
 def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
     """Raise `UsageError` unless the copies have the spaces of the run's policy."""
     observation, action, policy = copies.observation_space, copies.action_space, run.policy
-    if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
+    if (observation_leaves(observation), action_spec(action)) != (policy.seen, policy.action):
         raise UsageError(
             f"environment {run.env.id}: its observations {observation} and actions {action} are not those of the policy; "
             "install the version of the environment that the policy was made for"
@@ -118,10 +118,12 @@ class LoopedCopies:
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
+        critic_keys: Sequence[str] = (),
         first: EnvCopy = FIRST_COPY,
     ) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
+        `critic_keys`: those of a Dict observation whose arrays come last.
         `first`: which copy the first one is. In an evaluation, no step resets a copy.
         """
         self._facts, self._activity = facts, activity()
@@ -134,6 +136,7 @@ class LoopedCopies:
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
         if masked:
             self.observation_space = without_mask(self.observation_space, self.action_space)
+        self.observation_space = with_last(self.observation_space, critic_keys)
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._read = make_flatten(self.observation_space)
         self._observations: list[Any] = [None] * self.count
@@ -225,8 +228,15 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
 class VectorCopies:
     """Any `gymnasium.vector.VectorEnv` with NextStep autoreset."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], facts: Sequence[str] = (), *, masked: bool = False) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        facts: Sequence[str] = (),
+        *,
+        masked: bool = False,
+        critic_keys: Sequence[str] = (),
+    ) -> None:
+        """See `LoopedCopies`.
 
         Raises `UsageError` for another autoreset mode.
         """
@@ -238,6 +248,7 @@ class VectorCopies:
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
         if masked:
             self.observation_space = without_mask(self.observation_space, self.action_space)
+        self.observation_space = with_last(self.observation_space, critic_keys)
         self._read = make_flatten(self.observation_space)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:

@@ -32,10 +32,11 @@ class SeatedCopies(LoopedCopies):
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
+        critic_keys: Sequence[str] = (),
         first: EnvCopy = FIRST_COPY,
     ) -> None:
         """`seats`: the names of the A agents. `facts`: without the returns of seats. For the rest, see `LoopedCopies`."""
-        super().__init__(makes, pulse, facts, masked=masked, first=first)
+        super().__init__(makes, pulse, facts, masked=masked, critic_keys=critic_keys, first=first)
         self._names, self._seats = seats, len(seats)
         self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: every action
         self.columns: SeatColumns

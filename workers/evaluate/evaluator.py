@@ -62,13 +62,13 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
     with warnings.catch_warnings():
         if render_mode is not None:
             warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
-        first = EnvCopy(evaluation=True)
+        makes, first, keys = [make] * count, EnvCopy(evaluation=True), run.policy.critic_keys
         if run.seats:
             copies: LoopedCopies = SeatedCopies(
-                [make] * count, pulse, run.seats, run.info_keys, masked=run.masked, first=first
+                makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first
             )
         else:
-            copies = LoopedCopies([make] * count, pulse, run.facts, masked=run.masked, first=first)
+            copies = LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
     modes = copies.envs[0].metadata.get("render_modes", [])
     if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
         copies.close()
@@ -223,6 +223,6 @@ class Evaluator:
             frame = as_frame(copies.render(n)) if sender.wants_frame else None
         except ValueError as error:
             raise environment_failed(None, f"copy {n}, {error}") from error
-        shown = obs[: len(self._run.policy.observation)]  # without the mask
+        shown = obs[: len(self._run.policy.observation)]  # without the mask, and what only the critic sees
         A = self._run.seats_of_copy
         sender.observe([leaf[0, n * A : (n + 1) * A] if self._run.seats else leaf[0, n] for leaf in shown], frame)

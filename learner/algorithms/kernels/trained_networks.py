@@ -24,7 +24,7 @@ MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all
 
 def is_small(spec: PolicySpec, device: str) -> bool:
     """Whether this is only an MLP without large layers, on the CPU."""
-    if device != "cpu" or spec.needs_torch or spec.core is not None:
+    if device != "cpu" or spec.needs_torch or spec.core is not None or spec.critic:
         return False
     return max((feature_size(spec), *spec.net)) <= MAX_UNITS
 

@@ -220,6 +220,10 @@ class _Chain:
 class ChainCrowd(_Chain):
     """Both move at the same time."""
 
+    def state(self) -> np.ndarray:
+        """How many moves each has made."""
+        return np.array([self.made[agent] for agent in MOVES], np.float32)
+
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         self.agents, self.made = list(MOVES), dict.fromkeys(MOVES, 0)
         return {agent: self.observe(agent) for agent in self.agents}, {}

@@ -115,7 +115,7 @@ def test_each_agent_can_be_told_which_one_it_is(tmp_path: Path, env: str) -> Non
 @pytest.mark.parametrize(
     ("env", "settings", "says"),
     [
-        ("ChainGame", {"inference": "learner"}, "inference learner: .*ChainGame has several agents, whose workers act"),
+        ("ChainGame", {"inference": "learner"}, "inference learner: .*ChainGame has several agents, and workers must act"),
         ("ChainGame", {"record": "a/b-v0"}, "record: expected none, because .*ChainGame has several agents"),
         (
             "Unequal",
