@@ -42,8 +42,10 @@ class _Told:
     def __init__(self, most_steps: int = 12) -> None:
         self.most_steps = most_steps
         self.told: list[dict[str, Lived]] = []
+        self._shown: dict[str, np.ndarray] = {}
         self._generator = np.random.default_rng(0)
         self._observed = 0
+        self._buffers = {agent: np.zeros(1, np.float32) for agent in AGENTS}
 
     def observation_space(self, agent: str) -> spaces.Box:
         return spaces.Box(0, np.inf, (1,), np.float32)
@@ -62,9 +64,14 @@ class _Told:
         self._due = dict.fromkeys(AGENTS, 0.0)
 
     def _observation(self) -> np.ndarray:
-        """Each one is a number of its own."""
+        """Each one is a number of its own, small enough for a network."""
         self._observed += 1
-        return np.array([self._observed], np.float32)
+        return np.array([self._observed / 64], np.float32)
+
+    def _returned(self, agent: str) -> np.ndarray:
+        """What the agent sees, in a buffer that is used again and again."""
+        self._buffers[agent][:] = self._shown[agent]
+        return self._buffers[agent]
 
     def _act(self, agent: str, seen: np.ndarray, action: Any) -> None:
         self._pending[agent] = seen, int(action)
@@ -111,7 +118,6 @@ class RandomGame(_Told):
         self.rewards = self._rewards(self.agents) if self._generator.random() < 0.2 else dict.fromkeys(self.agents, 0.0)
         self._cumulative = dict(self.rewards)
         self.terminations, self.truncations = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, False)
-        self._shown: dict[str, np.ndarray] = {}
         self._choose()
 
     def _choose(self) -> None:
@@ -124,7 +130,7 @@ class RandomGame(_Told):
 
     def last(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         agent = self.agent_selection
-        return self._shown[agent], self._cumulative[agent], self.terminations[agent], self.truncations[agent], {}
+        return self._returned(agent), self._cumulative[agent], self.terminations[agent], self.truncations[agent], {}
 
     def step(self, action: Any) -> None:
         agent = self.agent_selection
@@ -156,7 +162,7 @@ class RandomCrowd(_Told):
         self._begin(seed)
         self._was_here = set(self.agents)
         self._shown = {agent: self._observation() for agent in self.agents}
-        return dict(self._shown), {agent: {} for agent in self.agents}
+        return {agent: self._returned(agent) for agent in self.agents}, {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
         assert list(actions) == [agent for agent in AGENTS if agent in self.agents]
@@ -178,7 +184,7 @@ class RandomCrowd(_Told):
             self.agents.append(late[0])
             shown[late[0]] = self._shown[late[0]] = self._observation()
         ended = [{agent: both[k] for agent, both in ends.items()} for k in (0, 1)]
-        return shown, rewards, *ended, {}
+        return {agent: self._returned(agent) for agent in shown}, rewards, *ended, {}
 
 
 class Unequal(RandomCrowd):

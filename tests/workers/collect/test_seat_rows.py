@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
+from learner.algorithms.minibatches import log_probs
+from learner.algorithms.ppo import PPO
 from learner.algorithms.returns import EpisodeEnds, complete, discounted_return, gae, vtrace
+from learner.config.hyperparameters import PPOConfig
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack_rollouts
 from protocol.rows.rollout_checks import validate
 from protocol.specs import PolicySpec, RunSpec, seat_returns
-from tests.support.in_process.collectors import collect, random_collector
+from tests.support.in_process.collectors import collect, no_pulse, random_collector
 from tests.support.users_code.seat_envs import AGENTS, Lived, RandomCrowd, RandomGame
 from workers.collect.collector import Collector
 
@@ -215,11 +218,21 @@ def test_a_monte_carlo_return_is_known_where_the_seats_part_ends_within_the_roll
     assert complete(ends).tolist() == [[True, False], [False, False], [True, False], [False, False]]
 
 
-# ------------------------------------------------------------------------------------------------------ what is refused
-
-
-def broken(rollout: Rollout, **changes: Any) -> Rollout:
-    return msgspec.structs.replace(rollout, **changes)
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("core", ["lstm", "gru"])
+def test_the_learner_finds_the_log_probabilities_and_states_under_which_seats_acted(form: str, core: Any) -> None:
+    """In every rollout, also of actions that were chosen in an earlier one."""
+    run = seated_run(form, T=5, N=6, core=core, core_size=7)
+    ppo = PPO(PPOConfig(core=core, core_size=7), run.policy, total_steps=1, seed=3)
+    policy = make_policy(run.policy)
+    policy.load(*ppo.weights())
+    collector = Collector(run, policy)
+    for k in range(6):
+        batch = stack_rollouts(collect(collector, run, k))
+        found = log_probs(ppo.net, ppo.observations(batch), batch, no_pulse)
+        valid = batch.valid
+        # A chain of some hundred float32 operations on numbers of the size of 1, in other orders.
+        np.testing.assert_allclose(found[valid], batch.log_prob[valid], atol=1e-4)
 
 
 def batch_of(form: str, **policy: Any) -> tuple[RunSpec, Batch]:
