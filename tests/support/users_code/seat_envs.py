@@ -115,6 +115,7 @@ class RandomGame(_Told):
 
     def reset(self, seed: int | None = None, options: Any = None) -> None:
         self._begin(seed)
+        self._buffers = dict.fromkeys(AGENTS, np.zeros(1, np.float32))  # one for all
         self.rewards = self._rewards(self.agents) if self._generator.random() < 0.2 else dict.fromkeys(self.agents, 0.0)
         self._cumulative = dict(self.rewards)
         self.terminations, self.truncations = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, False)
@@ -130,7 +131,13 @@ class RandomGame(_Told):
 
     def last(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         agent = self.agent_selection
-        return self._returned(agent), self._cumulative[agent], self.terminations[agent], self.truncations[agent], {}
+        return (
+            self._returned(agent),
+            self._cumulative[agent],
+            self.terminations[agent],
+            self.truncations[agent],
+            {"steps": self.steps},
+        )
 
     def step(self, action: Any) -> None:
         agent = self.agent_selection
@@ -184,7 +191,12 @@ class RandomCrowd(_Told):
             self.agents.append(late[0])
             shown[late[0]] = self._shown[late[0]] = self._observation()
         ended = [{agent: both[k] for agent, both in ends.items()} for k in (0, 1)]
-        return {agent: self._returned(agent) for agent in shown}, rewards, *ended, {}
+        return (
+            {agent: self._returned(agent) for agent in shown},
+            rewards,
+            *ended,
+            {agent: {"steps": self.steps} for agent in shown},
+        )
 
 
 class Unequal(RandomCrowd):

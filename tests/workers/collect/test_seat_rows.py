@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -87,16 +88,17 @@ def test_a_row_is_what_an_agent_lived_through(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_returns_of_episodes_count_every_reward(form: str) -> None:
-    run = seated_run(form, T=30, N=20)
+def test_episodes_count_every_reward_and_have_the_facts_of_their_last_step(form: str) -> None:
+    run = msgspec.structs.replace(seated_run(form, T=30, N=20), facts=("steps", *seat_returns(AGENTS)))
     collector, rollouts = collected(run, 2)
     episodes = [episode for rollout in rollouts for episode in rollout.episodes]
     envs = [seated.env for seated in collector.lanes[0].copies.envs]  # type: ignore[attr-defined]
     told = [each for env in envs for each in env.told[: -1 if env.agents else None]]
     expected = sorted(tuple(each[agent].total for agent in AGENTS) for each in told)
-    np.testing.assert_allclose(sorted(episode.facts for episode in episodes), expected, atol=1e-9)
+    np.testing.assert_allclose(sorted(episode.facts[1:] for episode in episodes), expected, atol=1e-9)
     for episode in episodes:
-        assert episode.reward == pytest.approx(sum(episode.facts))
+        assert episode.reward == pytest.approx(sum(episode.facts[1:]))
+        assert episode.facts[0] == episode.length
     running = sum(env.steps for env in envs if env.agents)
     steps = running + sum(episode.length for episode in episodes)
     assert sum(rollout.env_steps for rollout in rollouts) == collector.steps == steps
