@@ -91,6 +91,39 @@ def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Bat
     )
 
 
+def with_waiting_seats(batch: Batch) -> Batch:
+    """The same rows as those of an environment whose seats wait for one step before the outcome of each action comes.
+
+    Row t becomes two: in the first the seat waits. A step that resets comes first, and then the seat acts and waits.
+    """
+    T, columns = batch.valid.shape
+    waits = np.zeros_like(batch.valid)
+    valid = np.stack([waits, batch.valid], 1).reshape(2 * T, columns)
+    resets = np.concatenate([np.stack([~batch.valid, waits], 1).reshape(2 * T, columns), waits[:1]])
+    resets[-1] = batch.terminated[-1] | batch.truncated[-1]
+
+    def twice(array: Array) -> Array:
+        return np.repeat(array, 2, axis=0)
+
+    def shown(leaf: Array) -> Array:
+        found = np.concatenate([twice(leaf[:-1]), leaf[-1:]])
+        found[1::2] = np.where(_for_each(batch.valid, leaf), found[1::2], leaf[1:])
+        return found
+
+    return msgspec.structs.replace(
+        batch,
+        obs=tuple(map(shown, batch.obs)),
+        mask=None if batch.mask is None else shown(batch.mask),
+        action=twice(batch.action),
+        log_prob=twice(batch.log_prob),
+        reward=np.where(valid, twice(batch.reward), np.float32(GARBAGE_REWARD)),
+        terminated=twice(batch.terminated) & valid,
+        truncated=twice(batch.truncated) & valid,
+        valid=valid,
+        resets=resets,
+    )
+
+
 def _for_each(rows: Bools, array: Array) -> Bools:
     """What is said of rows [T, N], as it is broadcast to an array [T, N, …]."""
     return rows.reshape(*rows.shape, *[1] * (array.ndim - 2))

@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -214,7 +215,13 @@ class LearnsTheOpposite(Sound):
         return super().loss(rows._replace(advantage=-rows.advantage))
 
 
+class ForgetsThatSeatsWait(Sound):
+    def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
+        return super().estimate(msgspec.structs.replace(batch, resets=None), observations, reward, pulse)
+
+
 MISTAKES: list[tuple[type, str]] = [
+    (ForgetsThatSeatsWait, "update: rows of a seat that waits change the metric train/"),
     (UsesRowsThatAreNotValid, "update: rows that are not valid change the "),
     (ForgetsItsCoefficient, "state_dict: after a load the next update gives other metrics['train/"),
     (HidesWhatIsNotFinite, "update: rewards of NaN: expected an error (check_finite), got metrics"),
