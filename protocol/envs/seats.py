@@ -153,9 +153,8 @@ class ParallelSeats(SeatedEnv):
             seat = self.seat_of[agent]
             found.complete[seat], found.reward[seat] = True, float(rewards[agent])
             found.terminated[seat], found.truncated[seat] = bool(terminated[agent]), bool(truncated[agent])
-            if (
-                agent in observations or not terminated[agent]
-            ):  # nobody learns from the last observation of a task that ended
+            # The last observation of a task that has ended may be missing: nobody learns from it.
+            if agent in observations or not terminated[agent]:
                 found.observations[seat] = self._seen(seat, observations[agent])
             found.infos[seat] = infos.get(agent, _NO_INFO)
         for agent, reward in rewards.items():
@@ -165,13 +164,12 @@ class ParallelSeats(SeatedEnv):
         here = set(self.env.agents) - ended
         if lost := [agent for agent in self._present if agent not in here and agent not in ended]:
             raise RuntimeError(f"agent {lost[0]} left, expected it to be terminated or truncated in its last step")
-        came = [agent for agent in here if agent not in given]
         self._present = [agent for agent in self.agents if agent in here]
         for agent in self._present:
-            if agent in came:
-                self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
-            else:
+            if agent in given:
                 found.acts[self.seat_of[agent]] = True
+            else:
+                self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
         return not self._present
 
     def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Mapping[str, Any]) -> None:
