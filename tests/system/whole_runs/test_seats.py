@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,14 @@ from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
 from learner.policy_player import saved_policy
 from learner.run_folder import checkpoint
+from learner.run_folder.progress import Progress
 from millrace.launch.training import train
 from protocol.arrays import Floats
 from protocol.errors import UsageError
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
 from tests.support.users_code.seat_envs import CHAIN_REWARD, MOVES, values_of_the_chain
-from tests.system.stage.run_folders import policy_of
+from tests.system.stage.run_folders import folder_of, policy_of
 
 ENVS = "tests.support.users_code.seat_envs:"
 GAMMA = 0.9
@@ -32,8 +35,14 @@ SMALL: dict[str, Any] = {"preset": "none", "transport": "inproc", "seed": 1, "wo
 RAW: dict[str, Any] = {"gamma": GAMMA, "normalize_observations": False, "normalize_rewards": False}
 
 
-def trained(path: Path, env: str, resume: Path | None = None, **settings: Any) -> Path:
-    return train(resolve(f"{ENVS}{env}", resume=resume, run_dir=str(path), **SMALL | settings), resume, lambda _: None)
+def silent(progress: Progress) -> None:
+    """Show nothing."""
+
+
+def trained(
+    path: Path, env: str, resume: Path | None = None, watch: Callable[[Progress], None] = silent, **settings: Any
+) -> Path:
+    return train(resolve(f"{ENVS}{env}", resume=resume, run_dir=str(path), **SMALL | settings), resume, watch)
 
 
 def each_observation() -> Floats:
@@ -85,6 +94,25 @@ def test_so_does_dqn(tmp_path: Path, env: str, n_step: int) -> None:
 def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
     settings |= {"steps": 1_500, "rollout_steps": 16}
     policies = [policy_of(trained(tmp_path / str(n), env, workers=n, **settings)) for n in (1, 3)]
+    assert policies[0] == policies[1]
+
+
+def test_a_resumed_run_goes_on_alike_with_any_number_of_workers(tmp_path: Path) -> None:
+    """Seats that waited when it was interrupted begin anew, as all lanes do."""
+
+    def stops(progress: Progress) -> None:
+        if progress.updates == 5:
+            raise KeyboardInterrupt
+
+    settings: dict[str, Any] = {"steps": 1_200, "rollout_steps": 16, "normalize_rewards": True, "max_lag": 1}
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "first", "RandomGame", watch=stops, **settings)
+    first = folder_of(tmp_path / "first")
+    policies = []
+    for workers in (1, 3):
+        again = tmp_path / str(workers) / first.name
+        shutil.copytree(first, again)
+        policies.append(policy_of(trained(again.parent, "RandomGame", again, workers=workers, **settings)))
     assert policies[0] == policies[1]
 
 
