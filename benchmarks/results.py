@@ -1,4 +1,4 @@
-"""Adds runs to benchmarks/scores.json, and writes the tables of docs/explanation/results.md from it.
+"""Adds runs to benchmarks/scores.json, and writes its tables into docs/explanation/results.md and benchmarks/README.md.
 
 `python -m benchmarks.results RUN ...`; without runs it only writes the tables. For each run it takes the best policy of the
 run's own evaluations, evaluated again on 100 other episodes, and the final policy. If a run's own evaluations had fewer
@@ -36,7 +36,10 @@ from learner.run_folder.run_folder import RunFolder, Which
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "results.md"
-TABLES_OF_PAGE = re.compile(r"^\| (?:environment|seconds) \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
+PAGE_OF_COMMANDS = Path(__file__).with_name("README.md")
+RETURNS, COMMANDS = (
+    re.compile(rf"^\| {first} \|.*?\n(?=\n|\Z)", re.MULTILINE | re.DOTALL) for first in ("environment", "seconds")
+)
 OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
 NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
 EVALUATION = ("eval_every", "eval_episodes")
@@ -103,7 +106,7 @@ def _words(name: str, value: object, default: object) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="scores.json and docs/explanation/results.md from run folders")
+    parser = argparse.ArgumentParser(description="scores.json, and the pages with its tables, from run folders")
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--only-final", action="store_true", help="leave the best policies of the runs' evaluations out")
     flags = parser.parse_args()
@@ -115,9 +118,11 @@ def main() -> None:
             scores[score.command] = merged(scores.get(score.command), score)
     write_scores(scores.values())
     written = read_scores()
-    tables = iter((returns_table(written, read_published()), commands_table(written)))
-    PAGE.write_text(TABLES_OF_PAGE.sub(lambda old: next(tables), PAGE.read_text()))
-    print(PAGE)
+    returns, commands = returns_table(written, read_published()), commands_table(written)
+    for page, old, new in ((PAGE, RETURNS, returns), (PAGE_OF_COMMANDS, COMMANDS, commands)):
+        text = page.read_text()
+        page.write_text(text.replace("".join(old.findall(text)), new))
+        print(page)
 
 
 if __name__ == "__main__":

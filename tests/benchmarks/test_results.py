@@ -1,4 +1,4 @@
-"""docs/explanation/results.md has the tables of benchmarks/scores.json, and the commands of the scores parse."""
+"""The manual and benchmarks/README.md have the tables of benchmarks/scores.json, and the commands of the scores parse."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ from millrace.cli.main import main
 SCORES = read_scores()
 
 
-def test_the_page_has_the_tables_of_the_scores() -> None:
-    text = results.PAGE.read_text()
-    assert f"\n\n{returns_table(SCORES, read_published())}\n" in text
-    assert f"\n\n{commands_table(SCORES)}\n" in text
+def test_the_pages_have_the_tables_of_the_scores() -> None:
+    (returns,) = results.RETURNS.findall(results.PAGE.read_text())
+    assert returns == returns_table(SCORES, read_published())
+    (commands,) = results.COMMANDS.findall(results.PAGE_OF_COMMANDS.read_text())
+    assert commands == commands_table(SCORES)
 
 
 def test_scores_are_compared_with_those_of_the_same_environment_and_algorithm() -> None:
