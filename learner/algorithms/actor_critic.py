@@ -26,7 +26,7 @@ from learner.algorithms.kernels.trained_networks import actor_critic_network
 from learner.algorithms.minibatches import LossInput, Minibatch, Observations, flat_tensor
 from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
-from protocol.arrays import Bools, Floats
+from protocol.arrays import Array, Bools, Floats
 from protocol.errors import RunError, UsageError
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
 from protocol.policy.torch_distributions import policy_log_prob
@@ -218,19 +218,9 @@ class ActorCritic(Clones):
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:
-            recurrent = self.recurrent(batch)
+            recurrent = _recurrent_input(batch, self.tensor)
         features, *pixels = (flat_tensor(array, self.net.flat.device) for array in (x, *images))
         return Observations(x.shape[:2], features, tuple(pixels), recurrent)
-
-    def recurrent(self, batch: Batch) -> RecurrentInput:
-        """The states before all T+1 steps. An episode begins after a step that resets; rows between those of a seat pass."""
-        begins, first = ~batch.valid, np.zeros_like(batch.valid[:1])
-        advances = None
-        if batch.resets is not None:
-            begins = np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
-            advances = self.tensor(np.concatenate([batch.valid, first]))
-        keep_state = ~np.concatenate([first, begins])
-        return RecurrentInput(self.tensor(batch.state), self.tensor(keep_state.astype(np.float32)), advances=advances)
 
     def values(self, observations: Observations, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN] under the present weights."""
@@ -259,6 +249,16 @@ class ActorCritic(Clones):
         """See `GradientDescent`."""
         super().load_other_state(state)
         self.generator.set_state(state["generator"])
+
+
+def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> RecurrentInput:
+    """The states before all T+1 steps. An episode begins after a step that resets; rows between those of a seat pass."""
+    begins, first, advances = ~batch.valid, np.zeros_like(batch.valid[:1]), None
+    if batch.resets is not None:
+        begins = np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
+        advances = tensor(np.concatenate([batch.valid, first]))
+    keep_state = ~np.concatenate([first, begins])
+    return RecurrentInput(tensor(batch.state), tensor(keep_state.astype(np.float32)), advances=advances)
 
 
 def _checked(found: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor | float]]:
