@@ -15,6 +15,7 @@ import gymnasium
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import describe_env
 from protocol.envs.envpool import envpool_spec
+from protocol.envs.seats import SeatedEnv
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.envs.vectorized import make_native, vector_alternative
 from protocol.envs.which_copy import FIRST_COPY
@@ -61,6 +62,8 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
 def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
     """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy."""
     match spec.vector:
+        case _ if isinstance(env, SeatedEnv):
+            return  # the learner refuses all but a loop
         case "loop":
             return
         case "native":

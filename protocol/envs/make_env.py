@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
+import pkgutil
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -32,6 +34,13 @@ def names_a_function(env_id: str) -> bool:
 
 def _names_a_module(env_id: str) -> bool:
     return re.fullmatch(r"[^\W\d]\w*(\.\w+)*\.\w+_v\d+", env_id) is not None
+
+
+def _newer_or_older(module: str) -> str:
+    """Which module of the same package was perhaps meant, as the end of a line; empty if none is similar."""
+    package, _, name = module.rpartition(".")
+    beside = [each.name for each in pkgutil.iter_modules(getattr(sys.modules.get(package), "__path__", []))]
+    return "".join(f"; did you mean {package}.{close}?" for close in difflib.get_close_matches(name, beside, 1, cutoff=0.75))
 
 
 def made_by_id(env_id: str, kwargs: dict[str, Any]) -> Any:
@@ -111,6 +120,8 @@ def why_not_made(
             return f"environment {env_id}: {says}"
         case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):
             return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
+        case ModuleNotFoundError(name=missing) if missing == env_id:  # its package is there
+            return f"environment {env_id}: {says}{_newer_or_older(env_id)}"
         case ModuleNotFoundError(name=missing):
             return f"environment {env_id}: a package it needs is missing ({says}); {what_to_install(missing)}"
         case ImportError():

@@ -110,6 +110,10 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
     Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised.
     """
     name = wrapper_name(wrapper)
+    if has_seats(env) and name.startswith("gymnasium."):
+        raise UsageError(
+            f"wrapper {name}: expected one of PettingZoo's or supersuit's, because the environment has several agents"
+        )
     try:
         made: object = _found(wrapper)(env) if isinstance(wrapper, str) else wrapper(env)
     except UsageError:

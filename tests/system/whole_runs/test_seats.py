@@ -144,6 +144,7 @@ def test_each_agent_can_be_told_which_one_it_is(tmp_path: Path, env: str) -> Non
     ("env", "settings", "says"),
     [
         ("ChainGame", {"inference": "learner"}, "inference learner: .*ChainGame has several agents, and workers must act"),
+        ("ChainGame", {"vector": "native"}, "vector native: .*ChainGame has several agents, whose copies are looped"),
         ("ChainGame", {"record": "a/b-v0"}, "record: expected none, because .*ChainGame has several agents"),
         (
             "Unequal",
