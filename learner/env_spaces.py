@@ -67,6 +67,6 @@ class EnvSpaces(NamedTuple):
         return EnvSpaces(leaves, action, env.max_episode_steps, masked, env.seats, env.takes_turns, critic)
 
     @staticmethod
-    def of_policy(policy: PolicySpec) -> EnvSpaces:
+    def of_policy(policy: PolicySpec, seats: tuple[str, ...] = ()) -> EnvSpaces:
         """Those that a policy was made for."""
-        return EnvSpaces(policy.observation, policy.action, None, critic=policy.critic)
+        return EnvSpaces(policy.observation, policy.action, None, seats=seats, critic=policy.critic)

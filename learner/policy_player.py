@@ -130,6 +130,7 @@ class PolicyPlayer:
             facts=policy.facts,
             masked=policy.masked,
             seats=policy.seats,
+            takes_turns=bool(policy.seats),  # perhaps
             heartbeat_s=settings.heartbeat_s(),
         )
         hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)

@@ -68,8 +68,9 @@ def check_settings(config: Config, run: Path) -> list[str]:
 
 
 def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
-    """Check that the environment has the spaces that the policy was made for. Raises `UsageError` that names the other."""
+    """Check that the environment has the spaces and agents that the policy was made for. Raises `UsageError` if not."""
     for what, expected, got in (
+        ("agents", (made_for.seats,), (now.seats,)),
         ("observations", made_for.observation, now.observation),
         ("actions", (made_for.action,), (now.action,)),
     ):

@@ -28,7 +28,7 @@ from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
 from protocol.env_spec import EnvSpec
 from protocol.envs.advice.atari_ids import preprocessed
-from protocol.envs.description import DescribedEnv
+from protocol.envs.description import DescribedEnv, agents_in_words
 from protocol.errors import UsageError
 from protocol.logs.notices import log_notice
 from protocol.specs import DescribeSpec
@@ -109,6 +109,9 @@ def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: 
             f"eval_env_kwargs: expected the spaces of training, {training.observation_space} and {training.action_space}, "
             f"got {evaluation.observation_space} and {evaluation.action_space}"
         )
+    agents = [agents_in_words(env.seats, env.takes_turns) for env in (training, evaluation)]
+    if agents[0] != agents[1]:
+        raise UsageError(f"eval_env_kwargs: expected the agents of training, {agents[0]}; got {agents[1]}")
 
 
 Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
@@ -134,15 +137,11 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
             if interrupts.received:
                 raise stopped(None if resume is None else resume.run)
 
-        policy = None if resume is None else RunFolder.open(resume.run).policy_spec()
+        saved = None if resume is None else RunFolder.open(resume.run).policy_description()
 
         def accept(found: DescribedEnv) -> None:
-            if resume is not None and policy is not None:
-                check_spaces(
-                    resume.run,
-                    EnvSpaces.of_policy(policy),
-                    _spaces(config, found),
-                )
+            if resume is not None and saved is not None:
+                check_spaces(resume.run, EnvSpaces.of_policy(saved.policy, saved.seats), _spaces(config, found))
 
         described = describe(DescribeSpec(env, config.vector, heartbeat_s=config.heartbeat_s()), check_interrupt, accept)
         evaluation = described

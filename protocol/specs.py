@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from protocol.bounds import MAX_NAME, one_line
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
 from protocol.space_spec import Shape
 from protocol.wire.weight_dtypes import ActingDtype
@@ -250,6 +251,11 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         """A, 1 for an environment of gymnasium's."""
         return max(1, len(self.seats))
 
+    @property
+    def row_axes(self) -> tuple[str, str | tuple[str, ...]]:
+        """The axes of the rows of a rollout, as errors name them (`protocol.rows.array_checks`)."""
+        return "step", self.seats or "copy"
+
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
         for what, called in (("encoder", self.policy.encoder), ("policy", self.policy.own)):
@@ -260,7 +266,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
 def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:
     """The names of the returns of these seats among the facts of an episode."""
-    return tuple(f"return_{seat}" for seat in seats)
+    return tuple(one_line(f"return_{seat}", MAX_NAME) for seat in seats)
 
 
 class StepSpec(msgspec.Struct, frozen=True, tag=True):

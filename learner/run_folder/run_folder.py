@@ -330,10 +330,10 @@ class RunFolder:
         parameters = _flat([arrays[field.name] for field in acting])
         return description, parameters, _flat([arrays[name] for name in names])
 
-    def policy_spec(self) -> PolicySpec | None:
-        """The policy that policy.json describes. None if that file is missing or cannot be read."""
+    def policy_description(self) -> PolicyDescription | None:
+        """What policy.json says. None if that file is missing or cannot be read."""
         try:
-            return _decode_description(read(self.path / POLICY_JSON)).policy
+            return _decode_description(read(self.path / POLICY_JSON))
         except UNREADABLE:
             return None
 

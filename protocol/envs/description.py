@@ -5,6 +5,7 @@ Rule: what a worker sent is data. Reading it makes spaces and records; it import
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,6 +53,7 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
         observation = describe_space(env.observation_space, "observation space")
     except UsageError as error:
         raise UsageError(f"{error}; {observation_advice(env)}") from error
+    seats, takes_turns = agents_of(env)
     description = EnvDescription(
         observation=observation,
         action=describe_space(env.action_space, "action space"),
@@ -61,8 +63,8 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
         render_mode=one_line(env.render_mode or "", MAX_NAME),
         generators=generator_states(env.observation_space, env.action_space),
         wrappers=_wrappers(env)[:MAX_WRAPPERS],
-        seats=_seats(env),
-        takes_turns=isinstance(env, SeatedEnv) and env.takes_turns,
+        seats=seats,
+        takes_turns=takes_turns,
     )
     try:
         check_size(description)
@@ -81,6 +83,9 @@ def read_description(description: EnvDescription) -> DescribedEnv:
     metadata = plain_values.unpack(description.metadata.tobytes())
     if type(metadata) is not dict or not all(type(name) is str for name in metadata):
         raise BadMessage(f"metadata: expected a dict with names as keys, got {type(metadata).__name__}")
+    seats, takes_turns = description.seats, description.takes_turns
+    if len(set(seats)) < len(seats) or (takes_turns and not seats):
+        raise BadMessage(f"seats: expected agents of different names, or none, got {agents_in_words(seats, takes_turns)}")
     observation_space, action_space = make_space(description.observation), make_space(description.action)
     restore_generators(description.generators, observation_space, action_space)
     return DescribedEnv(
@@ -91,17 +96,23 @@ def read_description(description: EnvDescription) -> DescribedEnv:
         max_episode_steps=description.longest_episode or None,
         render_mode=description.render_mode or None,
         wrappers=frozenset(description.wrappers),
-        seats=description.seats,
-        takes_turns=description.takes_turns,
+        seats=seats,
+        takes_turns=takes_turns,
     )
 
 
-def _seats(env: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
+def agents_of(env: gymnasium.Env[Any, Any]) -> tuple[tuple[str, ...], bool]:
+    """The names of its agents in a description, none if it is gymnasium's, and whether they take turns."""
     if not isinstance(env, SeatedEnv):
-        return ()
+        return (), False
     if len(env.seats) > MAX_SEATS:
         raise UsageError(f"environment: expected at most {MAX_SEATS} agents, got {len(env.seats)}")
-    return tuple(one_line(seat, MAX_NAME) for seat in env.seats)
+    return tuple(one_line(seat, MAX_NAME) for seat in env.seats), env.takes_turns
+
+
+def agents_in_words(seats: Sequence[str], takes_turns: bool) -> str:
+    """The agents of an environment, for errors."""
+    return one_line(f"{'agents that take turns' if takes_turns else 'agents'}: {', '.join(seats) or 'none'}", MAX_NAME)
 
 
 def class_name(kind: type) -> str:

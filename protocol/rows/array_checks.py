@@ -1,7 +1,8 @@
 """Checks of arrays from elsewhere: of shape and dtype, and that their values are finite and of their space. Pure.
 
 Each check returns what is wrong, as one line; an empty one if nothing is. A line names the first wrong value and its place:
-`axes` names the leading dimensions of an array, so that ("step", "copy") leads to "at step 3, copy 1".
+`axes` names the leading dimensions of an array, so that ("step", "copy") leads to "at step 3, copy 1". The names of a copy's
+seats in place of "copy" say that it has a column for each: ("step", ("black", "white")) leads to "at step 3, copy 1, white".
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 from protocol.arrays import Array, Bools
 from protocol.specs import ActionSpec, Leaf
 
-STEP_AND_COPY = ("step", "copy")
+Axes = Sequence[str | tuple[str, ...]]
+STEP_AND_COPY: Axes = ("step", "copy")
 
 
 class Expected(NamedTuple):
@@ -28,7 +30,7 @@ class Expected(NamedTuple):
     """None: any finite numbers. Of an action, which is stored: choices from 0."""
 
 
-def wrong_arrays(expected: Iterable[Expected], axes: Sequence[str] | None = STEP_AND_COPY) -> str:
+def wrong_arrays(expected: Iterable[Expected], axes: Axes | None = STEP_AND_COPY) -> str:
     """What is wrong with the first of these arrays that is wrong. `axes` None: whatever values it has."""
     for name, array, shape, dtype, space in expected:
         if why := _misfit(array, shape, dtype) or (axes is not None and wrong_values(array, space, axes)):
@@ -37,7 +39,7 @@ def wrong_arrays(expected: Iterable[Expected], axes: Sequence[str] | None = STEP
 
 
 def wrong_observation(
-    arrays: Sequence[Array], leaves: Sequence[Leaf], rows: tuple[int, ...], axes: Sequence[str] | None = STEP_AND_COPY
+    arrays: Sequence[Array], leaves: Sequence[Leaf], rows: tuple[int, ...], axes: Axes | None = STEP_AND_COPY
 ) -> str:
     """What is wrong with the arrays [*rows, *leaf] of an observation, one for each leaf."""
     if len(arrays) != len(leaves):
@@ -46,9 +48,7 @@ def wrong_observation(
     return wrong_arrays((Expected(leaf.name, array, (*rows, *leaf.shape), leaf.dtype, leaf) for leaf, array in each), axes)
 
 
-def wrong_values(
-    array: Array, space: Leaf | ActionSpec | None = None, axes: Sequence[str] = STEP_AND_COPY, first: int = 0
-) -> str:
+def wrong_values(array: Array, space: Leaf | ActionSpec | None = None, axes: Axes = STEP_AND_COPY, first: int = 0) -> str:
     """What is wrong with values [..., *shape]: one is not finite, or is not of its `space`, if that counts its values.
 
     The bounds of a Box are not checked: many environments leave theirs. `first`: the number of row 0.
@@ -78,9 +78,17 @@ def _misfit(array: Array, shape: tuple[int, ...], dtype: str) -> str:
     return ""
 
 
-def _first(array: Array, wrong: Bools, axes: Sequence[str], first: int) -> str:
+def _first(array: Array, wrong: Bools, axes: Axes, first: int) -> str:
     """The first wrong value and its place."""
     index = np.argwhere(wrong)[0]
     value, index[:1] = array[tuple(index)], index[:1] + first
-    place = ", ".join(f"{axis} {number}" for axis, number in zip(axes, index, strict=False))
-    return f"{value} at {place}" if place else f"{value}"
+    return f"{value} at {place}" if (place := place_of(index, axes)) else f"{value}"
+
+
+def place_of(index: Iterable[int], axes: Axes) -> str:
+    """Where an entry of an array stands, in words."""
+    words = []
+    for axis, number in zip(axes, index, strict=False):
+        copy, seat = (number, None) if isinstance(axis, str) else divmod(number, len(axis))
+        words.append(f"{axis} {copy}" if seat is None else f"copy {copy}, {axis[seat]}")
+    return ", ".join(words)

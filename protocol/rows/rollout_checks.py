@@ -10,7 +10,7 @@ from protocol.arrays import Array
 from protocol.errors import BadRollout
 from protocol.policy.masks import no_choice, not_allowed
 from protocol.rollout import Episode, Rollout
-from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
+from protocol.rows.array_checks import Axes, Expected, place_of, wrong_arrays, wrong_observation
 from protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
@@ -19,7 +19,7 @@ LARGEST_REWARD = float(np.finfo(np.float32).max)
 def validate(rollout: Rollout, run: RunSpec) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
     T, N = run.rollout_steps, run.columns
-    action = run.policy.action
+    action, axes = run.policy.action, run.row_axes
     expected = [
         Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),
         Expected("log_prob", rollout.log_prob, (T, N), "float32"),
@@ -41,12 +41,12 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"extras: expected {len(run.extras)} arrays, got {len(rollout.extras)}")
     for extra, array in zip(run.extras, rollout.extras, strict=True):
         expected.append(Expected(f"extra {extra.name}", array, (T, N, *extra.shape), extra.dtype))
-    if why := wrong_observation(rollout.obs, run.policy.seen, (T + 1, N)) or wrong_arrays(expected):
+    if why := wrong_observation(rollout.obs, run.policy.seen, (T + 1, N), axes) or wrong_arrays(expected, axes):
         raise BadRollout(why)
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
     if rollout.mask is not None:
-        _check_mask(rollout.mask, rollout, action)
+        _check_mask(rollout.mask, rollout, action, axes)
     ended = rollout.terminated | rollout.truncated
     if rollout.resets is not None:
         _check_seats(rollout.valid, ended, rollout.resets, run)
@@ -75,31 +75,28 @@ def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> Non
     gone, plays = np.zeros_like(reset), np.zeros_like(reset)  # the seat has left this episode; it has a row in it
     for t in range(len(valid)):
         gone[t + 1] = (gone[t] | ended[t]) & ~reset[t]
-        plays[t + 1] = (plays[t] & ~reset[t] | valid[t]) & ~ended[t]
+        plays[t + 1] = (plays[t] | valid[t]) & ~ended[t]
     idle = plays[:-1] & ~valid if not run.takes_turns else np.zeros_like(valid)
     for wrong, expected in (
-        (ended & ~valid, "an end only in a valid row"),
-        (valid & reset[:-1], "no valid row in a step that resets the copy"),
-        (valid & gone[:-1], "no valid row of a seat that has left its episode"),
-        (plays & reset, "the end of each seat before a step that resets the copy"),
-        (idle, "a valid row after one that has not ended"),
-        (reset[1:] & reset[:-1], "a step of the episode after one that resets the copy"),
+        (ended & ~valid, "valid: expected no end in a row that is not valid"),
+        (valid & reset[:-1], "valid: expected none in a step that only resets the copy"),
+        (valid & gone[:-1], "valid: expected none of a seat whose part of the episode has ended"),
+        (plays & reset, "resets: expected none before the part of each seat has ended"),
+        (reset[1:] & reset[:-1], "resets: expected none right before another"),
+        (idle, "valid: expected no gap after a row that has not ended, because no agent waits for others"),
     ):
         if wrong.any():
-            t, column = np.argwhere(wrong)[0]
-            n, seat = divmod(int(column), run.seats_of_copy)
-            raise BadRollout(f"valid: expected {expected}, got none at step {t}, copy {n}, {run.seats[seat]}")
+            raise BadRollout(f"{expected}, got one at {place_of(np.argwhere(wrong)[0], run.row_axes)}")
 
 
-def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec) -> None:
+def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -> None:
     """Raise `BadRollout` if a mask allows no choice, or forbids what was done."""
     if (empty := no_choice(mask, action)).any():
-        t, n = np.argwhere(empty)[0]
-        raise BadRollout(f"mask: expected an allowed choice at step {t}, copy {n}, got none")
+        raise BadRollout(f"mask: expected an allowed choice at {place_of(np.argwhere(empty)[0], axes)}, got none")
     if (wrong := rollout.valid & not_allowed(rollout.action, mask[:-1], action)).any():
         t, n = np.argwhere(wrong)[0]
         got = rollout.action[t, n].tolist()
-        raise BadRollout(f"action: expected one that the mask allows at step {t}, copy {n}, got {got}")
+        raise BadRollout(f"action: expected one that the mask allows at {place_of((t, n), axes)}, got {got}")
 
 
 def wrong_facts(episode: Episode, count: int) -> str:

@@ -134,8 +134,8 @@ class Collector:
             # An invalid observation or reward may have caused the error. Then these checks raise the clearer one.
             done = len(rows.step_end_s)
             for i, lane in enumerate(lanes):
-                check_observed(lane.number, self._stored, [array[i, : done + 1] for array in rows.obs])
-                check_rewards(lane.number, rows.reward[i, :done])
+                check_observed(lane.number, self._stored, [array[i, : done + 1] for array in rows.obs], self._run.row_axes)
+                check_rewards(lane.number, rows.reward[i, :done], self._run.row_axes)
             raise
         return [
             self._rollout(rows, actions, i, lane, assignment, version, session)
@@ -237,11 +237,12 @@ class Collector:
         """The rollout of lane `i`, made of views of the rows."""
         valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.step_end_s)
         obs = tuple(array[i] for array in rows.obs)
-        check_observed(lane.number, self._stored, obs)
-        reward = check_rewards(lane.number, rows.reward[i])
+        axes = self._run.row_axes
+        check_observed(lane.number, self._stored, obs, axes)
+        reward = check_rewards(lane.number, rows.reward[i], axes)
         acted = actions.columns(i)
-        check_acted(lane.number, "action", acted.action, obs)
-        check_acted(lane.number, "log_prob", acted.log_prob, obs)
+        check_acted(lane.number, "action", acted.action, obs, axes)
+        check_acted(lane.number, "log_prob", acted.log_prob, obs, axes)
         lane.obs = tuple(array[-1].copy() for array in obs)
         lane.state = rows.state[i].copy()
         resets = None if lane.seats is None else lane.seats.resets

@@ -19,6 +19,7 @@ from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array, Bools, Doubles
 from protocol.envs.action_masks import without_mask
+from protocol.envs.description import agents_in_words, agents_of
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
@@ -94,12 +95,18 @@ class EnvCopies(Protocol):
 
 
 def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
-    """Raise `UsageError` unless the copies have the spaces of the run's policy."""
+    """Raise `UsageError` unless the copies have the spaces of the run's policy, and its agents."""
     observation, action, policy = copies.observation_space, copies.action_space, run.policy
     if (observation_leaves(observation), action_spec(action)) != (policy.seen, policy.action):
         raise UsageError(
             f"environment {run.env.id}: its observations {observation} and actions {action} are not those of the policy; "
             "install the version of the environment that the policy was made for"
+        )
+    seats, takes_turns = agents_of(copies.envs[0]) if isinstance(copies, LoopedCopies) else ((), False)
+    if seats != run.seats or (takes_turns and not run.takes_turns):  # if seats may wait, they need not
+        raise UsageError(
+            f"environment {run.env.id}: expected {agents_in_words(run.seats, run.takes_turns)}, got "
+            f"{agents_in_words(seats, takes_turns)}; install the version of the environment that the run was started with"
         )
 
 

@@ -1,7 +1,7 @@
 """Checks of the values of rows before they are sent: finite, and of their spaces. `row_writers` has checked their shapes.
 
 Each raises `EnvironmentFailed`, which names the lane, or an evaluation (`lane` None), and the step and the copy of the
-first wrong value. Arrays are [rows, N, …], and row 0 is `first_step`.
+first wrong value. Arrays are [rows, N, …] with the axes `RunSpec.row_axes`, and row 0 is `first_step`.
 """
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.arrays import Array
-from protocol.rows.array_checks import wrong_values
+from protocol.rows.array_checks import Axes, wrong_values
 from protocol.specs import Leaf
 from workers.copies.env_errors import environment_failed
 
 
-def check_observed(lane: int | None, leaves: Sequence[Leaf], obs: Sequence[Array], first_step: int = 0) -> None:
+def check_observed(lane: int | None, leaves: Sequence[Leaf], obs: Sequence[Array], axes: Axes, first_step: int = 0) -> None:
     """Check observations [rows, N, *leaf]."""
     for leaf, array in zip(leaves, obs, strict=True):
-        if why := wrong_values(array, leaf, first=first_step):
+        if why := wrong_values(array, leaf, axes, first_step):
             raise environment_failed(lane, f"{leaf.name}: {why}")
 
 
-def check_rewards(lane: int | None, reward: Array, first_step: int = 0) -> Array:
+def check_rewards(lane: int | None, reward: Array, axes: Axes, first_step: int = 0) -> Array:
     """The rewards as float32, checked."""
     with np.errstate(over="ignore"):
         stored = reward.astype(np.float32)
-    if why := wrong_values(stored, first=first_step):
+    if why := wrong_values(stored, None, axes, first_step):
         raise environment_failed(lane, f"reward: {why}")
     return stored
 
 
-def check_acted(lane: int | None, name: str, array: Array, obs: Sequence[Array], first_step: int = 0) -> None:
+def check_acted(lane: int | None, name: str, array: Array, obs: Sequence[Array], axes: Axes, first_step: int = 0) -> None:
     """Check what the policy computed: if it is not finite, finite observations `obs` are too large for float32."""
-    if why := wrong_values(array, first=first_step):
+    if why := wrong_values(array, None, axes, first_step):
         largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
         line = f"{name} of the policy: {why}, from observations up to {largest:g}"
         raise environment_failed(lane, f"{line}; wrap the environment so that they are smaller")

@@ -157,7 +157,7 @@ class Evaluator:
                 )
             except CopyFailed as error:
                 raise environment_failed(None, error, f"step {t}") from error
-            check_rewards(None, numbers[0][None], t)
+            check_rewards(None, numbers[0][None], self._run.row_axes, t)
             rewards, ends, cuts = (array.reshape(k, A) for array in numbers)
             if (columns := step.columns) is not None:
                 rewards, ends = rewards + columns.outside[: k * A].reshape(k, A), columns.over[:k, None]
@@ -209,14 +209,14 @@ class Evaluator:
             self._writer.write_some([array[0] for array in obs], self._columns(copies), leaves)
         except CopyFailed as error:
             raise environment_failed(None, error, doing) from error
-        check_observed(None, self._stored, obs, t)
+        check_observed(None, self._stored, obs, self._run.row_axes, t)
 
     def _check_acted(self, chosen: Array, running: Sequence[int], obs: tuple[Array, ...], t: int) -> None:
         """As in training. The action of a copy whose episode has ended does not count."""
         if chosen.dtype.kind == "f":
             acted, columns = np.zeros_like(chosen), self._columns(running)
             acted[columns] = chosen[columns]
-            check_acted(None, "action", acted[None], obs, t)
+            check_acted(None, "action", acted[None], obs, self._run.row_axes, t)
 
     def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
         try:

@@ -167,8 +167,8 @@ def test_another_replay_ratio_is_said(tmp_path: Path) -> None:
 def test_an_environment_with_other_spaces_is_refused() -> None:
     from gymnasium import spaces
 
-    def of(observation: spaces.Space[Any], actions: int) -> EnvSpaces:
-        return EnvSpaces(observation_leaves(observation), action_spec(spaces.Discrete(actions)), None)
+    def of(observation: spaces.Space[Any], actions: int, *seats: str) -> EnvSpaces:
+        return EnvSpaces(observation_leaves(observation), action_spec(spaces.Discrete(actions)), None, seats=seats)
 
     run, box = Path("runs/mine"), spaces.Box(-1, 1, (3,))
     check_spaces(run, of(box, 2), of(box, 2))
@@ -176,6 +176,7 @@ def test_an_environment_with_other_spaces_is_refused() -> None:
         (of(spaces.Box(-1, 1, (4,)), 2), r"observations have changed: expected .*\(3,\).*, got .*\(4,\)"),
         (of(box, 3), r"actions have changed: expected .*2.*, got .*3"),
         (of(spaces.Dict(a=box, b=box), 2), "observations have changed"),
+        (of(box, 2, "a", "b"), r"agents have changed: expected \(\), got \('a', 'b'\)"),
     ):
         with pytest.raises(UsageError, match=f"^run runs/mine: the environment's {says}.*; install the version") as why:
             check_spaces(run, of(box, 2), now)

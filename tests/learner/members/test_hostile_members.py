@@ -32,13 +32,14 @@ from protocol.messages import (
     ToLearner,
     Welcome,
 )
-from protocol.rollout import Episode
+from protocol.rollout import Episode, Rollout
 from protocol.rows.rollout_checks import validate
 from protocol.token_bucket import TokenBucket
 from protocol.wire.codec import decode_to_learner, decode_to_observer, decode_to_worker, encode
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.conversation.extreme_messages import SESSION, extremes, of_session
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, SEATS, fake_rollout, run_spec, seated_rollout
 from tests.support.conversation.fake_link import FakeLink
 from workers.copies.env_errors import CopyFailed, environment_failed
 
@@ -46,9 +47,9 @@ from workers.copies.env_errors import CopyFailed, environment_failed
 class Noisy:
     """A hub that has one lane, an honest worker that owns it, and a link on which anybody may speak."""
 
-    def __init__(self, max_env_failures: int = 0) -> None:
+    def __init__(self, max_env_failures: int = 0, **run: object) -> None:
         self.link = FakeLink()
-        self.coordinator = TicketCoordinator(run_spec(lanes=1), max_lag=0, worker_timeout_s=5.0, first_session=1)
+        self.coordinator = TicketCoordinator(run_spec(1, **run), max_lag=0, worker_timeout_s=5.0, first_session=1)
         settings = HubSettings(60.0, 600.0, max_env_failures)
         self.hub = Hub(cast(LearnerLink, self.link), self.coordinator, settings, clock=lambda: self.link.now)
         self.joins("honest")
@@ -479,3 +480,29 @@ def test_a_return_that_no_episode_can_have_is_refused() -> None:
     validate(msgspec.structs.replace(rollout, episodes=(Episode(1e30, 1, 0.1),)), run_spec(lanes=1))
     with pytest.raises(BadRollout, match="episode: expected a finite return of 1 to 1 float32 rewards"):
         validate(msgspec.structs.replace(rollout, episodes=(Episode(1e308, 1, 0.1),)), run_spec(lanes=1))
+
+
+@pytest.mark.parametrize("seats", [(), SEATS])
+def test_rollouts_with_any_resets_are_counted_and_lead_to_no_error(seats: tuple[str, ...]) -> None:
+    """Also in a run that has none, of a session that has ended, and before it is known whose they are."""
+    noisy, good = Noisy(seats=seats), seated_rollout(SESSION)
+    rollouts, lines = noisy.coordinator.rollouts, noisy.hub._server.member_log
+    said: list[str] = []
+    lines.warn_limited = lambda peer, line: said.append(line)  # type: ignore[method-assign]
+    session = noisy.joins("spare")
+    for number, frames in enumerate(extremes(good)):
+        try:
+            message = decode_to_learner(of_session(frames, session), 10_000_000)
+        except BadMessage:
+            continue
+        assert isinstance(message, Rollout)
+        rollouts.late(message)  # neither of them may trust it
+        rollouts.invalid(message)
+        noisy.hears("spare", message)
+        noisy.hears("honest", Heartbeat(1, 0, (0,), (0,), 0, {}, 0))
+        session = noisy.joins("spare", number + 2)
+    assert len(said) > 100
+    assert all("\n" not in line and len(line) < 1_000 for line in said)
+    assert noisy.hub._server.unexpected_errors == 0
+    assert set(noisy.coordinator.members) == {b"honest", b"spare"}
+    assert 0 <= rollouts.ledger.transitions_invalid < 10**9

@@ -16,6 +16,7 @@ from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye
 from protocol.rollout import Episode
 from protocol.rows.played import reason_to_reject
+from protocol.rows.rollout_checks import LARGEST_REWARD
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of
 from tests.support.conversation.fake_ends import fake_rows
@@ -210,3 +211,40 @@ def test_rows_may_have_a_part_without_elements() -> None:
     policy = PolicySpec((Leaf("", "box", (0,), "bool"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
     run = msgspec.structs.replace(run, policy=policy)
     assert reason_to_reject(msgspec.structs.replace(row, obs=(empty,)), [], run, MOST_STEPS, with_frames=False) == ""
+
+
+def of_seats(played: Played, count: int) -> EpisodeRows:
+    """A row of this number of seats."""
+    return played.rows(0, obs=(np.zeros((2, count, 1), np.float32),), action=np.zeros((1, count), np.int64))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_rows_are_of_all_seats_of_the_run(count: int) -> None:
+    played = Played()
+    dealer = played.learner.coordinator.evaluation
+    played.learner.says(A, of_seats(played, 2))
+    assert played.strikes() == 1, "the run has no seats"
+    dealer._run = msgspec.structs.replace(dealer._run, seats=("black", "white"))
+    for rows in (played.rows(0), of_seats(played, count)):
+        assert "expected float32[2, 2, 1], got" in reason_to_reject(rows, [], dealer._run, MOST_STEPS, with_frames=False)
+        played.learner.says(A, rows)
+    assert A not in played.learner.coordinator.members, "three strikes"
+
+
+def test_the_first_wrong_value_of_a_row_is_named_by_its_seat() -> None:
+    played = Played()
+    run = msgspec.structs.replace(played.learner.coordinator.run, seats=("black", "white"))
+    rows = msgspec.structs.replace(of_seats(played, 2), action=np.array([[0, 2]]))
+    assert (
+        reason_to_reject(rows, [], run, MOST_STEPS, with_frames=False) == "action: expected 0 to 1, got 2 at row 0, seat 1"
+    )
+
+
+def test_a_return_is_one_that_the_rewards_of_all_seats_can_give() -> None:
+    played = Played()
+    dealer = played.learner.coordinator.evaluation
+    dealer._run = msgspec.structs.replace(dealer._run, seats=("black", "white"))
+    for total, strikes in ((2.001 * LARGEST_REWARD, 1), (math.nan, 2), (2 * LARGEST_REWARD, 2)):
+        played.learner.says(A, of_seats(played, 2))
+        played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(Episode(total, 1, 0.0),)))
+        assert played.strikes() == strikes

@@ -83,8 +83,8 @@ def resume(run: Path) -> tuple[RunState, tuple[bytes, ...]]:
     unless_finished(config, run, lambda checked: run)
     folder = RunFolder.open(run)
     env = EnvSpec.of(config.env, config.env_kwargs)
-    policy = folder.policy_spec()
-    spaces = EnvSpaces.of_description(DESCRIBED) if policy is None else EnvSpaces.of_policy(policy)
+    saved = folder.policy_description()
+    spaces = EnvSpaces.of_description(DESCRIBED) if saved is None else EnvSpaces.of_policy(saved.policy)
     algorithm = algorithm_class(config.algo)(
         config.algorithm, run_spec(config, env, spaces).policy, total_steps=config.steps, seed=1
     )

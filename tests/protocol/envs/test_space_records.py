@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from protocol.bounds import MAX_NAME
 from protocol.envs.description import DescribedEnv, describe_env, read_description
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError
@@ -18,6 +19,7 @@ from protocol.messages import Described
 from protocol.space_spec import (
     MAX_ELEMENTS,
     MAX_LEAVES,
+    MAX_SEATS,
     BoxSpace,
     DictSpace,
     DiscreteSpace,
@@ -282,6 +284,15 @@ def test_an_entry_point_that_json_cannot_hold_leaves_the_spec_out() -> None:
 
 
 @pytest.mark.parametrize(
+    "seats", [("a",) * (MAX_SEATS + 1), ("a" * (MAX_NAME + 1),), ("a\n",), ("\x1b[31m",), (1,), "ab", None]
+)
+def test_a_description_with_names_of_seats_that_are_none_is_not_decoded(seats: Any) -> None:
+    description = msgspec.structs.replace(described(DiscreteSpace(2, 0, "int64")), seats=seats)
+    with pytest.raises(BadMessage, match=r"description\[8\]"):
+        decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
+
+
+@pytest.mark.parametrize(
     "changes",
     [
         {"metadata": np.frombuffer(b"\xc1", np.uint8)},
@@ -293,6 +304,8 @@ def test_an_entry_point_that_json_cannot_hold_leaves_the_spec_out() -> None:
         {"spec": "[" * 60_000},
         {"spec": "3"},
         {"spec": '{"id": 3, "additional_wrappers": []}'},
+        {"seats": ("a", "b", "a")},
+        {"takes_turns": True},
     ],
     ids=str,
 )

@@ -80,6 +80,25 @@ def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: i
     )
 
 
+SEATS = ("black", "white")
+
+
+def seated_rollout(session: int) -> Rollout:
+    """One step of a copy with these seats: the first acted, and the second waits."""
+    return msgspec.structs.replace(
+        fake_rollout(session, 0, 0, 0, 0),
+        obs=(np.zeros((2, 2, 1), np.float32),),
+        action=np.zeros((1, 2), np.int64),
+        log_prob=np.zeros((1, 2), np.float32),
+        reward=np.zeros((1, 2), np.float32),
+        terminated=np.zeros((1, 2), bool),
+        truncated=np.zeros((1, 2), bool),
+        valid=np.array([[True, False]]),
+        state=np.zeros((2, 0), np.float32),
+        resets=np.zeros((2, 1), bool),
+    )
+
+
 def process_ends(coordinator: Coordinator[Any], worker: str, why: str = "killed", nonce: int = -1) -> list[Outgoing]:
     """The learner hears that the process of this worker has ended. `nonce`: of one that is no member any more."""
     nonces = [each.hello.process_nonce for each in coordinator.members.values() if each.hello.worker == worker]

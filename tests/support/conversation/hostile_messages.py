@@ -13,7 +13,7 @@ from protocol.messages import Inquire, ToLearner
 from protocol.wire.codec import encode
 from protocol.wire.compression import Packing
 from tests.support.conversation.every_message import to_learner
-from tests.support.conversation.fake_ends import fake_rollout
+from tests.support.conversation.fake_ends import fake_rollout, seated_rollout
 
 Frames = list[bytes]
 
@@ -33,10 +33,10 @@ NONSENSE: list[Any] = [
 
 
 def real(session: int) -> list[ToLearner | Inquire]:
-    """One good message of each kind that a learner can be told; the rollout also with frame stacks, which go packed."""
+    """One good message of each kind that a learner can be told; rollouts also of seats, and with frames that go packed."""
     frames = np.lib.stride_tricks.sliding_window_view(np.arange(16 + 4, dtype=np.uint8), 4)[:, None, :, None, None]
     packed = msgspec.structs.replace(fake_rollout(session, 0, 0, 0, 0), obs=(np.tile(frames, (8, 8)),))
-    return [*to_learner(session), packed, Inquire()]
+    return [*to_learner(session), packed, seated_rollout(session), Inquire()]
 
 
 def hostile(seed: int, messages: Sequence[Any]) -> Iterator[Frames]:

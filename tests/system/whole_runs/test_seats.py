@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -19,8 +21,10 @@ from learner.config.layers import resolve
 from learner.policy_player import saved_policy
 from learner.run_folder import checkpoint
 from learner.run_folder.progress import Progress
+from learner.run_setup import check_evaluation_spaces
 from millrace.launch.training import train
 from protocol.arrays import Floats
+from protocol.envs.description import DescribedEnv
 from protocol.errors import UsageError
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
@@ -158,3 +162,23 @@ def test_what_several_agents_cannot_have_is_refused_in_a_line(
 ) -> None:
     with pytest.raises(UsageError, match=says):
         trained(tmp_path, env, steps=300, **settings)
+
+
+def test_a_run_is_not_resumed_with_other_agents(tmp_path: Path) -> None:
+    run = trained(tmp_path, "ChainGame", steps=300, rollout_steps=16)
+    card = run / "policy.json"
+    saved = json.loads(card.read_text())
+    card.write_text(json.dumps(saved | {"seats": ["short", "tall"]}))
+    with pytest.raises(UsageError, match=r"agents have changed: expected \('short', 'tall'\), got \('short', 'long'\)"):
+        trained(tmp_path, "ChainGame", run, steps=600, rollout_steps=16)
+
+
+def test_an_evaluation_has_the_agents_of_training() -> None:
+    none = DescribedEnv(gymnasium.spaces.Box(0, 1), gymnasium.spaces.Discrete(2))
+    two = replace(none, seats=("a", "b"))
+    turns = replace(two, takes_turns=True)
+    config = resolve("ChainGame")
+    check_evaluation_spaces(config, two, two)
+    for other, got in ((turns, "agents that take turns: a, b"), (none, "agents: none")):
+        with pytest.raises(UsageError, match=f"^eval_env_kwargs: expected the agents of training, agents: a, b; got {got}$"):
+            check_evaluation_spaces(config, two, other)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import msgspec
 import numpy as np
 import pytest
@@ -15,11 +16,12 @@ from learner.config.hyperparameters import PPOConfig
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import EnvironmentFailed, UsageError
 from protocol.policy.policy import make_policy
-from protocol.rollout import Batch, Rollout, stack_rollouts
+from protocol.rollout import Rollout, stack_rollouts
 from protocol.rows.rollout_checks import validate
 from protocol.specs import PolicySpec, RunSpec, seat_returns
-from tests.support.in_process.collectors import collect, no_pulse, random_collector
+from tests.support.in_process.collectors import collect, evaluated, no_pulse, random_collector, random_policy
 from tests.support.users_code.seat_envs import AGENTS, Lived, RandomCrowd, RandomGame
 from workers.collect.collector import Collector
 
@@ -237,13 +239,52 @@ def test_the_learner_finds_the_log_probabilities_and_states_under_which_seats_ac
         np.testing.assert_allclose(found[valid], batch.log_prob[valid], atol=1e-4)
 
 
-def batch_of(form: str, **policy: Any) -> tuple[RunSpec, Batch]:
-    run = seated_run(form, T=32, N=4, **policy)
-    _, rollouts = collected(run, 1)
-    return run, stack_rollouts(rollouts)
-
-
 def test_a_batch_counts_steps_of_copies() -> None:
-    run, batch = batch_of("turns")
+    run = seated_run("turns", T=32, N=4)
+    batch = stack_rollouts(collected(run, 1)[1])
     assert batch.resets is not None
     assert batch.env_steps == run.rollout_steps * run.copies - np.count_nonzero(batch.resets[:-1])
+
+
+class Alone(gymnasium.Env[Any, Any]):
+    """One agent, which has the spaces of those of the others."""
+
+    observation_space, action_space = RandomCrowd().observation_space("a"), RandomCrowd().action_space("a")
+
+
+def test_an_environment_of_other_agents_is_refused_in_one_line() -> None:
+    together, turns = "agents: a, b, c", "agents that take turns: a, b, c"
+    crowd, game = (seated_run(form, T=2, N=2) for form in ("together", "turns"))
+    alone = msgspec.structs.replace(crowd, seats=(), facts=())
+    of_alone = EnvSpec(f"{__name__}:{Alone.__name__}")
+    for run, env, expected, got in (
+        (crowd, of_alone, together, "agents: none"),
+        (alone, crowd.env, "agents: none", together),
+        (alone, game.env, "agents: none", turns),
+        (game, of_alone, turns, "agents: none"),
+        (crowd, game.env, together, turns),
+        (msgspec.structs.replace(crowd, seats=("a", "b"), facts=()), crowd.env, "agents: a, b", together),
+        (msgspec.structs.replace(crowd, seats=("a", "c", "b"), facts=()), crowd.env, "agents: a, c, b", together),
+    ):
+        changed = msgspec.structs.replace(run, env=env)
+        says = f"environment {env.id}: expected {expected}, got {got}; install the version .*$"
+        with pytest.raises(UsageError, match=says):
+            collect(random_collector(changed), changed)
+        with pytest.raises(UsageError, match=says):
+            evaluated(changed, random_policy(changed.policy), 1, 0)
+    may_wait = msgspec.structs.replace(game, env=crowd.env)
+    collect(random_collector(may_wait), may_wait)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_value_that_is_no_number_is_named_by_the_seat_that_it_is_of(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def rewards(env: Any, agents: list[str]) -> dict[str, float]:
+        return {agent: np.nan if agent == "b" else 0.0 for agent in agents}
+
+    monkeypatch.setattr(FORMS[form], "_rewards", rewards)
+    run = seated_run(form, T=12, N=3)
+    says = r"reward: expected finite values, got nan at step \d+, copy [0-2], b$"
+    with pytest.raises(EnvironmentFailed, match=f"lane 0, {says}"):
+        collect(random_collector(run), run)
+    with pytest.raises(EnvironmentFailed, match=says):
+        evaluated(run, random_policy(run.policy), 3, 0)

@@ -1,0 +1,217 @@
+"""What a learner refuses of the rows of seats, whoever made them. Each refusal is one line, which names step, copy and seat.
+
+Here a letter is what one step is for a seat: `v` a valid row, `e` a valid row that ends its part of the episode, `.` no row,
+`R` a step that only resets the copy. `E` is an end without a valid row, `V` a valid row in a step that resets.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from protocol.arrays import Array
+from protocol.bounds import MAX_NAME
+from protocol.env_spec import EnvSpec
+from protocol.errors import BadRollout
+from protocol.rollout import Episode, Rollout
+from protocol.rows.rollout_checks import LARGEST_REWARD, validate
+from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec, seat_returns
+from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
+
+LAW = {
+    form: re.compile(rf"({closed}R)?((?!R){closed}R)*{running}")
+    for form, closed, running in (
+        ("turns", r"(\.*|[v.]*e\.*)", r"[v.]*(e\.*)?"),
+        ("together", r"(\.*|\.*v*e\.*)", r"\.*v*(e\.*)?"),
+    )
+}
+"""What the letters of a seat may be in one rollout, with an `R` behind them if the next rollout begins with a reset."""
+RESETS, ENDS, VALID = "RV", "eE", "veV"
+
+
+def letters(rollout: Rollout, seats: int) -> list[str]:
+    """Those of each column."""
+    assert rollout.resets is not None
+    ended, columns = rollout.terminated | rollout.truncated, []
+    for column, valid in enumerate(rollout.valid.T):
+        resets = rollout.resets[:, column // seats]
+        found = [
+            {(0, 0, 0): ".", (1, 0, 0): "v", (1, 1, 0): "e", (0, 0, 1): "R"}.get(step, "X")
+            for step in zip(valid.tolist(), ended[:, column].tolist(), resets[:-1].tolist(), strict=True)
+        ]
+        columns.append("".join(found) + "R" * int(resets[-1]))
+    return columns
+
+
+def with_as_many_episodes(rollout: Rollout, run: RunSpec) -> Rollout:
+    """The rollout, with an episode for each reset that follows one of its steps."""
+    assert rollout.resets is not None
+    episode = Episode(0.0, 1, 0.0, (math.nan,) * len(run.facts))
+    return msgspec.structs.replace(rollout, episodes=(episode,) * np.count_nonzero(rollout.resets[1:]))
+
+
+def flipped(rollout: Rollout) -> Iterator[Rollout]:
+    """The rollout with one other flag, for each flag that it has."""
+    for name in ("valid", "terminated", "truncated", "resets"):
+        flags = getattr(rollout, name)
+        for index in np.ndindex(flags.shape):
+            other = flags.copy()
+            other[index] = not other[index]
+            yield msgspec.structs.replace(rollout, **{name: other})
+
+
+def refusal(rollout: Rollout, run: RunSpec) -> str:
+    """What the learner says of it; nothing if it takes it."""
+    try:
+        validate(rollout, run)
+    except BadRollout as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("T", [1, 2, 11, pytest.param(30, marks=pytest.mark.soak)])
+def test_a_flag_that_is_not_the_environments_is_refused_or_could_be(form: str, T: int) -> None:
+    run, refused, lawful = seated_run(form, T, N=3), 0, 0
+    for rollout in collected(run, max(2, 40 // T))[1]:
+        assert all(map(LAW[form].fullmatch, letters(rollout, len(run.seats))))
+        for other in flipped(rollout):
+            says = refusal(with_as_many_episodes(other, run), run)
+            assert (says == "") == all(map(LAW[form].fullmatch, letters(other, len(run.seats)))), says
+            if says:
+                assert re.fullmatch(r"(valid|resets): expected no\S* .*, got one at step \d+, copy [0-2], [abc]", says)
+            refused, lawful = refused + bool(says), lawful + (not says)
+    assert min(refused, lawful) > 50
+
+
+SEATS = ("black", "white")
+
+
+def run_of(form: str, T: int, copies: int, **changes: Any) -> RunSpec:
+    policy = PolicySpec((Leaf("", "box", (1,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
+    turns = form == "turns"
+    run = RunSpec(EnvSpec("Fake-v0"), policy, T, copies, 1, 0, seats=SEATS, takes_turns=turns, facts=("a", "b"))
+    return msgspec.structs.replace(run, **changes)
+
+
+def rollout_of(form: str, columns: Sequence[str], **changes: Any) -> tuple[Rollout, RunSpec]:
+    """A rollout with these letters, two columns a copy; the last letter says only whether the next step resets."""
+    T, C = len(columns[0]) - 1, len(columns)
+    run = run_of(form, T, C // 2, **changes)
+
+    def flags(of: str) -> Array:
+        return np.array([[letter in of for letter in column] for column in columns]).T
+
+    rollout = Rollout(
+        session=1, lane=0, ticket=0, version=0, sequence=5,
+        obs=(np.zeros((T + 1, C, 1), np.float32),),
+        action=np.zeros((T, C), np.int64),
+        log_prob=np.zeros((T, C), np.float32),
+        reward=np.zeros((T, C), np.float32),
+        terminated=flags(ENDS)[:-1],
+        truncated=np.zeros((T, C), bool),
+        valid=flags(VALID)[:-1],
+        state=np.zeros((C, 0), np.float32),
+        resets=flags(RESETS)[:, ::2],
+    )  # fmt: skip
+    return with_as_many_episodes(rollout, run), run
+
+
+GAP = "valid: expected no gap after a row that has not ended, because no agent waits for others"
+EARLY = "resets: expected none before the part of each seat has ended"
+
+
+@pytest.mark.parametrize(
+    ("form", "columns", "says", "place"),
+    [
+        ("turns", ("v.v.", ".E..", "v...", "v..."), "valid: expected no end in a row that is not valid", (1, 0, "white")),
+        ("together", ("eRv.", "eVv."), "valid: expected none in a step that only resets the copy", (1, 0, "white")),
+        ("turns", ("ve..", "e.v."), "valid: expected none of a seat whose part of the episode has ended", (2, 0, "white")),
+        ("together", ("vvv.", "vvv.", "vvv.", "v.v."), GAP, (1, 1, "white")),
+        ("turns", ("v...", "v...", "eRv.", "vRv."), EARLY, (1, 1, "white")),
+        ("turns", ("v...", "v...", "v..R", "v.eR"), EARLY, (3, 1, "black")),
+        ("turns", ("v...", "v...", "eRR.", "eRR."), "resets: expected none right before another", (1, 1, "black")),
+    ],
+)
+def test_a_false_flag_is_named(form: str, columns: Sequence[str], says: str, place: tuple[int, int, str]) -> None:
+    step, copy, seat = place
+    assert refusal(*rollout_of(form, columns)) == f"{says}, got one at step {step}, copy {copy}, {seat}"
+
+
+GOOD = ("v.e.", "...."), ("v.v.", ".v.."), ("eRvv", "eR.v")
+
+
+@pytest.mark.parametrize("columns", GOOD)
+def test_rows_that_keep_the_law_are_taken(columns: tuple[str, str]) -> None:
+    assert refusal(*rollout_of("turns", ("v.v.", ".v..", *columns))) == ""
+
+
+def good(**changes: Any) -> tuple[Rollout, RunSpec]:
+    return rollout_of("turns", ("eRv.", "eRv.", "v...", "v..."), **changes)
+
+
+def test_resets_are_flags_of_each_copy() -> None:
+    rollout, run = good()
+    assert rollout.resets is not None
+    for resets, says in (
+        (None, "resets: expected some"),
+        (rollout.resets[:-1], r"resets: expected bool\[4, 2\], got bool\[3, 2\]"),
+        (rollout.resets[:, :1], r"resets: expected bool\[4, 2\], got bool\[4, 1\]"),
+        (np.repeat(rollout.resets, 2, axis=1), r"resets: expected bool\[4, 2\], got bool\[4, 4\]"),
+        (rollout.resets.ravel(), r"resets: expected bool\[4, 2\], got bool\[8\]"),
+        (rollout.resets.view(np.uint8), r"resets: expected bool\[4, 2\], got uint8\[4, 2\]"),
+        ((2 * rollout.resets.view(np.uint8)).view(bool), "resets: expected bytes 0 and 1, got 2"),
+    ):
+        with pytest.raises(BadRollout, match=says):
+            validate(msgspec.structs.replace(rollout, resets=resets), run)
+    with pytest.raises(BadRollout, match="resets: expected none"):
+        validate(rollout, msgspec.structs.replace(run, seats=(), copies=run.columns))
+
+
+def test_an_episode_has_one_reset_the_returns_of_all_seats_and_each_fact() -> None:
+    rollout, run = good()
+    (episode,) = rollout.episodes
+    most = 4 * len(SEATS) * LARGEST_REWARD
+    for episodes, says in (
+        ((), "episodes: expected 1, got 0"),
+        ((episode, episode), "episodes: expected 1, got 2"),
+        ((Episode(most * 1.001, 4, 0.0, episode.facts),), "episode: expected a finite return"),
+        ((Episode(math.nan, 4, 0.0, episode.facts),), "episode: expected a finite return"),
+        ((Episode(0.0, 1, 0.0, (math.nan,)),), "episode: expected 2 facts, got 1"),
+        ((Episode(0.0, 1, 0.0, (0.0, math.inf)),), "episode: expected finite facts"),
+    ):
+        assert refusal(msgspec.structs.replace(rollout, episodes=episodes), run).startswith(says)
+    validate(msgspec.structs.replace(rollout, episodes=(Episode(most, 4, 0.0, episode.facts),)), run)
+
+
+def test_a_wrong_value_is_named_by_the_seat_that_it_is_of() -> None:
+    rollout, run = good()
+    obs, reward, action = rollout.obs[0].copy(), rollout.reward.copy(), rollout.action.copy()
+    obs[3, 1], reward[2, 3], action[1, 2] = np.inf, np.nan, 2
+    mask = np.ones((4, 4, 2), bool)
+    masked = msgspec.structs.replace(run, masked=True)
+    forbids, empty = mask.copy(), mask.copy()
+    forbids[0, 1, 0] = empty[3, 3] = False
+    for changes, of_run, says in (
+        ({"obs": (obs,)}, run, "observation: expected finite values, got inf at step 3, copy 0, white"),
+        ({"reward": reward}, run, "reward: expected finite values, got nan at step 2, copy 1, white"),
+        ({"action": action}, run, "action: expected 0 to 1, got 2 at step 1, copy 1, black"),
+        ({"mask": forbids}, masked, "action: expected one that the mask allows at step 0, copy 0, white, got 0"),
+        ({"mask": empty}, masked, "mask: expected an allowed choice at step 3, copy 1, white, got none"),
+    ):
+        changed: dict[str, Any] = changes
+        assert refusal(msgspec.structs.replace(rollout, **changed), of_run) == says
+
+
+def test_the_name_of_a_return_is_as_short_as_a_name_and_hides_nothing() -> None:
+    """It names a metric, and policy.json keeps it."""
+    (name,) = found = seat_returns(("\u202e" + "a" * (MAX_NAME - 1),))
+    assert len(name) == MAX_NAME
+    assert name.startswith("return_\\u202eaaa")
+    assert run_of("turns", 1, 1, seats=("\u202e" + "a" * (MAX_NAME - 1),), facts=found).has_seat_returns
