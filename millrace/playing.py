@@ -164,7 +164,11 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
 
 def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
     """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
-    with policy_player(_saved(flags, given), _workers(flags, flags.workers, 1), watch) as player:
+    saved = _saved(flags, given)
+    for found, why in ((saved.seats, f"{saved.env.id} has several agents"), (saved.spec.critic, "the run has critic_keys")):
+        if found:
+            raise UsageError(f"record: {why}, which a dataset has not")
+    with policy_player(saved, _workers(flags, flags.workers, 1), watch) as player:
         return record_dataset(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
         )
@@ -177,4 +181,9 @@ def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> Pla
 
 def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
     env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
-    return saved_policy(flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
+    saved = saved_policy(flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
+    if saved.seats and flags.inference == "learner":
+        raise UsageError(
+            f"inference learner: {saved.env.id} has several agents, and workers must act; use --inference workers"
+        )
+    return saved

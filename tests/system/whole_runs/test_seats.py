@@ -182,3 +182,11 @@ def test_an_evaluation_has_the_agents_of_training() -> None:
     for other, got in ((turns, "agents that take turns: a, b"), (none, "agents: none")):
         with pytest.raises(UsageError, match=f"^eval_env_kwargs: expected the agents of training, agents: a, b; got {got}$"):
             check_evaluation_spaces(config, two, other)
+
+
+def test_so_is_what_a_saved_policy_of_theirs_cannot_do(tmp_path: Path) -> None:
+    run = trained(tmp_path, "ChainGame", steps=100, rollout_steps=16)
+    with pytest.raises(UsageError, match=r"^inference learner: .*ChainGame has several agents, and workers must act"):
+        millrace.evaluate(run, episodes=1, inference="learner")
+    with pytest.raises(UsageError, match=r"^record: .*ChainGame has several agents, which a dataset has not"):
+        millrace.record(run, "some/data-v0", steps=10)
