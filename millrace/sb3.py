@@ -24,6 +24,7 @@ from millrace.arguments import checked
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.description import class_name
+from protocol.envs.seats import SeatedEnv
 from protocol.envs.spaces import make_flatten, make_unflatten
 from protocol.errors import UsageError
 
@@ -78,14 +79,17 @@ def make_vec_env(
 
 
 class Sb3VecEnv(VecEnv):
-    """The SB3 interface of a vector environment whose autoreset mode is `SameStep`."""
+    """The SB3 interface of a vector environment whose autoreset mode is `SameStep`.
+
+    With seats, `num_envs` counts the agents of all copies, which must all act at every step: SB3 has no place for others.
+    """
 
     def __init__(self, env: ZmqVectorEnv, *, monitored: bool = False) -> None:
         """`monitored`: the workers record episodes as `Monitor` does. Raises `UsageError` for another autoreset mode."""
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
         env.merge_infos = False  # merged infos have one dtype and shape for all copies
-        self.env, self._monitored = env, monitored
+        self.env, self._monitored, self._rows_of_copy = env, monitored, max(1, len(env.seats))
         space = env.single_action_space
         self._nested_actions = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._flatten, self._unflatten = make_flatten(space), make_unflatten(space)
@@ -93,9 +97,10 @@ class Sb3VecEnv(VecEnv):
 
     def reset(self) -> Any:
         """Begin episodes in all env copies, with the seeds and options that were set. Returns the observations."""
-        seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
-        options = [each or None for each in self._options] if any(self._options) else None
-        observation, _ = self.env.reset(seed=seeds, options=options)
+        seeds = self._seeds[:: self._rows_of_copy] if any(seed is not None for seed in self._seeds) else None
+        options = [each or None for each in self._options[:: self._rows_of_copy]] if any(self._options) else None
+        observation, infos = self.env.reset(seed=seeds, options=options)
+        self._check_all_act(infos)
         self.reset_infos = self._info_list()
         self._reset_seeds()
         self._reset_options()
@@ -110,9 +115,10 @@ class Sb3VecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """Observations, rewards (float32), dones and a list with one info for each env copy."""
-        observation, reward, terminated, truncated, _ = self.env.step_wait()
+        observation, reward, terminated, truncated, infos = self.env.step_wait()
+        self._check_all_act(infos)
         done = terminated | truncated
-        if not self.env.infos_by_copy and not done.any():
+        if not self.env.infos_by_row and not done.any():
             return observation, reward.astype(np.float32), done, [{"TimeLimit.truncated": False} for _ in done]
         info_list = self._info_list()
         for n, info in enumerate(info_list):
@@ -124,6 +130,14 @@ class Sb3VecEnv(VecEnv):
                 info.update(final_info, terminal_observation=terminal_observation)
             info["TimeLimit.truncated"] = bool(truncated[n] and not terminated[n])
         return observation, reward.astype(np.float32), done, info_list
+
+    def _check_all_act(self, infos: dict[str, Any]) -> None:
+        if self.env.seats and not infos["acts"].all():
+            who = self.env.seats[int(np.argmin(infos["acts"])) % self._rows_of_copy]
+            raise UsageError(
+                f"Sb3VecEnv: expected all agents to act at every step, but {who} does not; for agents that leave, use "
+                "wrappers=['supersuit:black_death_v3']; for others, millrace.make_vec, whose infos say who acts"
+            )
 
     def close(self) -> None:
         """Close the vector environment; its local workers end."""
@@ -167,12 +181,12 @@ class Sb3VecEnv(VecEnv):
         return [results[n] for n in copies]
 
     def _copies(self, indices: Indices) -> list[int]:
-        """The numbers of these env copies, as plain integers. As in a list, -1 is the last one."""
-        return [range(self.num_envs)[n] for n in self._get_indices(indices)]
+        """The numbers of the copies of these rows, as plain integers. As in a list, -1 is the last one."""
+        return [range(self.num_envs)[n] // self._rows_of_copy for n in self._get_indices(indices)]
 
     def _info_list(self) -> list[dict[str, Any]]:
         """The newest infos: a dict for each env copy, as its environment returned it."""
-        return [self.env.infos_by_copy.get(n, {}) for n in range(self.num_envs)]
+        return [self.env.infos_by_row.get(n, {}) for n in range(self.num_envs)]
 
 
 class _Wrapping:
@@ -200,6 +214,8 @@ def _wrapped(
 
     def make(render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
         made = msgspec.structs.replace(inner, kwargs=kwargs).make(render_mode)
+        if isinstance(made, SeatedEnv):
+            raise UsageError("make_vec_env: wrapper_class: expected none with agents; give PettingZoo's as wrappers=[...]")
         return wrapper_class(gymnasium.wrappers.RecordEpisodeStatistics(made) if monitor else made, **keywords)
 
     make.__name__ = make.__qualname__ = inner.id

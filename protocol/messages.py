@@ -283,7 +283,7 @@ class Step(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     actions: tuple[Array, ...]
-    """one array [N, *leaf] for each leaf of the action"""
+    """one array [N, *leaf] for each leaf of the action; see `StepSpec.seats` for N with seats"""
 
 
 DESCRIPTION = "<description>"
@@ -320,7 +320,7 @@ class Stepped(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     obs: tuple[Array, ...]
-    """one array [N, *leaf] for each leaf of the observation"""
+    """one array [N, *leaf] for each leaf of the observation; with seats, three more (`StepSpec.seats`)"""
     reward: Array
     """[N] float64, raw"""
     terminated: Array
@@ -328,7 +328,7 @@ class Stepped(Message, frozen=True):
     truncated: Array
     """[N] bool"""
     infos: Array
-    """[bytes] uint8: a list of pairs of copy and info, each pair a list or a tuple, packed by `protocol.wire.plain_values`;
+    """[bytes] uint8: a list of pairs of row and info, each pair a list or a tuple, packed by `protocol.wire.plain_values`;
     empty infos are left out
     """
 

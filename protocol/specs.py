@@ -269,6 +269,10 @@ def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(one_line(f"return_{seat}", MAX_NAME) for seat in seats)
 
 
+SEAT_LEAVES = (Leaf("acts", "box", (), "bool"), Leaf("complete", "box", (), "bool"), Leaf("outside", "box", (), "float64"))
+"""Arrays beside those of the observation, of a vector environment with seats; see `protocol.envs.seats.SeatStep`"""
+
+
 class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """Everything that a worker needs to know about a vector environment whose copies it steps on order."""
 
@@ -287,6 +291,11 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """passed to each copy"""
     evaluation_copies: int = 0
     """so many of the last copies play evaluations; the number of such a copy counts from the first of them"""
+    seats: tuple[str, ...] = ()
+    """names of the A agents of each copy; empty if the environments are gymnasium's. With seats, arrays have N · A rows in
+    place of N, those of a copy side by side, and three more follow the observation's: `acts` and `complete` (bool), and
+    `outside` (float64)
+    """
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The caller may
@@ -297,6 +306,21 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     def first_copy(self, lane: int) -> int:
         """Number of the lane's first copy."""
         return sum(self.lanes[:lane])
+
+    @property
+    def seats_of_copy(self) -> int:
+        """A, 1 for environments of gymnasium's."""
+        return max(1, len(self.seats))
+
+    @property
+    def leaves(self) -> tuple[Leaf, ...]:
+        """What the arrays `Stepped.obs` hold."""
+        return (*self.observation, *(SEAT_LEAVES if self.seats else ()))
+
+    def rows(self, lane: int) -> slice:
+        """The lane's rows in arrays of all lanes."""
+        first, A = self.first_copy(lane), self.seats_of_copy
+        return slice(first * A, (first + self.lanes[lane]) * A)
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""

@@ -1,4 +1,4 @@
-"""The arrays that hold the newest observations, rewards and episode ends of all env copies.
+"""The arrays that hold the newest observations, rewards and episode ends of all env copies; with seats, of each seat.
 
 They lie in shared memory if there is any: local workers write a step's results there themselves. Results that arrive as
 messages are written to the same arrays.
@@ -13,37 +13,40 @@ import gymnasium
 import numpy as np
 
 from learner.vector_env.batch_layout import BatchLayout
-from protocol.arrays import Array
+from learner.vector_env.sent_lanes import Infos
+from protocol.arrays import Array, Bools
 from protocol.envs.spaces import make_unflatten
 from protocol.messages import Stepped
-from protocol.specs import StepSpec
+from protocol.specs import SEAT_LEAVES, StepSpec
 from protocol.wire.shared_memory import SharedMemory
 
 
 class BatchArrays:
-    """The newest results of all env copies."""
+    """The newest results of all env copies. N is the number of rows."""
 
     def __init__(
         self, spec: StepSpec, layout: BatchLayout, observation_space: gymnasium.Space[Any], memory: SharedMemory | None
     ) -> None:
-        """`observation_space`: of a single env copy. `memory`: shared with local workers."""
-        N = layout.num_envs
+        """`observation_space`: of a single row. `memory`: shared with local workers."""
+        N = layout.rows[-1].stop
         self._layout, self._nest = layout, make_unflatten(observation_space)
-        self._observation: tuple[Array, ...]  # [num_envs, *leaf] each
-        self.reward: Array  # [num_envs] float64
-        self.terminated: Array  # [num_envs] bool
-        self.truncated: Array  # [num_envs] bool
+        self._leaves: tuple[Array, ...]  # [N, *leaf] each
+        self.reward: Array  # [N] float64
+        self.terminated: Array  # [N] bool
+        self.truncated: Array  # [N] bool
         if memory is not None:
-            self._observation, self.reward = memory.obs, memory.reward
+            self._leaves, self.reward = memory.obs, memory.reward
             self.terminated, self.truncated = memory.terminated, memory.truncated
         else:
-            self._observation = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.observation)
+            self._leaves = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.leaves)
             self.reward, self.terminated, self.truncated = np.zeros(N), np.zeros(N, bool), np.zeros(N, bool)
+        count = len(spec.observation)
+        self._observation, self._seats = self._leaves[:count], self._leaves[count:]
 
     def store(self, lane: int, answer: Stepped) -> None:
         """Write what a lane sent as a message."""
         rows = self._layout.rows[lane]
-        for array, leaf in zip(self._observation, answer.obs, strict=True):
+        for array, leaf in zip(self._leaves, answer.obs, strict=True):
             array[rows] = leaf
         self.reward[rows], self.terminated[rows], self.truncated[rows] = answer.reward, answer.terminated, answer.truncated
 
@@ -51,15 +54,29 @@ class BatchArrays:
         """Truncate the episodes of a lane: reward 0 at the newest observation."""
         rows = self._layout.rows[lane]
         self.reward[rows], self.terminated[rows], self.truncated[rows] = 0.0, False, True
+        for array in self._seats:
+            array[rows] = 0
+
+    @property
+    def over(self) -> Bools:
+        """[copies] whether the episode has ended: with seats, no agent is left."""
+        if not self._seats:
+            return self.terminated | self.truncated
+        return np.logical_not(self._seats[0].reshape(self._layout.count, -1).any(1))
+
+    def of_seats(self, rows: slice | Sequence[int]) -> Infos:
+        """Which of these rows act next, which are complete, and rewards outside of any, in the form of gymnasium's infos."""
+        found = {leaf.path: array[rows].copy() for leaf, array in zip(SEAT_LEAVES, self._seats, strict=True)}
+        return found | {f"_{name}": np.ones(len(array), bool) for name, array in found.items()}
 
     def observation(self, *, copy: bool) -> Any:
-        """Observations of all env copies, nested as in the space. Without `copy` the next step overwrites them."""
+        """Observations of all rows, nested as in the space. Without `copy` the next step overwrites them."""
         return self._nest([array.copy() for array in self._observation] if copy else self._observation)
 
-    def observation_of_some(self, copies: Sequence[int]) -> Any:
-        """Copies of the newest observations of these env copies, nested as in the space: [len(copies), *leaf] each."""
-        return self._nest([array[list(copies)] for array in self._observation])
+    def observation_of_some(self, rows: Sequence[int]) -> Any:
+        """Copies of the newest observations of these rows, nested as in the space: [len(rows), *leaf] each."""
+        return self._nest([array[list(rows)] for array in self._observation])
 
-    def observation_of(self, n: int) -> Any:
-        """A copy of the newest observation of env copy `n`."""
-        return self._nest([array[n].copy() for array in self._observation])
+    def observation_of(self, row: int) -> Any:
+        """A copy of the newest observation of this row."""
+        return self._nest([array[row].copy() for array in self._observation])

@@ -1,6 +1,7 @@
 """Layout of a batch: the rows of each lane. Pure.
 
-Row n of every array of a batch belongs to env copy n. A lane has consecutive rows; lane 0 has the first ones.
+Row n of every array of a batch belongs to env copy n. With A seats, copy n has the rows n · A to n · A + A - 1. A lane has
+consecutive rows; lane 0 has the first ones.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from itertools import accumulate
 class BatchLayout:
     """The rows of each lane."""
 
-    def __init__(self, lane_sizes: Sequence[int]) -> None:
-        """`lane_sizes`: the number of env copies of each lane."""
+    def __init__(self, lane_sizes: Sequence[int], seats: int = 1) -> None:
+        """`lane_sizes`: the number of env copies of each lane. `seats`: A, of each copy."""
         ends = list(accumulate(lane_sizes))
-        self.num_envs = ends[-1]
+        self._seats = seats
+        self.count = ends[-1]
+        """Number of env copies."""
         self.lanes = range(len(ends))
-        self.rows = [slice(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
+        self._copies = [range(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
+        self._firsts = [copies.start for copies in self._copies]
+        self.rows = [slice(copies.start * seats, copies.stop * seats) for copies in self._copies]
         """Rows of each lane, by lane."""
-        self._firsts = [rows.start for rows in self.rows]
-        self._copies = [range(rows.start, rows.stop) for rows in self.rows]
 
     def copies(self, lane: int) -> range:
         """The env copies of a lane, numbered as in the whole batch."""
@@ -31,14 +34,18 @@ class BatchLayout:
         """The env copies of these lanes."""
         return [n for lane in lanes for n in self.copies(lane)]
 
+    def rows_of(self, copies: Sequence[int]) -> Sequence[int]:
+        """The rows of these env copies."""
+        return copies if self._seats == 1 else [n * self._seats + seat for n in copies for seat in range(self._seats)]
+
     def size(self, lane: int) -> int:
         """Number of env copies of a lane."""
         return len(self.copies(lane))
 
     def lane_of(self, copy: int) -> int:
         """The lane of an env copy. Raises `IndexError` if there is no such copy."""
-        if not 0 <= copy < self.num_envs:
-            raise IndexError(f"copy: expected 0 to {self.num_envs - 1}, got {copy}")
+        if not 0 <= copy < self.count:
+            raise IndexError(f"copy: expected 0 to {self.count - 1}, got {copy}")
         return bisect_right(self._firsts, copy) - 1
 
     def by_lane(self, copies: Iterable[int]) -> dict[int, list[int]]:
@@ -51,11 +58,11 @@ class BatchLayout:
 
     def check(self, copies: Sequence[int]) -> None:
         """Raises `ValueError` unless these are different copies that exist, at least one."""
-        if not copies or len(set(copies)) != len(copies) or not 0 <= min(copies) <= max(copies) < self.num_envs:
-            raise ValueError(f"env_ids: expected different numbers from 0 to {self.num_envs - 1}, got {list(copies)}")
+        if not copies or len(set(copies)) != len(copies) or not 0 <= min(copies) <= max(copies) < self.count:
+            raise ValueError(f"env_ids: expected different numbers from 0 to {self.count - 1}, got {list(copies)}")
 
-    def positions(self, copies: Sequence[int]) -> dict[int, list[int]]:
-        """Where in `copies` the copies of each lane are, by lane. Raises `ValueError` unless all are whole lanes."""
+    def positions(self, copies: Sequence[int]) -> dict[int, Sequence[int]]:
+        """Where each lane's rows are among those of `copies`, by lane. Raises `ValueError` unless all are whole lanes."""
         self.check(copies)
         at = {copy: position for position, copy in enumerate(copies)}
         found = {lane: [at.get(copy, -1) for copy in self.copies(lane)] for lane in self.by_lane(sorted(copies))}
@@ -66,4 +73,4 @@ class BatchLayout:
                     f"env_ids: expected all copies of lane {lane}, {of_lane[0]} to {of_lane[-1]}, got "
                     f"{[copy for copy in of_lane if copy in at]}; with lanes=num_envs every copy is a lane of its own"
                 )
-        return found
+        return {lane: self.rows_of(positions) for lane, positions in found.items()}

@@ -58,8 +58,8 @@ class CopyCalls:
         """Make all copies, before they are reset, and describe them. Raises as `call`."""
         for _ in range(RESET_ATTEMPTS - 1):
             with suppress(WorkerLost):  # another worker may make them
-                return self.describe(range(self._parts.layout.num_envs))
-        return self.describe(range(self._parts.layout.num_envs))
+                return self.describe(range(self._parts.layout.count))
+        return self.describe(range(self._parts.layout.count))
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
         self._send_recv.call(orders)

@@ -2,6 +2,9 @@
 
 Rule: the results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions, whichever
 way they travel. A lost worker is always reported, as truncated copies or as an error; it is never hidden.
+
+With A seats, a row of a batch is a seat's, and those of a copy are side by side; `num_envs` counts rows. What addresses an
+environment counts copies: seeds, options, `reset_mask`, `env_ids`, calls and attributes.
 """
 
 from __future__ import annotations
@@ -54,7 +57,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `on_close` is called once: by `close`, when this object is garbage collected, or when the interpreter exits.
         """
         step = description.step
-        self.num_envs = N = len(step.copies)
+        self.seats = step.seats
+        """the names of the agents of each copy; empty if the environment is gymnasium's"""
+        self._layout = BatchLayout(step.lanes, step.seats_of_copy)
+        self.num_envs = N = self._layout.rows[-1].stop
         self.metadata = description.metadata
         self.autoreset_mode = AutoresetMode(step.autoreset)  # as SyncVectorEnv has it; TorchRL reads it
         self.render_mode = description.render_mode
@@ -65,20 +71,20 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.action_space = batch_space(self.single_action_space, N)
         self.copy = copy
         self.merge_infos = True
-        """whether infos are returned, merged as gymnasium does it; otherwise only `infos_by_copy` has them"""
-        self.infos_by_copy: dict[int, Infos] = {}
+        """whether infos are returned, merged as gymnasium does it; otherwise only `infos_by_row` has them"""
+        self.infos_by_row: dict[int, Infos] = {}
         """the newest infos that are not empty, as each copy returned them"""
         self.hub = hub
         """who is asked; it may be told what to call while it waits"""
         self.address = hub.address
         """the address that workers connect to"""
         self._action_leaves, self._read_actions = step.action, make_flatten(self.single_action_space)
-        self._layout = BatchLayout(step.lanes)
         memory = None if hub.shared is None else hub.shared.memory
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
         self._state = AsyncState.DEFAULT
         self._info_reader = InfoReader(self._layout, hub.refuse_owner)
-        seeds, ever_reset = list[int | None]([None] * N), np.zeros(N, bool)
+        count = self._layout.count
+        seeds, ever_reset = list[int | None]([None] * count), np.zeros(count, bool)
         parts = VectorEnvParts(
             hub, self._layout, self._batch, LostLanes(), step.autoreset, seeds, ever_reset, on_worker_loss
         )
@@ -114,7 +120,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `AlreadyPendingCallError` if one of the copies, or another one of its lane, has not come back.
         """
         self._check_idle("reset_async", of_sent=True)
-        copies, seeds, options = reset_arguments(env_ids, seed, options, self.num_envs)
+        copies, seeds, options = reset_arguments(env_ids, seed, options, self._layout.count)
         alone = not self.outstanding
         self._send_recv.reset(copies, seeds, options)
         self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
@@ -129,6 +135,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         `actions` and observations have a row for each copy, as `action_space` and `observation_space`. Rewards are
         [num_envs] float64; terminated and truncated are [num_envs] bool; infos are a dict, as gymnasium merges them.
+
+        With seats, the action of a row counts where `infos["acts"]` is True in the results before. `infos["complete"]` says
+        which rows are transitions: from the observation that the row had before, in which its seat acted, to the present
+        one, with this reward, terminated and truncated. Agents that take turns have acted some steps earlier: keep their
+        actions until then. Leave all other rows out; `infos["outside"]` has rewards that belong to no transition. An episode
+        is over when no seat of its copy acts. If a worker is lost, its rows are truncated and not complete.
 
         Raises `UsageError` for copies that must be reset first, `TypeError` and `ValueError` for wrong actions,
         `EnvironmentFailed`, `NoWorkers`, and with `on_worker_loss="raise"` `WorkerLost`.
@@ -168,9 +180,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             envs.send(policy(observation), infos["env_id"])
         """
         self._check_idle("send", of_sent=True)
-        copies = numbered(env_ids, self.num_envs)
+        copies = numbered(env_ids, self._layout.count)
         at = self._layout.positions(copies)
-        arrays = action_arrays(actions, self._read_actions, self._action_leaves, len(copies))
+        arrays = action_arrays(actions, self._read_actions, self._action_leaves, len(self._layout.rows_of(copies)))
         self._send_recv.step(list(at), arrays, at, together=False)
         self._state = AsyncState.DEFAULT
 
@@ -178,8 +190,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The results of all copies that are ready; waits until at least `min_envs` are. 0 does not wait.
 
         Observations, rewards, terminated and truncated have a row for each of these copies, in ascending order of the
-        copies; so have the infos, which also have `env_id`: int64[rows], the numbers of the copies. The arrays are the
-        caller's. Each row is that which `step` or `reset` would have given.
+        copies, or for each of their seats; so have the infos, which also have `env_id`: int64, the numbers of the copies.
+        The arrays are the caller's. Each row is that which `step` or `reset` would have given.
 
         A worker that does not answer within `timeout` seconds (`timeout_s` by default), counted from the order while the
         caller waits, is given up, as by `step`. Raises `NoAsyncCallError` if nothing was sent, `EnvironmentFailed`,
@@ -210,18 +222,18 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """
         if name not in self.calls.known:
             self._check_idle("call")
-        return self.calls.call(range(self.num_envs), name, args, kwargs)
+        return self.calls.call(range(self._layout.count), name, args, kwargs)
 
     get_attr = call
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute. A list or tuple has one value for each copy; any other value goes to all copies."""
         if not isinstance(values, list | tuple):
-            values = [values] * self.num_envs
-        if len(values) != self.num_envs:
-            raise ValueError(f"values: expected one for each of {self.num_envs} copies, got {len(values)}")
+            values = [values] * self._layout.count
+        if len(values) != self._layout.count:
+            raise ValueError(f"values: expected one for each of {self._layout.count} copies, got {len(values)}")
         self._check_idle("call")
-        self.calls.assign(range(self.num_envs), name, values)
+        self.calls.assign(range(self._layout.count), name, values)
 
     def render(self) -> tuple[Any, ...]:
         """What `render` of every copy returns."""
@@ -267,13 +279,16 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def _rows(self, ready: Ready, copies: list[int] | None = None) -> GymnasiumStep:
         """The rows of these copies, which came back, or of all."""
-        batch, rows = self._batch, slice(None) if copies is None else copies
+        batch, some = self._batch, None if copies is None else self._layout.rows_of(copies)
+        rows = slice(None) if some is None else some
         truncated = batch.truncated.copy()
         if ready.losses:
             truncated[list(ready.losses)] = True
-        self.infos_by_copy = self._info_reader.by_copy(ready)
-        infos = merged(self.infos_by_copy, self, copies) if self.merge_infos else {}
-        observation = batch.observation(copy=self.copy) if copies is None else batch.observation_of_some(copies)
+        self.infos_by_row = self._info_reader.by_row(ready)
+        infos = merged(self.infos_by_row, self, some) if self.merge_infos else {}
+        if self.seats:
+            infos |= batch.of_seats(rows)
+        observation = batch.observation(copy=self.copy) if some is None else batch.observation_of_some(some)
         return observation, batch.reward[rows].copy(), batch.terminated[rows].copy(), truncated[rows], infos
 
 

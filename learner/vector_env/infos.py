@@ -1,4 +1,4 @@
-"""The infos of a step: packed bytes of each lane to one dict for each env copy, and these merged as gymnasium does it."""
+"""The infos of a step: packed bytes of each lane to one dict for each row, and these merged as gymnasium does it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from protocol.wire.plain_values import repr_paths, unpack
 log = logging.getLogger("millrace.learner")
 
 
-class OfSomeCopies(VectorEnv[Any, Any, Array]):
-    """Merges the infos of some copies, as gymnasium's vector environments merge those of all."""
+class OfSomeRows(VectorEnv[Any, Any, Array]):
+    """Merges the infos of some rows, as gymnasium's vector environments merge those of all."""
 
     closed = True  # there is nothing to close
 
@@ -34,14 +34,14 @@ class InfoReader:
         self._layout, self._refuse = layout, refuse
         self._warned: set[str] = set()  # keys of infos that arrived as their repr
 
-    def by_copy(self, ready: Ready) -> dict[int, Infos]:
-        """The infos that are not empty, in the order of the copies."""
+    def by_row(self, ready: Ready) -> dict[int, Infos]:
+        """The infos that are not empty, in the order of the rows."""
         found = dict(ready.losses)
         for lane, packed in ready.results.items():
             if not isinstance(packed, bytes) or not packed:
                 continue
             try:
-                for n, info in unpack_infos(packed, self._layout.copies(lane)).items():
+                for n, info in unpack_infos(packed, self._layout.rows_of(self._layout.copies(lane))).items():
                     found[n] = found.get(n, {}) | info
             except BadMessage as error:
                 self._refuse(lane, f"lane {lane}: infos cannot be read: {error}")
@@ -51,22 +51,22 @@ class InfoReader:
             for key in repr_paths(found[n]):
                 if key not in self._warned:
                     self._warned.add(key)
-                    log.warning("info %s of copy %d is no plain data: it arrives as its repr, a string", key, n)
+                    log.warning("info %s of row %d is no plain data: it arrives as its repr, a string", key, n)
         return dict(sorted(found.items()))
 
 
-def merged(by_copy: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], copies: Sequence[int] | None = None) -> Infos:
-    """Infos as gymnasium merges them, with a row for each of these copies; None: for all of the vector environment."""
+def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: Sequence[int] | None = None) -> Infos:
+    """Infos of these rows as gymnasium merges them; None: of all of the vector environment."""
     infos: Infos = {}
-    rows = OfSomeCopies(len(copies)) if copies is not None else env
-    row_of = range(env.num_envs) if copies is None else {n: row for row, n in enumerate(copies)}
-    for n, info in by_copy.items():
-        infos = rows._add_info(infos, info, row_of[n])
+    merges = OfSomeRows(len(rows)) if rows is not None else env
+    number_of = range(env.num_envs) if rows is None else {n: number for number, n in enumerate(rows)}
+    for n, info in by_row.items():
+        infos = merges._add_info(infos, info, number_of[n])
     return infos
 
 
-def unpack_infos(packed: bytes, copies: range) -> dict[int, Infos]:
-    """Infos by env copy, of a lane that has these copies. Raises `BadMessage` for bytes that are no infos."""
+def unpack_infos(packed: bytes, rows: Sequence[int]) -> dict[int, Infos]:
+    """Infos by row, of a lane that has these rows. Raises `BadMessage` for bytes that are no infos."""
     try:
         pairs = [(n, info) for n, info in unpack(packed)]
     except (TypeError, ValueError) as error:
@@ -74,4 +74,4 @@ def unpack_infos(packed: bytes, copies: range) -> dict[int, Infos]:
     for n, info in pairs:
         if type(n) is not int or not isinstance(info, dict):
             raise BadMessage(f"expected pairs of a number and a dict, got {type(n).__name__} and {type(info).__name__}")
-    return {copies[n]: info for n, info in pairs if n in range(len(copies))}
+    return {rows[n]: info for n, info in pairs if n in range(len(rows))}

@@ -41,12 +41,13 @@ class VectorEnvParts:
     seeds: list[int | None]
     """of each copy's last seeded reset"""
     ever_reset: Bools
-    """[num_envs] whether the copy was ever reset"""
+    """[copies] whether the copy was ever reset"""
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
 
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
         """Seeds for the copies that replace those of a lost lane."""
-        return replacement_seeds(self.seeds[self.layout.rows[lane]], self.hub.coordinator.lanes[lane].incarnation)
+        seeds = [self.seeds[n] for n in self.layout.copies(lane)]
+        return replacement_seeds(seeds, self.hub.coordinator.lanes[lane].incarnation)
 
     def reset_of_new_copies(self, lane: int) -> AskedReset:
         """The reset of the copies that replace those of a lost lane."""
@@ -223,7 +224,7 @@ class SendRecv:
                 raise UsageError(f"step before reset of copies {never}: call reset(), or reset_async() and recv(), first")
             self._all_were_reset = bool(parts.ever_reset.all())
         if parts.autoreset == "Disabled":
-            over = parts.batch.terminated | parts.batch.truncated
+            over = parts.batch.over
             # Of a loss that is not reported, the caller learns by the result of this step.
             if ended := [
                 n for n in parts.layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
@@ -240,9 +241,9 @@ class SendRecv:
             )
 
     def _asked_reset(self, lane: int, chosen: Sequence[int], seeds: Sequence[int | None], options: Options) -> AskedReset:
-        rows = self._parts.layout.rows[lane]
-        of_lane = [options[rows][n] for n in chosen] if isinstance(options, list) else options
-        return AskedReset(tuple(chosen), tuple(seeds[rows][n] for n in chosen), packed(of_lane))
+        copies = [self._parts.layout.copies(lane)[n] for n in chosen]
+        of_lane = [options[n] for n in copies] if isinstance(options, list) else options
+        return AskedReset(tuple(chosen), tuple(seeds[n] for n in copies), packed(of_lane))
 
     def _reset_instead(self, lane: int, reset: AskedReset, last_observations: Mapping[int, Any]) -> None:
         """The lane was lost: its new copies are reset before it comes back."""
@@ -260,7 +261,7 @@ class SendRecv:
         parts.batch.store(lane, answer)
         parts.lost_lanes.answered({lane})
         if isinstance(asked, AskedReset):
-            parts.ever_reset[parts.layout.rows[lane]][list(asked.copies)] = True
+            parts.ever_reset[[parts.layout.copies(lane)[n] for n in asked.copies]] = True
         return bytes(answer.infos.data)
 
     def _give_up_late(self, timeout_s: float) -> None:
@@ -293,7 +294,7 @@ class SendRecv:
                     self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])
-                    last = {n: parts.batch.observation_of(n) for n in copies}
+                    last = {row: parts.batch.observation_of(row) for row in parts.layout.rows_of(copies)}
                     self._reset_instead(lane, parts.reset_of_new_copies(lane), last)
                 case AfterLoss.COME_BACK:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])

@@ -19,7 +19,7 @@ from protocol.arrays import Bytes
 from protocol.messages import Returned
 
 Infos = dict[str, Any]
-"""What the environment tells beside a row of one copy."""
+"""What the environment tells beside a row."""
 LONGEST_GAP_S = 0.5  # a caller that looks less often was busy, or its process was stopped
 
 
@@ -52,7 +52,7 @@ class Sent(NamedTuple):
     attempts: int = 1
     """how often a reset was sent"""
     last_observations: Mapping[int, Any] | None = None
-    """Of copies that were lost and whose episodes end with these observations, while their new copies are reset."""
+    """by row: those with which the episodes of lost copies end, while their new copies are reset"""
 
 
 class Ready(NamedTuple):
@@ -61,7 +61,7 @@ class Ready(NamedTuple):
     results: Mapping[int, bytes | Returned]
     """by lane, in ascending order: packed infos, or what a call returned"""
     losses: Mapping[int, Infos]
-    """by copy: infos of those that come back truncated, because their worker was lost"""
+    """by row: infos of those that come back truncated, because their worker was lost"""
 
 
 class AfterLoss(Enum):
@@ -96,7 +96,7 @@ class SentLanes:
         self.sent: dict[int, Sent] = {}
         """by lane: what the lanes that have not come back were asked for"""
         self._results: dict[int, bytes | Returned] = {}  # of those that are ready
-        self._losses: dict[int, Infos] = {}  # by copy, of those that are ready
+        self._losses: dict[int, Infos] = {}  # by row, of those that are ready
 
     @property
     def all_ready(self) -> bool:
@@ -142,13 +142,13 @@ class SentLanes:
         """These lanes have their results."""
         self._results |= results
         for lane in results:
-            for n, last in (self.sent[lane].last_observations or {}).items():
-                self._losses[n] = {"worker_lost": True, "final_obs": last, "final_info": {"worker_lost": True}}
+            for row, last in (self.sent[lane].last_observations or {}).items():
+                self._losses[row] = {"worker_lost": True, "final_obs": last, "final_info": {"worker_lost": True}}
 
     def ready_as_lost(self, lane: int) -> None:
         """The lane comes back truncated, and is reset by the caller or by its next step."""
         self._results[lane] = b""
-        self._losses |= {n: {"worker_lost": True} for n in self._layout.copies(lane)}
+        self._losses |= {row: {"worker_lost": True} for row in self._layout.rows_of(self._layout.copies(lane))}
 
     def drop(self, lane: int) -> None:
         """The lane does not come back: the caller gets an error that names it."""

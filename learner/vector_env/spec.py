@@ -71,6 +71,7 @@ class RequestedCopies:
             render_mode=self.render_mode,
             learner_timeout_s=self.learner_timeout_s,
             evaluation_copies=self.evaluation_copies,
+            seats=env.seats,
         )
         check_can_be_sent(self.envs[0].id, step)
         metadata = {**env.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
@@ -114,12 +115,12 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
 
 
 def observation_spaces(
-    mode: ObservationMode, first: tuple[Space[Any], Space[Any]], copies: Sequence[DescribedEnv | None]
+    mode: ObservationMode, first: tuple[Space[Any], Space[Any]], copies: Sequence[DescribedEnv | None], seats: int = 1
 ) -> tuple[Space[Any], Space[Any]]:
-    """The observation spaces of a single copy and of the batch.
+    """The observation spaces of a single row and of the batch.
 
-    `first`: observation and action space of copy 0. `copies`: None for one that its client did not describe. Raises
-    `EnvironmentFailed` for a copy that does not fit.
+    `first`: observation and action space of copy 0. `copies`: None for one that its client did not describe. `seats`: of
+    each. Raises `EnvironmentFailed` for a copy that does not fit.
     """
     observation, action = first
     single = observation if isinstance(mode, str) else mode[1]
@@ -133,9 +134,11 @@ def observation_spaces(
             )
     match mode:
         case "same":
-            return single, batch_space(single, len(copies))
+            return single, batch_space(single, len(copies) * seats)
         case "different":
-            return single, batch_differing_spaces([copy.observation_space if copy else single for copy in copies])
+            return single, batch_differing_spaces(
+                [copy.observation_space if copy else single for copy in copies for _ in range(seats)]
+            )
         case (batch, _):
             return single, batch
 

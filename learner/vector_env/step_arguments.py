@@ -87,9 +87,9 @@ def numbered(env_ids: Any, num_envs: int) -> list[int]:
 
 
 def action_arrays(
-    actions: Any, read: Callable[[Any], tuple[Any, ...]], leaves: Sequence[Leaf], num_envs: int
+    actions: Any, read: Callable[[Any], tuple[Any, ...]], leaves: Sequence[Leaf], rows: int
 ) -> tuple[list[Array], bool]:
-    """A batch of actions as arrays [num_envs, *leaf], and whether shared memory can hold them without rounding.
+    """A batch of actions as arrays [rows, *leaf], and whether shared memory can hold them without rounding.
 
     `read` takes the actions apart into one value for each of `leaves`. Raises `TypeError` for what are not numbers,
     `ValueError` for a wrong number of actions.
@@ -97,9 +97,9 @@ def action_arrays(
     arrays, fit = [], True
     for leaf, value in zip(leaves, read(actions), strict=True):
         array = np.asarray(value)
-        if array.ndim == 0 or len(array) != num_envs:
+        if array.ndim == 0 or len(array) != rows:
             raise (ValueError if array.ndim else TypeError)(
-                f"actions: expected one for each of {num_envs} copies, got shape {list(array.shape)}"
+                f"actions: expected one for each of {rows} rows, got shape {list(array.shape)}"
             )
         if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
             raise TypeError(f"actions: expected numbers of at most 64 bits, got {array.dtype}")

@@ -164,7 +164,7 @@ def make_vec(
         made.hub.while_waiting = deaths.check
         made.hub.wait_for(local_workers or settings.lane_count, join_timeout_s)
         spaces = made.single_observation_space, made.single_action_space
-        found = observation_spaces(settings.observation_mode, spaces, made.calls.make())
+        found = observation_spaces(settings.observation_mode, spaces, made.calls.make(), max(1, len(made.seats)))
         made.single_observation_space, made.observation_space = found
         return made
     except BaseException:

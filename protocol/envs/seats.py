@@ -11,7 +11,7 @@ observation in which it acted. Rewards belong to the row in which they fall; tho
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple
 
@@ -44,6 +44,11 @@ class SeatStep(NamedTuple):
     """whether the next step takes the seat's action"""
     outside: list[float]
     """rewards outside of any row: before the seat's first action, or after its end"""
+
+
+def side_by_side(copies: Iterable[SeatStep]) -> SeatStep:
+    """What a step means for the seats of several copies, as one `SeatStep`."""
+    return SeatStep(*([seat for of_copy in of_copies for seat in of_copy] for of_copies in zip(*copies, strict=True)))
 
 
 class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
@@ -125,6 +130,28 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     @abstractmethod
     def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
         """Step the environment, and write into `found` what follows. Returns whether the episode is over."""
+
+    def owner(self, name: str) -> Any:
+        """The outermost of PettingZoo's wrappers that has this attribute itself; the environment if none has."""
+        owner = self.env
+        while name not in dir(owner) and hasattr(owner, "env"):
+            owner = owner.env
+        return owner
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether PettingZoo's environment, one of its wrappers or this object has the attribute."""
+        return hasattr(self.owner(name), name) or hasattr(self, name)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """The attribute of PettingZoo's environment or of one of its wrappers; else of this object."""
+        owner = self.owner(name)
+        return getattr(owner if hasattr(owner, name) else self, name)
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """Set the attribute of PettingZoo's environment or of one of its wrappers; without `force`, only if it is there."""
+        if there := force or hasattr(self.owner(name), name):
+            setattr(self.owner(name), name, value)
+        return there
 
     def render(self) -> Any:
         """What the environment renders."""

@@ -11,10 +11,10 @@ from protocol.specs import StepSpec
 
 def wrong_rows(answer: Stepped, spec: StepSpec, axes: Sequence[str] | None) -> str:
     """What is wrong with the arrays of an answer, or with their values if `axes` are given; empty if nothing is."""
-    N = spec.lanes[answer.lane]
+    N = spec.lanes[answer.lane] * spec.seats_of_copy
     numbers = [
         Expected("reward", answer.reward, (N,), "float64"),
         Expected("terminated", answer.terminated, (N,), "bool"),
         Expected("truncated", answer.truncated, (N,), "bool"),
     ]
-    return wrong_observation(answer.obs, spec.observation, (N,), axes) or wrong_arrays(numbers, axes)
+    return wrong_observation(answer.obs, spec.leaves, (N,), axes) or wrong_arrays(numbers, axes)

@@ -60,12 +60,13 @@ class SharedMemory:
 
         Raises ValueError if it has another size.
         """
-        N, lanes = len(spec.copies), len(spec.lanes)
-        self._offset = 2 * CACHE_LINE_BYTES * lanes
-        places = [self._reserve(N, leaf.shape, leaf.dtype) for leaf in (*spec.action, *spec.observation)]
+        lanes = [spec.rows(lane) for lane in range(len(spec.lanes))]
+        N = lanes[-1].stop
+        self._offset = 2 * CACHE_LINE_BYTES * len(lanes)
+        places = [self._reserve(N, leaf.shape, leaf.dtype) for leaf in (*spec.action, *spec.leaves)]
         flags = [self._reserve(N, (), dtype) for dtype in ("float64", "bool", "bool")]
-        observed = sum(np.dtype(leaf.dtype).itemsize * int(np.prod(leaf.shape)) for leaf in spec.observation)
-        self.info_bytes = [MIN_INFO_BYTES + 2 * observed * copies for copies in spec.lanes]
+        observed = sum(np.dtype(leaf.dtype).itemsize * int(np.prod(leaf.shape)) for leaf in spec.leaves)
+        self.info_bytes: list[int] = [MIN_INFO_BYTES + 2 * observed * (rows.stop - rows.start) for rows in lanes]
         infos = self._offset
         self.fd = fd
         size = infos + sum(self.info_bytes)
@@ -74,8 +75,8 @@ class SharedMemory:
         if os.fstat(fd).st_size != size:
             raise ValueError(f"shared memory: expected {size} bytes, got {os.fstat(fd).st_size}")
         memory = mmap.mmap(self.fd, size)
-        self._words = memoryview(memory)[: 2 * CACHE_LINE_BYTES * lanes].cast("q")
-        numbers = np.frombuffer(memory, np.int64, 2 * WORDS * lanes).reshape(lanes, 2, WORDS)[:, :, 0]
+        self._words = memoryview(memory)[: 2 * CACHE_LINE_BYTES * len(lanes)].cast("q")
+        numbers = np.frombuffer(memory, np.int64, 2 * WORDS * len(lanes)).reshape(len(lanes), 2, WORDS)[:, :, 0]
         self._ordered, self._answered = numbers[:, 0], numbers[:, 1]
         self._fence = threading.Lock()
         arrays = [
@@ -83,11 +84,10 @@ class SharedMemory:
             for at, shape, dtype in (*places, *flags)
         ]
         self.actions, self.obs = tuple(arrays[: len(spec.action)]), tuple(arrays[len(spec.action) : -3])
-        """[num_envs, *leaf] each, all lanes together"""
+        """[N, *leaf] each, all lanes together"""
         self.reward, self.terminated, self.truncated = arrays[-3:]
         self.lanes = []
-        for lane, copies in enumerate(spec.lanes):
-            rows = slice(spec.first_copy(lane), spec.first_copy(lane) + copies)
+        for lane, rows in enumerate(lanes):
             actions, obs = (tuple(array[rows] for array in leaves) for leaves in (self.actions, self.obs))
             view = memoryview(memory)[infos : infos + self.info_bytes[lane]]
             reward, terminated, truncated = self.reward[rows], self.terminated[rows], self.truncated[rows]

@@ -20,6 +20,7 @@ from gymnasium.wrappers import OrderEnforcing
 from protocol.arrays import Array, Bools, Doubles
 from protocol.envs.action_masks import without_mask
 from protocol.envs.description import agents_in_words, agents_of
+from protocol.envs.seats import SeatedEnv
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
@@ -216,7 +217,7 @@ def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any
 
 def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
     """Set a public attribute that the environment, or one of its wrappers, has. Raises `CopyFailed`."""
-    owner = env
+    owner = env.owner(name) if isinstance(env, SeatedEnv) else env
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):
             for instance in owner.instances():

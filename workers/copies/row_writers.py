@@ -109,14 +109,7 @@ class ObservationWriter:
             try:
                 writer.write(array[t], values)
             except CopyFailed as error:
-                raise self._of_seat(error) from error
-
-    def _of_seat(self, error: CopyFailed) -> CopyFailed:
-        """The error of a column, which names its copy and its seat."""
-        if not self._seats or error.copy is None:
-            return error
-        copy, seat = divmod(error.copy, len(self._seats))
-        return CopyFailed(copy, error.doing, f"{self._seats[seat]}, {error.line}")
+                raise of_seat(error, self._seats) from error
 
     def write_some(self, arrays: Iterable[Array], columns: Sequence[int], leaves: Iterable[Any]) -> None:
         """Write those of these columns into arrays [N, *leaf]. `leaves`: values that have theirs at their numbers."""
@@ -125,11 +118,21 @@ class ObservationWriter:
                 try:
                     writer.write_one(array, n, values[n])
                 except CopyFailed as error:
-                    raise self._of_seat(error) from error
+                    raise of_seat(error, self._seats) from error
 
 
-def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any]) -> tuple[Sequence[Any], ...]:
-    """For each leaf of a Dict or Tuple observation, the values of N copies. Raises `CopyFailed` where a leaf is missing."""
+def of_seat(error: CopyFailed, seats: Sequence[str]) -> CopyFailed:
+    """The error of a column, which names its copy and its seat."""
+    if not seats or error.copy is None:
+        return error
+    copy, seat = divmod(error.copy, len(seats))
+    return CopyFailed(copy, error.doing, f"{seats[seat]}, {error.line}")
+
+
+def read_leaves(
+    read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any], seats: Sequence[str] = ()
+) -> tuple[Sequence[Any], ...]:
+    """For each leaf of a Dict or Tuple observation, the values of N columns. Raises `CopyFailed` where a leaf is missing."""
     try:
         return tuple(zip(*map(read, observations), strict=True))
     except (LookupError, TypeError):
@@ -137,7 +140,7 @@ def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[A
             try:
                 read(observation)
             except (LookupError, TypeError) as error:
-                raise missing_leaf(n, observation, error) from error
+                raise of_seat(missing_leaf(n, observation, error), seats) from error
         raise
 
 

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from protocol.arrays import Array, Bools
-from protocol.envs.seats import SeatStep
+from protocol.envs.seats import SeatStep, side_by_side
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
 from workers.copies.env_errors import CopyFailed
@@ -57,10 +57,8 @@ class SeatedCopies(LoopedCopies):
     def _result(self, stepped: Sequence[int]) -> StepResult:
         """What the last step of these copies returned. The others show their last step; copies never reset are left out."""
         steps: list[SeatStep] = [step for step in self._observations if step is not None]
-        observations, infos, reward, terminated, truncated, complete, acts, outside = (
-            [value for of_copy in of_copies for value in of_copy] for of_copies in zip(*steps, strict=True)
-        )
-        leaves: Leaves = read_leaves(self._read, observations) if self._nested else (observations,)
+        observations, infos, reward, terminated, truncated, complete, acts, outside = side_by_side(steps)
+        leaves: Leaves = read_leaves(self._read, observations, self._names) if self._nested else (observations,)
         if self._masks is not None:
             for n in stepped:
                 for seat, name in enumerate(self._names):

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from protocol.arrays import Array
-from protocol.envs.description import describe_env
+from protocol.envs.description import agents_of, describe_env
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
 from protocol.envs.which_copy import EnvCopy
 from protocol.errors import UsageError
@@ -29,7 +29,7 @@ from workers.copies.row_writers import ObservationWriter, read_leaves, write_num
 class ResultRows(NamedTuple):
     """Arrays into which a lane writes the results of its copies: its own, or a part of shared memory."""
 
-    obs: tuple[Array, ...]  # [N, *leaf] each
+    obs: tuple[Array, ...]  # [N, *leaf] each; with seats, all of these have N · A rows
     reward: Array  # [N] float64
     terminated: Array  # [N] bool
     truncated: Array  # [N] bool
@@ -37,8 +37,8 @@ class ResultRows(NamedTuple):
 
 def new_rows(spec: StepSpec, lane: int) -> ResultRows:
     """New arrays for this lane."""
-    N = spec.lanes[lane]
-    obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.observation)
+    N = spec.lanes[lane] * spec.seats_of_copy
+    obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.leaves)
     return ResultRows(obs, np.zeros(N), np.zeros(N, bool), np.zeros(N, bool))
 
 
@@ -51,8 +51,8 @@ class SteppedLane:
         self.rows = rows
         self.executed = 0
         """number of the newest order through shared memory that was executed"""
-        first = spec.first_copy(lane)
-        makes = [partial(_make_copy, spec, first + copy) for copy in range(spec.lanes[lane])]
+        first, self.count = spec.first_copy(lane), spec.lanes[lane]
+        makes = [partial(_make_copy, spec, first + copy) for copy in range(self.count)]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=_first_copy(spec, lane))
         env = self._loop.envs[0]
@@ -60,31 +60,42 @@ class SteppedLane:
         self._nest = make_unflatten(env.action_space)
         self._nested_observations = _is_nested(env.observation_space)
         self._read = make_flatten(env.observation_space)
-        self._observations: list[Any] = [None] * len(self._loop.envs)  # as the copies returned them last
-        self._writer = ObservationWriter(spec.observation, len(self._loop.envs))
+        self._observations: list[Any] = [None] * self.count  # as the copies returned them last
+        self._seats = spec.seats
+        self._writer = ObservationWriter(spec.leaves, len(rows.reward), spec.seats)
         self._joined = self._writer.joined(array[None] for array in rows.obs)
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> CopyInfos:
         """Start episodes in these copies, with a seed for each. `options`: a list with those of each, or those of all."""
         each = options if isinstance(options, list) else [options] * len(copies)
-        infos = self._loop.reset(copies, seeds, self._observations, pulse, each)
+        return self._write_some(copies, self._loop.reset(copies, seeds, self._observations, pulse, each))
+
+    def step(self, actions: Sequence[Array], pulse: Pulse) -> CopyInfos:
+        """Step each copy with its row of the actions, which are [N, *leaf] for each leaf."""
+        step = self._loop.steps
+        infos = self._loop.step(self._of_each(actions), self._observations, pulse)
+        try:
+            return self._write(infos)
+        except CopyFailed as error:
+            raise CopyFailed(error.copy, f"step {step}", error.line) from error
+
+    def _of_each(self, actions: Sequence[Array]) -> Iterable[Any]:
+        """The action of each copy."""
+        return map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
+
+    def _write(self, infos: CopyInfos) -> CopyInfos:
+        """Write the rows of all copies, of which the loop returned these infos. Returns the infos of rows."""
+        leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
+        self._writer.write(self._joined, 0, leaves)
+        self._write_numbers()
+        return infos
+
+    def _write_some(self, copies: Sequence[int], infos: CopyInfos) -> CopyInfos:
+        """Write the rows of these copies, which were reset. Returns the infos of rows."""
         for n in copies:  # only these: a copy may overwrite the observation that it returned before
             leaves = read_leaves(self._read, [self._observations[n]])
             self._writer.write_some(self.rows.obs, [n], [{n: value} for (value,) in leaves])
         self._write_numbers()
-        return infos
-
-    def step(self, actions: Sequence[Array], pulse: Pulse) -> CopyInfos:
-        """Step each copy with its row of the actions, which are [N, *leaf] for each leaf."""
-        each: Iterable[Any] = map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
-        step = self._loop.steps
-        infos = self._loop.step(each, self._observations, pulse)
-        try:
-            leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
-            self._writer.write(self._joined, 0, leaves)
-            self._write_numbers()
-        except CopyFailed as error:
-            raise CopyFailed(error.copy, f"step {step}", error.line) from error
         return infos
 
     def _write_numbers(self) -> None:
@@ -131,10 +142,12 @@ def _make_copy(spec: StepSpec, number: int) -> gymnasium.Env[Any, Any]:
         )
     except UsageError:
         fits = False
-    if fits:
+    if fits and (agents := agents_of(env)[0]) == spec.seats:
         return env
     with suppress(BaseException):
         env.close()
+    if fits:
+        raise UsageError(f"copy {number}: expected agents {list(spec.seats)} as copy 0 has, got {list(agents)}")
     raise UsageError(
         f"copy {number}: its observations {env.observation_space} and actions {env.action_space} are not those of the "
         "vector environment; all copies must have the same, and each machine the same version of the environment"

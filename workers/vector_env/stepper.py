@@ -27,6 +27,7 @@ from workers.activity import STEPPING, activity
 from workers.copies.env_errors import CopyFailed, environment_failed
 from workers.copies.env_loop import CopyInfos, Pulse
 from workers.copies.open_lanes import OpenLanes
+from workers.vector_env.seated_lane import SeatedLane
 from workers.vector_env.stepped_lane import ResultRows, SteppedLane, new_rows
 
 
@@ -135,7 +136,7 @@ class Stepper:
         began = perf_counter()
         # A copy of the actions, because an environment may keep its action, or change it.
         infos = lane.step([array.copy() for array in actions], pulse)
-        self.steps += len(lane.rows.reward)
+        self.steps += lane.count
         self.stages["step"] += perf_counter() - began
         return infos
 
@@ -143,8 +144,8 @@ class Stepper:
         """The lane in this incarnation. It is made if it does not exist."""
         if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
-        began = perf_counter()
-        lane = self.lanes.open(number, lambda: SteppedLane(self._spec, number, incarnation, self._rows(number), pulse))
+        began, kind = perf_counter(), SeatedLane if self._spec.seats else SteppedLane
+        lane = self.lanes.open(number, lambda: kind(self._spec, number, incarnation, self._rows(number), pulse))
         if self._memory is not None:
             lane.executed = self._memory.ordered(number)
         self.stages["open"] += perf_counter() - began

@@ -24,7 +24,7 @@ from protocol.wire.plain_values import pack
 
 def test_lanes_have_consecutive_rows() -> None:
     layout = BatchLayout((3, 1, 2))
-    assert layout.num_envs == 6
+    assert layout.count == 6
     assert [layout.lane_of(copy) for copy in range(6)] == [0, 0, 0, 1, 2, 2]
     assert [list(layout.copies(lane)) for lane in layout.lanes] == [[0, 1, 2], [3], [4, 5]]
     assert layout.by_lane([0, 2, 5]) == {0: [0, 2], 2: [1]}

@@ -216,7 +216,7 @@ def test_a_reset_mask_leaves_the_other_copies_unchanged() -> None:
                 env.reset(options={"reset_mask": wrong})
         assert env.step(np.zeros(3, np.int64))[1].tolist() == [1.0] * 3
         for actions, error in (np.zeros(2, np.int64), ValueError), (np.zeros(4, np.int64), ValueError), (0, TypeError):
-            with pytest.raises(error, match="actions: expected one for each of 3 copies"):
+            with pytest.raises(error, match="actions: expected one for each of 3 rows"):
                 env.step(actions)
 
 

@@ -687,7 +687,7 @@ def test_wrong_arguments_are_refused_in_one_line_and_nothing_is_sent() -> None:
         for not_numbers in (["a"], [0.5], 3, [[0, 1]]):
             with pytest.raises(TypeError, match="env_ids: expected a list of whole numbers"):
                 env.send(zeros(range(2)), not_numbers)  # type: ignore[arg-type]
-        with pytest.raises(ValueError, match="actions: expected one for each of 2 copies"):
+        with pytest.raises(ValueError, match="actions: expected one for each of 2 rows"):
             env.send(zeros(range(4)), [0, 1])
         with pytest.raises(ValueError, match="env_ids: expected different numbers"):
             env.reset_async(env_ids=[2, 2])

@@ -86,7 +86,7 @@ class Caller:
         self._take = self.hub.take
         self.hub.take = self._taken  # type: ignore[method-assign]
         layout, space = BatchLayout(coordinator.spec.lanes), gymnasium.spaces.Box(-1, 1000, (1,), np.float32)
-        batch, copies = BatchArrays(coordinator.spec, layout, space, None), layout.num_envs
+        batch, copies = BatchArrays(coordinator.spec, layout, space, None), layout.count
         seeds: list[int | None] = [None] * copies
         self.parts = Parts(self.hub, layout, batch, LostLanes(), "NextStep", seeds, np.zeros(copies, bool))
         self.send_recv = SendRecv(self.parts, self.timeout_s)

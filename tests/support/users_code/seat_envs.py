@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
 
 AGENTS = ("a", "b", "c")
 
@@ -35,28 +36,34 @@ class Lived:
 class _Told:
     """The parts that both forms share."""
 
-    possible_agents = AGENTS
+    possible_agents: tuple[str, ...] = AGENTS
     metadata: dict[str, Any] = {}
     render_mode = None
+    level = 1
+    present = 0.9
+    """How often an agent is there from the start."""
 
     def __init__(self, most_steps: int = 12) -> None:
         self.most_steps = most_steps
+        self._spaces: dict[str, tuple[spaces.Space[Any], spaces.Space[Any]]] = {
+            agent: (spaces.Box(0, np.inf, (1,), np.float32), spaces.Discrete(3)) for agent in AGENTS
+        }
         self.told: list[dict[str, Lived]] = []
         self._shown: dict[str, np.ndarray] = {}
         self._generator = np.random.default_rng(0)
         self._observed = 0
         self._buffers = {agent: np.zeros(1, np.float32) for agent in AGENTS}
 
-    def observation_space(self, agent: str) -> spaces.Box:
-        return spaces.Box(0, np.inf, (1,), np.float32)
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return self._spaces[agent][0]
 
-    def action_space(self, agent: str) -> spaces.Discrete:
-        return spaces.Discrete(3)
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return self._spaces[agent][1]
 
     def _begin(self, seed: int | None) -> None:
         if seed is not None:
             self._generator = np.random.default_rng(seed)
-        self.agents = [agent for agent in AGENTS if self._generator.random() < 0.9] or [AGENTS[0]]
+        self.agents = [agent for agent in AGENTS if self._generator.random() < self.present] or [AGENTS[0]]
         self.steps = 0
         self._lived = {agent: Lived() for agent in AGENTS}
         self.told.append(self._lived)
@@ -107,18 +114,19 @@ class _Told:
         pass
 
 
-class RandomGame(_Told):
-    """One agent acts at a time: PettingZoo's AEC form."""
+class RandomGame(_Told, AECEnv[str, Any, Any]):  # type: ignore[misc]
+    """One agent acts at a time: PettingZoo's AEC form. Its first rewards may come with the reset."""
 
-    def agent_iter(self) -> None:
-        """Present in this form alone."""
+    rewards_at_reset = 0.2
 
     def reset(self, seed: int | None = None, options: Any = None) -> None:
         self._begin(seed)
         self._buffers = dict.fromkeys(AGENTS, np.zeros(1, np.float32))  # one for all
-        self.rewards = self._rewards(self.agents) if self._generator.random() < 0.2 else dict.fromkeys(self.agents, 0.0)
+        early = self._generator.random() < self.rewards_at_reset
+        self.rewards = self._rewards(self.agents) if early else dict.fromkeys(self.agents, 0.0)
         self._cumulative = dict(self.rewards)
         self.terminations, self.truncations = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, False)
+        self.infos: dict[str, dict[str, Any]] = {agent: {"steps": 0} for agent in self.agents}
         self._choose()
 
     def _choose(self) -> None:
@@ -129,27 +137,27 @@ class RandomGame(_Told):
         self._shown[agent] = self._observation()
         self._outcome(agent, self._shown[agent], self.terminations[agent], self.truncations[agent])
 
-    def last(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         agent = self.agent_selection
-        return (
-            self._returned(agent),
-            self._cumulative[agent],
-            self.terminations[agent],
-            self.truncations[agent],
-            {"steps": self.steps},
-        )
+        ended = self.terminations[agent], self.truncations[agent]
+        return self._returned(agent) if observe else None, self._cumulative[agent], *ended, self.infos[agent]
 
     def step(self, action: Any) -> None:
         agent = self.agent_selection
         if self.terminations[agent] or self.truncations[agent]:
             assert action is None
             self.agents.remove(agent)
+            for of_agents in (self.terminations, self.truncations, self.infos):
+                del of_agents[agent]
+            self.rewards = dict.fromkeys(self.agents, 0.0)
         else:
             self._act(agent, self._shown[agent], action)
             self._cumulative[agent] = 0.0
-            for who, reward in self._rewards(self.agents).items():
+            self.rewards = self._rewards(self.agents)
+            for who, reward in self.rewards.items():
                 self._cumulative[who] += reward
             self.steps += 1
+            self.infos = {who: {"steps": self.steps} for who in self.agents}
             over = self.steps >= self.most_steps or self._generator.random() < 0.05
             for who in self.agents:
                 if over or self._generator.random() < 0.06:
@@ -162,8 +170,10 @@ class RandomGame(_Told):
             self._choose()
 
 
-class RandomCrowd(_Told):
+class RandomCrowd(_Told, ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     """All agents that are there act at the same time: PettingZoo's parallel form. Some come later."""
+
+    leaves = 0.08
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         self._begin(seed)
@@ -179,7 +189,9 @@ class RandomCrowd(_Told):
         rewards = self._rewards([*self.agents, *outside])
         self.steps += 1
         over = self.steps >= self.most_steps or self._generator.random() < 0.05
-        ends = {agent: self._end() if over or self._generator.random() < 0.08 else (False, False) for agent in self.agents}
+        ends = {
+            agent: self._end() if over or self._generator.random() < self.leaves else (False, False) for agent in self.agents
+        }
         shown = {}
         for agent, (terminated, truncated) in ends.items():
             shown[agent] = self._shown[agent] = self._observation()
@@ -188,7 +200,8 @@ class RandomCrowd(_Told):
         late = [agent for agent in AGENTS if agent not in self._was_here]
         if self.agents and late and self._generator.random() < 0.3:
             self._was_here.add(late[0])
-            self.agents.append(late[0])
+            self.agents = [agent for agent in AGENTS if agent in (*self.agents, late[0])]
+            ends[late[0]] = False, False
             shown[late[0]] = self._shown[late[0]] = self._observation()
         ended = [{agent: both[k] for agent, both in ends.items()} for k in (0, 1)]
         return (
@@ -290,3 +303,9 @@ def values_of_the_chain(gamma: float) -> list[float]:
     for rewards in CHAIN_REWARD.values():
         found += [sum(gamma**j * reward for j, reward in enumerate(rewards[k:])) for k in range(len(rewards))]
     return found
+
+
+class RandomTeam(RandomCrowd):
+    """All agents act at every step of an episode."""
+
+    present, leaves = 1.0, 0.0

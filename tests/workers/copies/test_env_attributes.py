@@ -7,13 +7,17 @@ from typing import Any
 import gymnasium
 import pytest
 from gymnasium.vector import SyncVectorEnv
+from pettingzoo.utils.wrappers import BaseWrapper
 
+from protocol.envs.seats import seated
 from protocol.errors import EnvironmentFailed
 from protocol.wire.plain_values import pack
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, run_of
 from tests.support.users_code.fact_envs import Facts
+from tests.support.users_code.seat_envs import AGENTS, RandomGame
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.copies.env_errors import CopyFailed
+from workers.copies.seated_copies import SeatedCopies
 
 FACTS = "tests.support.users_code.fact_envs:Facts-v0"
 
@@ -60,6 +64,16 @@ def test_an_attribute_that_is_not_there_is_refused(vector: bool, name: str, what
     with pytest.raises(CopyFailed) as caught:
         copies.assign(name, pack(1), no_pulse)
     assert caught.value.line == f"expected an attribute of the environment that is called {name}, got {what}"
+
+
+def test_with_seats_pettingzoos_environment_gets_it_or_its_wrapper_if_that_has_it() -> None:
+    env = BaseWrapper(RandomGame())
+    copies = SeatedCopies([lambda: seated(env, "it")], no_pulse, AGENTS)
+    copies.assign("level", pack(7), no_pulse)
+    assert env.env.level == 7
+    assert "level" not in vars(env)
+    with pytest.raises(CopyFailed, match="levle, got none"):
+        copies.assign("levle", pack(7), no_pulse)
 
 
 def test_what_a_setter_raises_is_the_environment_s() -> None:

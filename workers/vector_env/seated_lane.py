@@ -1,0 +1,61 @@
+"""The env copies of one lane of a vector environment with seats: N · A rows, those of a copy side by side.
+
+Rule: rows are, bit for bit, those of a loop over the same copies (`protocol.envs.seats`). With SameStep, the step in which a
+copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the old ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from protocol.arrays import Array
+from protocol.envs.seats import SeatStep, side_by_side
+from workers.copies.env_loop import CopyInfos
+from workers.copies.row_writers import read_leaves, write_numbers
+from workers.vector_env.stepped_lane import SteppedLane
+
+
+class SeatedLane(SteppedLane):
+    """N env copies with A seats each."""
+
+    def _of_each(self, actions: Sequence[Array]) -> Iterable[Any]:
+        of_copies = [array.reshape(-1, len(self._seats), *array.shape[1:]) for array in actions]
+        if not self._nested_actions:
+            return of_copies[0]
+        return [list(map(self._nest, zip(*of_seats, strict=True))) for of_seats in zip(*of_copies, strict=True)]
+
+    def _write(self, infos: CopyInfos) -> CopyInfos:
+        found, leaves = self._found(range(self.count), infos)
+        self._writer.write(self._joined, 0, leaves)
+        rows = self.rows
+        numbers = found.reward, found.terminated, found.truncated
+        write_numbers((rows.reward, rows.terminated, rows.truncated), slice(None), numbers)
+        return [(row, dict(info)) for row, info in enumerate(found.infos) if info]
+
+    def _write_some(self, copies: Sequence[int], infos: CopyInfos) -> CopyInfos:
+        found, leaves = self._found(copies, infos)
+        numbers = [n * len(self._seats) + seat for n in copies for seat in range(len(self._seats))]
+        self._writer.write_some(self.rows.obs, numbers, [dict(zip(numbers, values, strict=True)) for values in leaves])
+        for array in (self.rows.reward, self.rows.terminated, self.rows.truncated):
+            array[numbers] = 0
+        return [(row, dict(info)) for row, info in zip(numbers, found.infos, strict=True) if info]
+
+    def _found(self, copies: Iterable[int], infos: CopyInfos) -> tuple[SeatStep, Sequence[Any]]:
+        """The newest step of these copies, and what to write of it as their observations."""
+        last = {n: info["final_obs"] for n, info in infos}  # of the copies that SameStep has reset
+        steps: list[SeatStep] = [self._observations[n] for n in copies]
+        found = side_by_side(_reset(last[n], step) if n in last else step for n, step in zip(copies, steps, strict=True))
+        seen = found.observations
+        leaves = read_leaves(self._read, seen, self._seats) if self._nested_observations else (seen,)
+        return found, (*leaves, found.acts, found.complete, found.outside)
+
+
+def _reset(last: SeatStep, first: SeatStep) -> SeatStep:
+    """The last step of an episode in which its copy was reset, as SameStep has it."""
+    infos: list[Mapping[str, Any]] = [
+        {"final_obs": seen, "final_info": info, **new}
+        for seen, info, new in zip(last.observations, last.infos, first.infos, strict=True)
+    ]
+    outside = [old + new for old, new in zip(last.outside, first.outside, strict=True)]
+    return last._replace(observations=first.observations, infos=infos, acts=first.acts, outside=outside)
