@@ -30,7 +30,7 @@ class OwnPolicy:
     ...     def load(self, arrays):                     # for each version of the weights
     ...         self.arrays = arrays                    # {"w": float32 [4, 2]}
     ...
-    ...     def act(self, obs, state, rng):             # obs [N, 4] of the N copies of a lane
+    ...     def act(self, obs, state, rng):             # obs [N, 4] of the N columns of a lane
     ...         logits = obs @ self.arrays["w"]
     ...         action = (logits + rng.gumbel(size=logits.shape)).argmax(-1)
     ...         return action, state, {"logits": logits}
@@ -41,10 +41,11 @@ class OwnPolicy:
     (8, 2, 2)
 
     `factory(**kwargs)` is called in each worker and returns such an object. `act` is called once for each step of a lane,
-    with exactly its copies. What an episode remembers goes into `state` [N, state_size] float32, which is zeros when an
-    episode begins; if the object keeps nothing else between its calls, results do not depend on the number of workers. An
-    action is whole numbers that count from 0, or float32, which is clipped to the space after it was stored. If the
-    environment has action masks, `act` also gets `mask=` [N, choices] bool, and must choose what it allows.
+    with exactly its copies; if they have agents, with all of these, also those that wait or have left. What they remember
+    goes into `state` [N, state_size] float32, which is zeros when an episode begins; if the object keeps nothing else
+    between its calls, results do not depend on the number of workers. An action is whole numbers that count from 0, or
+    float32, which is clipped to the space after it was stored. If the environment has action masks, `act` also gets `mask=`
+    [N, choices] bool, and must choose what it allows.
     `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_learner.md has more.
     """
 
@@ -57,7 +58,7 @@ class OwnPolicy:
     """dtype of each further array that `act` returns, by name, as numpy.dtype takes it: `"float32"` for a number of each
     action, `("float32", (2,))` for an array of shape [2]. `log_prob` must be float32; it is then `batch.log_prob`"""
     state_size: int = 0
-    """S, how many numbers the state of one env copy has"""
+    """S, how many numbers the state of one column has"""
     kwargs: Mapping[str, Scalar] = field(default_factory=dict)
     """keyword arguments of the factory"""
 

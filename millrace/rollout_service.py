@@ -60,6 +60,10 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
     Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row that is not
     valid only resets its env copy: leave it out of every loss, return and count.
 
+    With several agents, each has a column: N is the number of copies times `len(service.seats)`, those of a copy side by
+    side. A row that is not valid may then also be of an agent that waits for others, or has left: what is carried along a
+    column, a return or a recurrent state, passes through it unchanged.
+
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
     ...     _ = service.publish(service.policy.initial())
@@ -69,9 +73,10 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
     Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
     [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
-    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` of a lane,
-    `mask` [T+1, N, choices] bool of the actions that were allowed (None without action masks), and `episodes`, which have
-    `reward` (the return), `length` and `seconds`.
+    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` (columns of a
+    lane), `mask` [T+1, N, choices] bool of the actions that were allowed (None without action masks), and `episodes`, which
+    have `reward` (the return, of all agents together), `length`, `seconds` and `facts`. With several agents, `resets`
+    [T+1, env copies] bool says which steps only reset a copy; the last row is of the next batch's first step.
     """
 
     obs: Any
@@ -85,7 +90,7 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
     def __repr__(self) -> str:
         T, N = self.reward.shape
-        return f"RolloutBatch({T} steps of {N} env copies: {self.env_steps} env steps, {len(self.episodes)} episodes ended)"
+        return f"RolloutBatch({T} steps of {N} columns: {self.env_steps} env steps, {len(self.episodes)} episodes ended)"
 
 
 class RolloutService:
@@ -95,7 +100,7 @@ class RolloutService:
     long computation loses none of them.
 
     `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. Iterating, or
-    `gather`, gives a `RolloutBatch` for each update: T = `rollout_steps` rows of N = `envs` env copies. It waits until one
+    `gather`, gives a `RolloutBatch` for each update: T = `rollout_steps` rows of `envs` env copies. It waits until one
     rollout of each lane is there. The batch was collected under the weights that were the newest when `gather` was called
     `max_lag` batches before: with 0, under those that you published last.
 
@@ -128,7 +133,7 @@ class RolloutService:
 
         Args:
             env: an id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
-                environment; also one that only your script or notebook has.
+                environment; also one that only your script or notebook has. It may be of PettingZoo's, with several agents.
             wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
                 "gymnasium.wrappers:FlattenObservation".
             policy: `MLP`, `CNN`, `Recurrent` or your `OwnPolicy`; by default `MLP(64, 64)`.
@@ -191,10 +196,12 @@ class RolloutService:
             raise
         self.policy: PolicyParameters = PolicyParameters(self.run.policy)
         """Names, shapes and offsets of the parameters in the flat vector, and initial values."""
+        self.seats: tuple[str, ...] = self.run.seats
+        """The agents of each env copy, in the order of their columns; none if the environment is gymnasium's."""
         self.observation_space: gymnasium.Space[Any] = described.observation_space
-        """That of a single env copy."""
+        """That of a single env copy, or of a single agent."""
         self.action_space: gymnasium.Space[Any] = described.action_space
-        """That of a single env copy."""
+        """That of a single env copy, or of a single agent."""
         self._thread = threading.Thread(target=self._answer_workers, name="millrace-service", daemon=True)
         self._thread.start()
 

@@ -46,7 +46,7 @@ def make_vec_env(
     """Make a vector environment, as `stable_baselines3.common.env_util.make_vec_env` does.
 
     Args:
-        env_id: as in `millrace.make_vec`.
+        env_id: as in `millrace.make_vec`. Of an environment with agents, which must all act at every step, each is a row.
         n_envs: number of env copies; by default 1, or the length of the list.
         seed: of the first reset: copy n gets `seed + n`; and of samples of `action_space`.
         monitor: record the return and length of each episode, for `rollout/ep_rew_mean`: those of the environment without

@@ -19,7 +19,13 @@ from millrace.cli.status import as_table
 from millrace.policies import PolicyParameters
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import CheckpointError, RunError, UsageError
+from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.networks import ActorCriticNetwork
+from protocol.policy.policy import make_policy
+from protocol.rollout import stack_rollouts
+from tests.support.in_process.collectors import collect, random_weights
+from tests.support.users_code.seat_envs import AGENTS
+from workers.collect.collector import Collector
 
 SMALL: dict[str, Any] = {"workers": 1, "envs": 4, "lanes": 2, "transport": "inproc"}
 
@@ -302,3 +308,80 @@ def test_the_layout_is_that_of_the_trained_network() -> None:
     weight = initial["actor.1.weight"]
     assert np.allclose(weight @ weight.T, 2 * np.eye(8), atol=1e-5)
     assert not initial["actor.0.bias"].any()
+
+
+# ------------------------------------------------------------------------------------------------------- several agents
+
+
+SEATED = "tests.support.users_code.seat_envs"
+BOTH_FORMS = pytest.mark.parametrize("env", [f"{SEATED}:RandomGame", f"{SEATED}:RandomCrowd"])
+
+
+class Counts:
+    """A policy of one's own that counts the moves of each agent in its state."""
+
+    def load(self, arrays: dict[str, Any]) -> None:
+        self.w = arrays["w"]
+
+    def act(self, obs: Any, state: Any, rng: np.random.Generator) -> tuple[Any, Any, dict[str, Any]]:
+        action = ((obs[:, 0] * self.w[0]).astype(np.int64) + rng.integers(0, 3, len(obs))) % 3
+        return action, state + 1, {"log_prob": np.full(len(obs), -1, np.float32), "moves": state[:, 0].copy()}
+
+
+OWN = millrace.OwnPolicy(f"{__name__}:Counts", {"w": (1,)}, extras={"log_prob": "float32", "moves": "float32"}, state_size=1)
+
+
+@BOTH_FORMS
+@pytest.mark.parametrize("policy", [millrace.Recurrent(8, core="gru", core_size=4), OWN], ids=["built-in", "own"])
+def test_agents_have_columns_whose_rows_are_those_of_the_collector(env: str, policy: Any) -> None:
+    with service(env, policy) as made:
+        weights = random_weights(made.run.policy)
+        made.publish(weights[0])
+        acting = CalledPolicy(made.run.policy, made.run.extras) if policy is OWN else make_policy(made.run.policy)
+        acting.load(*weights)
+        collector, N = Collector(made.run, acting), 4 * len(made.seats)
+        for sequence in range(3):
+            batch = made.gather()
+            wanted = stack_rollouts(collect(collector, made.run, sequence, lanes=(0, 1)))
+            for name in ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state", "lane", "resets"):
+                assert np.array_equal(getattr(batch, name), getattr(wanted, name)), name
+            assert np.array_equal(batch.obs, wanted.obs[0])
+            assert all(map(np.array_equal, batch.extras.values(), wanted.extras))
+            assert (batch.obs.shape, batch.version.tolist(), batch.copies) == ((9, N, 1), [0] * N, N // 2)
+            assert batch.resets is not None
+            assert batch.resets.shape == (9, 4)
+            assert batch.env_steps == wanted.env_steps == np.count_nonzero(~batch.resets[:-1])
+            if policy is OWN:
+                check_moves(batch)
+        assert made.env_steps == collector.steps
+        assert made.seats == AGENTS
+        assert made.evaluate(3) == made.evaluate(3)
+
+
+def check_moves(batch: Any) -> None:
+    """Of the valid rows of an agent, each has one move more than the one before, or is the first of an episode."""
+    for column in range(batch.valid.shape[1]):
+        rows = np.flatnonzero(batch.valid[:, column])
+        ended = (batch.terminated | batch.truncated)[rows, column]
+        moves = batch.extras["moves"][rows, column]
+        assert (moves[1:] == np.where(ended[:-1], 0, moves[:-1] + 1)).all()
+        if len(rows) and not batch.resets[: rows[0] + 1, column // len(AGENTS)].any():
+            assert moves[0] == batch.state[column, 0]
+
+
+@BOTH_FORMS
+def test_with_agents_a_saved_service_goes_on_and_normalizes_valid_rows(tmp_path: Path, env: str) -> None:
+    file, policy = tmp_path / "state.npz", millrace.MLP(8, normalize_observations=True)
+    with service(env, policy, rollout_steps=64) as made:
+        made.publish(made.policy.initial())
+        batch = made.gather()
+        made.normalizer.update(batch)
+        made.normalizer.scaled_rewards(batch, 0.9)
+        seen = batch.obs[:-1][batch.valid]
+        assert made.normalizer.mean == pytest.approx(seen.mean(0), rel=1e-5)
+        made.save(file)
+    with service(env, policy, rollout_steps=64, restore=file) as made:
+        assert made.env_steps == batch.env_steps
+        assert made.normalizer.mean == pytest.approx(seen.mean(0), rel=1e-5)
+        made.publish(made.policy.initial())
+        assert made.gather().fresh.all()

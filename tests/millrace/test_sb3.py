@@ -12,8 +12,10 @@ import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 
 import millrace
+from protocol.envs.seats import seated
 from protocol.errors import UsageError
 from tests.support.numbers.bit_equality import bit_equal
+from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame, RandomTeam
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -23,6 +25,8 @@ from stable_baselines3.common.monitor import Monitor  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
 from millrace.sb3 import Sb3VecEnv, make_vec_env  # noqa: E402
+
+A = len(AGENTS)
 
 
 def dummy(env: str, copies: int, **kwargs: Any) -> Any:
@@ -271,6 +275,47 @@ def test_samples_of_the_action_space_are_those_of_the_seed() -> None:
     theirs = env_util.make_vec_env("CartPole-v1", 2, seed=4)
     assert [ours.action_space.sample() for _ in range(20)] == [theirs.action_space.sample() for _ in range(20)]
     ours.close(), theirs.close()
+
+
+def test_each_agent_is_a_row_where_all_act_at_every_step() -> None:
+    env, loops, draw = make_vec_env(RandomTeam, 2, monitor=False, transport="inproc"), [], np.random.default_rng(1)
+    env.seed(5)
+    seen: Any = env.reset()
+    for n, seed in enumerate((5, 5 + A)):
+        loops.append(seated(RandomTeam(), "it"))
+        first, _ = loops[-1].reset(seed=seed)
+        assert bit_equal([*seen[n * A : n * A + A]], first.observations)
+    for _ in range(40):
+        action = draw.integers(0, 3, 2 * A)
+        seen, reward, done, infos = env.step(action)
+        for n, loop in enumerate(loops):
+            rows, (last, _, over, _, _) = slice(n * A, n * A + A), loop.step(action.reshape(2, A)[n])
+            cut = (np.array(last.truncated) & ~np.array(last.terminated)).tolist()
+            told: list[dict[str, Any]] = [{"step": loop.env.steps, "TimeLimit.truncated": each} for each in cut]
+            if over:
+                told = [info | {"terminal_observation": last.observations[k]} for k, info in enumerate(told)]
+            assert bit_equal([*seen[rows]], (loop.reset()[0] if over else last).observations)
+            assert bit_equal(reward[rows], np.array(last.reward, np.float32))
+            assert done[rows].tolist() == [over] * A
+            assert [dict(sorted(info.items())) for info in infos[rows]] == [dict(sorted(info.items())) for info in told]
+    env.set_attr("level", 4, indices=[1, 2])
+    assert env.get_attr("level") == [4] * A + [1] * A
+    env.close()
+
+
+@pytest.mark.parametrize("make", [RandomCrowd, RandomGame])
+def test_agents_that_do_not_act_at_every_step_are_refused(make: Any) -> None:
+    env = make_vec_env(make, 2, seed=1, transport="inproc")
+    with pytest.raises(UsageError, match=r"expected all agents to act at every step, but [abc] does not; for agents that"):
+        env.reset()
+        for _ in range(40):
+            env.step(np.zeros(2 * A, np.int64))
+    env.close()
+
+
+def test_a_wrapper_of_gymnasiums_is_refused_with_agents() -> None:
+    with pytest.raises(UsageError, match=r"wrapper_class: expected none with agents; give PettingZoo's as wrappers="):
+        make_vec_env(RandomTeam, 2, wrapper_class=TenTimes, transport="inproc")
 
 
 def test_another_autoreset_mode_is_refused() -> None:
