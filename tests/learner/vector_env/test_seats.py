@@ -22,7 +22,7 @@ from protocol.errors import EnvironmentFailed, UsageError
 from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import info_of
 from tests.support.numbers.bit_equality import bit_equal
-from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame
+from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame, RandomTeam
 
 FORMS: dict[str, Any] = {"turns": RandomGame, "together": RandomCrowd}
 MODES = tuple(AutoresetMode)
@@ -106,10 +106,10 @@ def test_the_rows_of_all_steps_are_those_of_a_loop(form: str, mode: AutoresetMod
             if over and mode is AutoresetMode.DISABLED:
                 with pytest.raises(UsageError, match=r"copies .* have ended"):
                     env.step(actions)
-                observation, infos = told(env.reset(options={"reset_mask": np.isin(np.arange(N), over)}))
-                for n in over:
-                    rows = slice(n * A, (n + 1) * A)
-                    assert bit_equal((observation[rows], infos[rows]), first_rows([loops[n].reset()]))
+                env.reset_async(env_ids=over)
+                *arrays, infos = env.recv(len(over))
+                assert infos.pop("env_id").tolist() == over
+                assert bit_equal(told((*arrays, infos)), rows_of([loops[n].reset() for n in over]))
         assert mode is AutoresetMode.SAME_STEP or ended > 10
 
 
@@ -216,6 +216,41 @@ def test_nested_observations_and_actions() -> None:
             assert list(did) == [agent for seat, agent in enumerate(AGENTS) if acted[n, seat]]
             for agent, left in did.items():
                 assert bit_equal(left, actions["left"][n * A + AGENTS.index(agent)])
+
+
+class Long(RandomTeam):
+    """The first observation of agent b is as its space says, the others are longer."""
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        seen, *rest = super().step(actions)
+        return seen | {"b": np.zeros(2, np.float32)}, *rest
+
+
+class Empty(Long):
+    """Its observations are dicts, and those of agent b lack their leaf."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for agent, (seen, action) in self._spaces.items():
+            self._spaces[agent] = spaces.Dict({"x": seen}), action
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        seen, infos = super().reset(seed, options)
+        return {agent: {"x": value} for agent, value in seen.items()}, infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        seen, *rest = super().step(actions)
+        return {agent: {} if agent == "b" else {"x": value} for agent, value in seen.items()}, *rest
+
+
+@pytest.mark.parametrize(
+    ("make", "what"), [(Long, r"observation: expected float32\[1\]"), (Empty, "observation: expected the str")]
+)
+def test_a_wrong_observation_is_named_by_its_copy_and_agent(make: Any, what: str) -> None:
+    with millrace.make_vec(make, 2, transport="inproc", lanes=1) as env:
+        env.reset()
+        with pytest.raises(EnvironmentFailed, match=f"lane 0, copy 0, step 0: b, {what}"):
+            env.step(np.zeros(2 * A, np.int64))
 
 
 class Wide(RandomGame):
