@@ -176,27 +176,26 @@ class ParallelSeats(SeatedEnv):
     def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
         given = {agent: actions[self.seat_of[agent]] for agent in self._present}
         observations, rewards, terminated, truncated, infos = self.env.step(given)
-        for agent in self._present:
+        seen, told, reward, terminates, truncates, complete, acts, outside = found
+        here = set(self.env.agents)
+        for agent in given:
             seat = self.seat_of[agent]
-            found.complete[seat], found.reward[seat] = True, float(rewards[agent])
-            found.terminated[seat], found.truncated[seat] = bool(terminated[agent]), bool(truncated[agent])
+            complete[seat], reward[seat], told[seat] = True, float(rewards[agent]), infos.get(agent, _NO_INFO)
+            terminates[seat], truncates[seat] = bool(terminated[agent]), bool(truncated[agent])
             # The last observation of a task that has ended may be missing: nobody learns from it.
-            if agent in observations or not terminated[agent]:
-                found.observations[seat] = self._seen(seat, observations[agent])
-            found.infos[seat] = infos.get(agent, _NO_INFO)
-        for agent, reward in rewards.items():
-            if agent not in given:
-                found.outside[self.seat_of[agent]] = float(reward)
-        ended = {agent for agent in self._present if terminated[agent] or truncated[agent]}
-        here = set(self.env.agents) - ended
-        if lost := [agent for agent in self._present if agent not in here and agent not in ended]:
-            raise RuntimeError(f"agent {lost[0]} left, expected it to be terminated or truncated in its last step")
-        self._present = [agent for agent in self.agents if agent in here]
-        for agent in self._present:
-            if agent in given:
-                found.acts[self.seat_of[agent]] = True
+            if agent in observations or not terminates[seat]:
+                seen[seat] = self._seen(seat, observations[agent])
+            if terminates[seat] or truncates[seat]:
+                here.discard(agent)
+            elif agent in here:
+                acts[seat] = True
             else:
-                self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+                raise RuntimeError(f"agent {agent} left, expected it to be terminated or truncated in its last step")
+        for agent in rewards.keys() - given.keys():
+            outside[self.seat_of[agent]] = float(rewards[agent])
+        for agent in here - given.keys():
+            self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+        self._present = [agent for agent in self.agents if agent in here]
         return not self._present
 
     def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Mapping[str, Any]) -> None:

@@ -291,7 +291,7 @@ def test_each_agent_is_a_row_where_all_act_at_every_step() -> None:
         for n, loop in enumerate(loops):
             rows, (last, _, over, _, _) = slice(n * A, n * A + A), loop.step(action.reshape(2, A)[n])
             cut = (np.array(last.truncated) & ~np.array(last.terminated)).tolist()
-            told: list[dict[str, Any]] = [{"step": loop.env.steps, "TimeLimit.truncated": each} for each in cut]
+            told: list[dict[str, Any]] = [{"steps": loop.env.steps, "TimeLimit.truncated": each} for each in cut]
             if over:
                 told = [info | {"terminal_observation": last.observations[k]} for k, info in enumerate(told)]
             assert bit_equal([*seen[rows]], (loop.reset()[0] if over else last).observations)

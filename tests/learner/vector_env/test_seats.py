@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,7 @@ class Loop:
         last, _, self.over, _, _ = self.env.step(actions)
         if not self.over or self.mode is not AutoresetMode.SAME_STEP:
             return last
+        last = deepcopy(last)  # the reset may overwrite it
         first, ends = self.reset(), zip(last.observations, last.infos, strict=True)
         infos: list[Any] = [{"final_obs": seen, "final_info": info} for seen, info in ends]
         outside = [a + b for a, b in zip(last.outside, first.outside, strict=True)]
