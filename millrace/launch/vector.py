@@ -77,7 +77,8 @@ def make_vec(
         env: anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
             env copy. What only your script or notebook has (a callable, an id that it registers) is code: it is sent over
             TCP only to workers that have a key.
-        num_envs: number of env copies; by default 1, or the length of the list.
+        num_envs: number of env copies; by default 1, or the length of the list. With several agents, as PettingZoo's
+            environments have, each of a copy has a row of its own, and the attribute `num_envs` counts rows; see `step`.
         workers: number of worker processes to start on this machine; by default one for each core, at most `num_envs`.
             They end with the vector environment.
         lanes: number of groups of env copies. A group lives in one worker. By default there is one for each worker.

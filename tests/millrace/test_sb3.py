@@ -293,7 +293,7 @@ def test_each_agent_is_a_row_where_all_act_at_every_step() -> None:
             cut = (np.array(last.truncated) & ~np.array(last.terminated)).tolist()
             told: list[dict[str, Any]] = [{"steps": loop.env.steps, "TimeLimit.truncated": each} for each in cut]
             if over:
-                told = [info | {"terminal_observation": last.observations[k]} for k, info in enumerate(told)]
+                told = [info | {"terminal_observation": last.observations[k].copy()} for k, info in enumerate(told)]
             assert bit_equal([*seen[rows]], (loop.reset()[0] if over else last).observations)
             assert bit_equal(reward[rows], np.array(last.reward, np.float32))
             assert done[rows].tolist() == [over] * A

@@ -53,8 +53,9 @@ class Loop:
         if not self.over or self.mode is not AutoresetMode.SAME_STEP:
             return last
         last = deepcopy(last)  # the reset may overwrite it
-        first, ends = self.reset(), zip(last.observations, last.infos, strict=True)
-        infos: list[Any] = [{"final_obs": seen, "final_info": info} for seen, info in ends]
+        first = self.reset()
+        ends = zip(last.observations, last.infos, first.infos, strict=True)
+        infos: list[Any] = [{"final_obs": seen, "final_info": info, **new} for seen, info, new in ends]
         outside = [a + b for a, b in zip(last.outside, first.outside, strict=True)]
         return last._replace(observations=first.observations, infos=infos, acts=first.acts, outside=outside)
 
