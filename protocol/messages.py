@@ -328,7 +328,7 @@ class Stepped(Message, frozen=True):
     truncated: Array
     """[N] bool"""
     infos: Array
-    """[bytes] uint8: a list of pairs of row and info, each pair a list or a tuple, packed by `protocol.wire.plain_values`;
+    """[bytes] uint8: a list of pairs of copy and info, each pair a list or a tuple, packed by `protocol.wire.plain_values`;
     empty infos are left out
     """
 
