@@ -23,11 +23,13 @@ from millrace.conformance.join_checks import (
     over_a_new_connection,
     time_limit,
 )
+from millrace.conformance.lane_rows import resets_of
 from millrace.conformance.learner import QUIET_S, Learner
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
 from millrace.conformance.watch import resets_too_early
 from protocol.arrays import Floats
+from protocol.envs.description import agents_in_words
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 from protocol.messages import (
@@ -35,6 +37,7 @@ from protocol.messages import (
     Drain,
     Evaluate,
     Evaluated,
+    Failure,
     Goodbye,
     Heartbeat,
     Hello,
@@ -48,7 +51,7 @@ from protocol.messages import (
 )
 from protocol.policy.features import leaf_of_features
 from protocol.policy.layout import acting_size, buffer_size, named_views, parameter_layout
-from protocol.specs import PolicySpec, RunSpec
+from protocol.specs import PolicySpec, RunSpec, seat_returns
 from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack
 from protocol.wire.weight_dtypes import to_wire_dtype
@@ -151,6 +154,9 @@ def run_spec(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Scri
         copies=settings.copies,
         lanes=2,
         seed=5,
+        facts=seat_returns(env.seats),
+        seats=env.seats,
+        takes_turns=env.takes_turns,
         heartbeat_s=settings.heartbeat_s,
         learner_timeout_s=30.0,
     )
@@ -235,16 +241,18 @@ def _repeats(one: Rollout, other: Rollout) -> bool:
 def keeps_rows(learner: Learner) -> Script[None]:
     """Rollouts in which episodes end."""
     session = yield from collecting(learner, steps=7)
-    ends = 0
+    ends, between = 0, False  # between: an episode ended in the last row of a rollout
     around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
     for _ in range(40):
         rollout = yield from session.collect()
+        if ends >= 8 and len(around) >= 3 and between:
+            break
         ends += len(rollout.episodes)
-        for t, n in np.argwhere(rollout.terminated[:-1]):
+        resets = np.repeat(resets_of(rollout), session.run.seats_of_copy, axis=1)
+        between = between or bool(resets[-1].any())
+        for t, n in np.argwhere(rollout.terminated[:-1] & resets[1:-1]):
             last, first = (b"".join(leaf[row, n].tobytes() for leaf in rollout.obs) for row in (t + 1, t + 2))
             around.append((last, first))
-        if ends >= 8 and len(around) >= 3:
-            break
     if not ends:
         raise Skipped(f"no episode ended in {40 * 7} steps")
     if resets_too_early(around):
@@ -253,6 +261,19 @@ def keeps_rows(learner: Learner) -> Script[None]:
             "the last observation of an episode in obs[t+1] of the row that ends it",
             f"the first one of the next episode, at each of {len(around)} ends",
         )
+
+
+def declines_other_agents(learner: Learner) -> Script[None]:
+    """A run of agents that the environment does not have."""
+    run = yield from run_spec(learner)
+    run = replace(run, seats=() if run.seats else ("one", "other"), facts=(), takes_turns=False)
+    yield from learner.joining()
+    learner.welcome(run)
+    session = Collecting(learner, run)
+    session.deal(session.permit())
+    text = f"Goodbye with the reason, in a run of {agents_in_words(run.seats, run.takes_turns)}"
+    yield from learner.expect((Goodbye, Failure), rules.OTHER_AGENTS, text, within_s=_long(learner))
+    yield from _ends(learner, (1, 2), "its last words")
 
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
@@ -280,7 +301,9 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
 
 
 def _truncated_in_order(rollout: Rollout) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """For each episode of the rollout: whether only a time limit ended it."""
+    """For each episode of the rollout: whether only a time limit ended it. With seats, that is not known."""
+    if rollout.resets is not None:
+        return np.zeros(len(rollout.episodes), bool)
     ended = (rollout.terminated | rollout.truncated) & rollout.valid
     return np.asarray((rollout.truncated & ~rollout.terminated)[ended])
 
@@ -437,7 +460,9 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
         rollout = yield from session.rollout(permit)
         rollouts.append(rollout)
     copies = [
-        (f"copy {n} of lane {lane}", *_did(rollouts[lane::2], n)) for lane in (0, 1) for n in range(session.run.copies)
+        (f"copy {n} of lane {lane}", *_did(rollouts[lane::2], n, session.run.seats_of_copy))
+        for lane in (0, 1)
+        for n in range(session.run.copies)
     ]
     for (one, actions, firsts), (other, its_actions, its_firsts) in combinations(copies, 2):
         drawn = [(a, b) for a, b in zip(actions, its_actions, strict=True) if a and b]
@@ -451,15 +476,15 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
             raise Broken(rules.INDEPENDENT, "copies whose episodes begin in their own way", got)
 
 
-def _did(rollouts: Sequence[Rollout], n: int) -> tuple[list[bytes], list[bytes]]:
-    """The actions of a copy, empty where it was only reset, and the first observations of its episodes."""
-    actions: list[bytes] = []
-    firsts = [b"".join(leaf[0, n].tobytes() for leaf in rollouts[0].obs)]
+def _did(rollouts: Sequence[Rollout], n: int, seats: int) -> tuple[list[bytes], list[bytes]]:
+    """The actions of a copy's first seat, empty in rows that are not valid, and the first observations of its episodes."""
+    actions, first = list[bytes](), n * seats
+    firsts = [b"".join(leaf[0, first].tobytes() for leaf in rollouts[0].obs)]
     for rollout in rollouts:
-        for t, valid in enumerate(rollout.valid[:, n]):
-            actions.append(rollout.action[t, n].tobytes() if valid else b"")
-            if not valid:
-                firsts.append(b"".join(leaf[t + 1, n].tobytes() for leaf in rollout.obs))
+        for t, resets in enumerate(resets_of(rollout)[:-1, n]):
+            actions.append(rollout.action[t, first].tobytes() if rollout.valid[t, first] else b"")
+            if resets:
+                firsts.append(b"".join(leaf[t + 1, first].tobytes() for leaf in rollout.obs))
     return actions, firsts
 
 
@@ -696,9 +721,13 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     learner.send(Drain("the run is over"))
     early, drained_s, beat_s = set(learner.watch.answers), learner.now, learner.settings.heartbeat_s
     within_s = 2 * learner.settings.patience_s
-    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain", within_s=within_s)
-    if learner.watch.heard_heartbeat_s < drained_s + beat_s and learner.now > drained_s + 3 * beat_s:
-        got = f"none in {learner.now - drained_s:.1f} s between Drain and Goodbye"
+    text = "Goodbye after Drain"
+    goodbye = yield from learner.expect((Rollout, Goodbye), rules.DRAIN, text, within_s=within_s)
+    finished_s = learner.now
+    if not isinstance(goodbye, Goodbye):
+        goodbye = yield from learner.expect(Goodbye, rules.DRAIN, text, within_s=within_s)
+    if learner.watch.heard_heartbeat_s < drained_s + beat_s and finished_s > drained_s + 3 * beat_s:
+        got = f"none in {finished_s - drained_s:.1f} s between Drain and the end of its rollout"
         raise Broken(rules.HEARTBEAT, f"a Heartbeat every {beat_s:g} s while it finishes its rollout", got)
     arrived = learner.watch.answers.keys()
     unfinished = {permit.ticket for permit in (*permits, waits)} - arrived

@@ -12,11 +12,12 @@ import numpy as np
 
 from millrace.conformance import rules
 from millrace.conformance.script import Broken
-from protocol.arrays import Array, Floats
+from protocol.arrays import Array, Bools, Floats
 from protocol.messages import Weights
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import make_policy
 from protocol.rollout import Rollout
+from protocol.rows.array_checks import place_of
 from protocol.specs import RunSpec
 from protocol.wire.weight_dtypes import to_float32
 
@@ -43,14 +44,14 @@ class LaneRows:
 
     def _check_begin(self, rollout: Rollout) -> None:
         last = self._last
-        ended = np.zeros(self._run.copies, bool) if last is None else last.terminated[-1] | last.truncated[-1]
-        if (wrong := rollout.valid[0] == ended).any():
-            n = int(np.argmax(wrong))
+        ended = np.zeros(self._run.copies, bool) if last is None else resets_of(last)[-1]
+        if (wrong := resets_of(rollout)[0] != ended).any():
+            n, flag = int(np.argmax(wrong)), "resets" if self._run.seats else "valid"
             raise Broken(
-                rules.FIRST_VALID,
-                f"valid[0] {not ended[n]} in copy {n} of sequence {rollout.sequence}: "
+                rules.FIRST_RESETS if self._run.seats else rules.FIRST_VALID,
+                f"{flag}[0] {ended[n] == bool(self._run.seats)} in copy {n} of sequence {rollout.sequence}: "
                 f"{'the last row of the rollout before ended its episode' if ended[n] else 'no episode had ended'}",
-                f"{bool(rollout.valid[0, n])}",
+                f"{ended[n] != bool(self._run.seats)}",
             )
         if last is not None:
             for one, other in zip(last.obs, rollout.obs, strict=True):
@@ -64,14 +65,17 @@ class LaneRows:
             raise Broken(rules.ROWS, "reward 0 in rows that are not valid", f"{rollout.reward[~rollout.valid].max()}")
 
     def _check_episodes(self, rollout: Rollout) -> None:
-        expected: list[tuple[float, int]] = []
-        for t in range(self._run.rollout_steps):
-            valid = rollout.valid[t]
-            self._return += np.where(valid, rollout.reward[t].astype(np.float64), 0.0)
-            self._length += valid
-            for n in np.flatnonzero(valid & (rollout.terminated[t] | rollout.truncated[t])).tolist():
+        run, expected = self._run, list[tuple[float, int]]()
+        reward = np.where(rollout.valid, rollout.reward.astype(np.float64), 0.0).reshape(-1, run.copies, run.seats_of_copy)
+        for of_step, resets, over in zip(reward, resets_of(rollout), resets_of(rollout)[1:], strict=False):
+            self._return += of_step.sum(1)
+            self._length += ~resets
+            for n in np.flatnonzero(over).tolist():
                 expected.append((float(self._return[n]), int(self._length[n])))
                 self._return[n], self._length[n] = 0.0, 0
+        if run.seats:  # rewards outside of rows count too
+            returns = (sum(episode.facts[-len(run.seats) :]) for episode in rollout.episodes)
+            expected = [(total, length) for total, (_, length) in zip(returns, expected, strict=True)]
         got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has counted them
         if not _same(expected, got) and _same(sorted(expected), sorted(got)):
             lengths = [length for _, length in expected]
@@ -90,19 +94,30 @@ class LaneRows:
                 raise Broken(rules.EPISODES, expected_return, f"{episode.reward:g}")
 
     def _check_log_prob(self, rollout: Rollout, weights: Weights) -> None:
-        params = params_of(self._run, weights, [leaf[:-1] for leaf in rollout.obs])
-        expected = distribution(self._run.policy).log_prob(params, rollout.action)
-        apart = np.where(rollout.valid, np.abs(expected - rollout.log_prob), 0.0)
+        # What a seat did that waited when the rollout began may be of older weights.
+        known = rollout.valid & (rollout.valid.cumsum(0) > 1) if self._run.takes_turns else rollout.valid
+        params = params_of(self._run, weights, [leaf[:-1][known][None] for leaf in rollout.obs])
+        action, got = rollout.action[known], rollout.log_prob[known]
+        expected = distribution(self._run.policy).log_prob(params, action[None])[0]
+        apart = np.abs(expected - got)
         if (apart > LOG_PROB_TOLERANCE * np.maximum(1.0, np.abs(expected))).any():
-            t, n = np.unravel_index(int(apart.argmax()), apart.shape)
+            k = int(apart.argmax())
             rounded = weights.parameters.dtype != np.float32
             normalized = self._run.policy.normalize_observations
+            place = place_of(np.argwhere(known)[k], self._run.row_axes)
             raise Broken(
                 rules.ROUNDED if rounded else rules.NORMALIZED if normalized else rules.LOG_PROB,
-                f"log_prob {expected[t, n]:.5f} at step {t}, copy {n} (within {LOG_PROB_TOLERANCE:g}), for action "
-                f"{rollout.action[t, n].tolist()} under version {rollout.version}",
-                f"{rollout.log_prob[t, n]:.5f}",
+                f"log_prob {expected[k]:.5f} at {place} (within {LOG_PROB_TOLERANCE:g}), for action {action[k].tolist()} "
+                f"under version {rollout.version}",
+                f"{got[k]:.5f}",
             )
+
+
+def resets_of(rollout: Rollout) -> Bools:
+    """Which steps only reset a copy [T+1, N]; the last row is of the step after the rollout."""
+    if rollout.resets is not None:
+        return rollout.resets
+    return np.concatenate([~rollout.valid, rollout.valid[-1:] & (rollout.terminated | rollout.truncated)[-1:]])
 
 
 def can_be_recomputed(run: RunSpec) -> bool:

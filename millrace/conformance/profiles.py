@@ -60,6 +60,7 @@ FAULTS = [
 COLLECTING = [
     Check("collects rollouts of a lane", collect_checks.collects),
     Check("keeps the row format where episodes end", collect_checks.keeps_rows),
+    Check("declines a run of agents that its environment does not have", collect_checks.declines_other_agents),
     Check("truncates an episode at the time limit", collect_checks.truncates_at_the_limit),
     Check("waits for the weights that an order names", collect_checks.waits_for_weights),
     Check("acts under the version that an order names, not under a newer one", collect_checks.acts_under_the_named_version),

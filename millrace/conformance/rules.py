@@ -352,6 +352,22 @@ ROWS = Rule(
     'compare what the section "Collector profile" says of rows with what the client writes, and dtypes and shapes '
     "with the table of Rollout",
 )
+SEATS = Rule(
+    "Collector profile",
+    "That row alone is `valid` … no later row of it is valid until the copy is reset … That step has no valid row, and no "
+    "other such step follows it",
+    'compare what "Seats" says of the rows of an agent with what the client writes, agent by agent',
+)
+FIRST_RESETS = Rule(
+    "Collector profile",
+    "`resets[0]` is the `resets[T]` of the rollout before",
+    "carry over which copies are to be reset first in the next rollout",
+)
+OTHER_AGENTS = Rule(
+    "Collector profile",
+    "A worker declines a run whose `seats` are not those of its environment",
+    "compare `seats` of the RunSpec with the agents of the environment, and say Goodbye if they differ",
+)
 LAST_OBSERVATION = Rule(
     "Collector profile",
     "The row after the end of an episode only resets that copy: its observation is the last one of the old episode, "

@@ -367,7 +367,8 @@ class WatchedSession:
         try:
             validate(message, self.run)
         except BadRollout as error:
-            raise Broken(rules.ROWS, "a rollout that keeps the row format", str(error)) from None
+            rule = rules.SEATS if self.run.seats else rules.ROWS
+            raise Broken(rule, "a rollout that keeps the row format", str(error)) from None
         rows = self._rows.setdefault(place, LaneRows(self.run))
         rows.see(message, self.versions[message.version])
 

@@ -72,10 +72,10 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
 def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:
     """Raise `BadRollout` if the rows of seats break the law of `protocol.rollout`. Arrays [T, N·A], `resets` [T+1, N]."""
     reset = np.repeat(resets, run.seats_of_copy, axis=1)  # [T+1, N·A]
+    steps = np.arange(len(valid))[:, None]
+    row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last
     gone, plays = np.zeros_like(reset), np.zeros_like(reset)  # the seat has left this episode; it has a row in it
-    for t in range(len(valid)):
-        gone[t + 1] = (gone[t] | ended[t]) & ~reset[t]
-        plays[t + 1] = (plays[t] | valid[t]) & ~ended[t]
+    gone[1:], plays[1:] = end > begin, row > end
     idle = plays[:-1] & ~valid if not run.takes_turns else np.zeros_like(valid)
     for wrong, expected in (
         (ended & ~valid, "valid: expected no end in a row that is not valid"),
