@@ -208,6 +208,7 @@ class Worker {
   /** Why this client cannot take part in the run, or nothing. */
   #unable() {
     const run = this.#run;
+    if (run.seats?.length) return `this client has no environment of several agents, the learner asks for ${run.seats.join(", ")}`;
     if (run.type === "RunSpec") return "this client does not act: it needs --inference learner, or millrace.make_vec";
     for (const env of run.type === "StepSpec" ? run.envs : [run.env]) {
       if (env.id !== this.description.id) return `this client has the environment ${this.description.id}, the learner asks for ${env.id}`;

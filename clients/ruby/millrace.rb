@@ -90,9 +90,9 @@ class Worker
     @session, @run, @replies, @next_at = session, run, 0, 0
     @silence_s = run.fetch(:learner_timeout_s) { run[:type] == "StepSpec" ? 600 : 30 }
     envs = (run[:envs] || [run[:env]]).map { |env| env.reject { |_, v| v.nil? || v.empty? } }
-    return if run[:type] != "RunSpec" && envs == [{ id: @environment::ID }] &&
+    return if run[:type] != "RunSpec" && envs == [{ id: @environment::ID }] && !run[:seats]&.any? &&
               (run[:autoreset] || "NextStep") == "NextStep"
-    leave(2, "expected --inference learner, #{@environment::ID}; got #{run[:type]}, #{envs}"[0, 1000])
+    leave(2, "expected --inference learner, #{@environment::ID}; got #{run[:type]}, #{envs}, #{run[:seats]}"[0, 1000])
   end
 
   def beat

@@ -28,6 +28,8 @@ class Mutant(NamedTuple):
     """the rule that the report names"""
     got: str
     """part of what the report says was got"""
+    program: str = "cartpole"
+    """in clients/cpp/examples or clients/cpp/tests"""
 
 
 # fmt: off
@@ -231,14 +233,14 @@ MUTANTS = [
     ),
     Mutant(
         "rows in another order", "rollouts.hpp",
-        "return &r.log_prob[r.rows * N + n];",
-        "return &r.log_prob[n * T + r.rows];",
+        "return &r.log_prob[r.rows * C + c];",
+        "return &r.log_prob[c * T + r.rows];",
         "collector", "collects rollouts", rules.LOG_PROB, "",
     ),
     Mutant(
-        "wrong episode length", "rollouts.hpp",
-        "else episodes_[n].reward += reward, ++episodes_[n].length;",
-        "else episodes_[n].reward += reward, episodes_[n].length = 1;",
+        "wrong episode length", "seats.hpp",
+        "else ++episodes_[n].length;",
+        "else episodes_[n].length = 1;",
         "collector", "keeps the row format", rules.EPISODES, "",
     ),
     Mutant(
@@ -344,23 +346,24 @@ MUTANTS = [
         "collector", "collects two lanes", rules.INDEPENDENT, "copy 0 of lane 0 in copy",
     ),
     Mutant(
-        "forgets an end between two rollouts", "rollouts.hpp",
-        "if (++r.rows < T) return false;",
-        "if (++r.rows < T) return false;\n"
-        "    ended.assign(N, 0);",
+        "forgets an end between two rollouts", "worker.hpp",
+        "for (rows.begin(*rollout);;) {",
+        "for (SeatedCopy& copy : lane->copies) copy.seats[0].acts = true;\n"
+        "      rows.resets.assign(rows.N, 0);\n"
+        "      for (rows.begin(*rollout);;) {",
         "collector", "keeps the row format", rules.FIRST_VALID, "True",
     ),
     Mutant(
         "forgotten final observation of an episode", "worker.hpp",
-        "              lane->envs[n]->reset(std::nullopt, rows.next_obs_at(*rollout, n));\n"
-        "            } else {\n"
-        "              policy_.to_env(rows.action_at(*rollout, n), lane->action.data());\n"
-        "              result = lane->envs[n]->step({lane->action.data()}, rows.next_obs_at(*rollout, n));\n",
-        "              std::memcpy(rows.next_obs_at(*rollout, n), rows.obs_at(*rollout, n), rows.obs_bytes);\n"
-        "            } else {\n"
-        "              policy_.to_env(rows.action_at(*rollout, n), lane->action.data());\n"
-        "              result = lane->envs[n]->step({lane->action.data()}, rows.next_obs_at(*rollout, n));\n"
-        "              if (result.terminated) lane->envs[n]->reset(std::nullopt, rows.next_obs_at(*rollout, n));\n",
+        "env_->reset(seed, seats[0].obs), seats[0].acts = true; }\n"
+        "  void step(const std::vector<Action>& actions, std::vector<Seat>& seats) override {\n"
+        "    const Result result = env_->step(actions[0], seats[0].obs);\n",
+        "if (seed) env_->reset(seed, seats[0].obs);\n"
+        "    seats[0].acts = true;\n"
+        "  }\n"
+        "  void step(const std::vector<Action>& actions, std::vector<Seat>& seats) override {\n"
+        "    const Result result = env_->step(actions[0], seats[0].obs);\n"
+        "    if (result.terminated) env_->reset(std::nullopt, seats[0].obs);\n",
         "collector", "keeps the row format", rules.LAST_OBSERVATION, "the first one",
     ),
     Mutant(
@@ -412,6 +415,44 @@ MUTANTS = [
         "orders_.erase(std::remove_if(orders_.begin(), orders_.end(), over), orders_.end());",
         "(void)over;",
         "collector", "ends an evaluation", rules.EVALUATE_ENDS, "ticket",
+    ),
+    Mutant(
+        "rows of a seat that waits", "seats.hpp",
+        "write(r, c, complete, complete ?",
+        "write(r, c, true, complete ?",
+        "collector", "collects rollouts", rules.SEATS, "valid: expected none", "gathering",
+    ),
+    Mutant(
+        "forgets who is reset first", "seats.hpp",
+        "std::copy(resets.begin(), resets.end(), r.resets.begin());",
+        "std::fill(r.resets.begin(), r.resets.end(), 0);",
+        "collector", "keeps the row format", rules.FIRST_RESETS, "False", "tag",
+    ),
+    Mutant(
+        "forgets what a seat that waits did", "seats.hpp",
+        "*log_prob_at(r, c) = columns_[c].log_prob;",
+        "*log_prob_at(r, c) = 0;",
+        "collector", "collects rollouts", rules.LOG_PROB, "0.00000", "nim",
+    ),
+    Mutant(
+        "a return of one seat", "seats.hpp",
+        "episode.reward += columns_[c].total,",
+        "episode.reward = columns_[c].total,",
+        "collector", "keeps the row format", rules.EPISODES, "", "tag",
+    ),
+    Mutant(
+        "steps that only reset count", "seats.hpp",
+        "if (resets[n]) begin_episode(n, now);\n"
+        "    else ++",
+        "if (resets[n]) begin_episode(n, now);\n"
+        "    ++",
+        "collector", "keeps the row format", rules.EPISODES, "", "tag",
+    ),
+    Mutant(
+        "serves any agents", "rollouts.hpp",
+        "if (run.seats == description_.seats && (run.takes_turns || !description_.takes_turns)) return \"\";",
+        "return \"\";",
+        "collector", "of agents", rules.OTHER_AGENTS, "none within", "tag",
     ),
 ]
 # fmt: on

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
+import zmq
 
-from tests.system.stage.processes import START_S, Learner, Running, Stage, free_port
+from protocol.messages import Hello, ToLearner
+from protocol.wire.codec import decode_to_learner
+from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port
 
+M = TypeVar("M", bound=ToLearner)
 IN_LEARNER = ("--inference", "learner")
 
 
@@ -47,15 +53,42 @@ def resumed(stage: Stage, runs: Learner, address: str, *words: object) -> Learne
     return made
 
 
+class FalseLearner:
+    """A ROUTER socket at which a client says Hello. A context manager."""
+
+    def __enter__(self) -> FalseLearner:
+        self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
+        self.address = f"tcp://127.0.0.1:{self.socket.bind_to_random_port('tcp://127.0.0.1')}"
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.socket.close(linger=0)
+
+    def hello(self) -> tuple[bytes, Hello]:
+        assert self.socket.poll(10_000), "no Hello within 10 s"
+        peer, *frames = self.socket.recv_multipart()
+        hello = decode_to_learner(frames)
+        assert isinstance(hello, Hello)
+        return peer, hello
+
+    def heard(self, kind: type[M]) -> M:
+        """The next message of this kind; heartbeats and the like may come before it."""
+        while self.socket.poll(10_000):
+            message = decode_to_learner(self.socket.recv_multipart()[1:])
+            if isinstance(message, kind):
+                return message
+        raise AssertionError(f"no {kind.__name__} within 10 s")
+
+
 class Client:
     """A program of a client, which is built."""
 
-    def __init__(self, stage: Stage, command: list[str]) -> None:
-        self._stage, self._command = stage, command
+    def __init__(self, stage: Stage, command: list[str], name_flag: Sequence[str] = ("--name",)) -> None:
+        self._stage, self._command, self._name_flag = stage, command, name_flag
 
     def start(self, address: str, name: str = "client", *flags: object) -> Running:
         """Start it for the learner at this address."""
-        return self._stage.start([*self._command, address, "--name", name, *map(str, flags)], name)
+        return self._stage.start([*self._command, address, *self._name_flag, name, *map(str, flags)], name)
 
 
 class Clients:
@@ -70,6 +103,9 @@ class Clients:
         if language == "cpp":
             build: Path = self._request.getfixturevalue("cpp")
             return Client(self._stage, [str(build / file)])
+        if language == "ruby":
+            self._request.getfixturevalue("ruby")
+            return Client(self._stage, ["ruby", str(ROOT / "clients" / "ruby" / "examples" / f"{file}.rb")], name_flag=())
         folder: Path = self._request.getfixturevalue("js")
         (script,) = folder.glob(f"*/{file}.js")
         return Client(self._stage, ["node", str(script)])

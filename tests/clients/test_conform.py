@@ -68,9 +68,36 @@ def command_of(client: str, request: pytest.FixtureRequest) -> tuple[str, ...]:
     match client:
         case "cpp":
             return (str(request.getfixturevalue("cpp") / "cartpole"), "{address}")
+        case "cpp nim" | "cpp tag":
+            return (str(request.getfixturevalue("cpp") / client[4:]), "{address}")
         case "js":
             return ("node", str(request.getfixturevalue("js") / "examples" / "cartpole.js"), "{address}")
     return WORKER  # it finds its token in the environment
+
+
+AGENTS = "declines a run of agents that its environment does not have"
+
+
+@pytest.mark.clients
+@pytest.mark.parametrize("env", ["ChainGame", "ChainCrowd"])
+def test_the_python_worker_keeps_the_rows_of_agents(env: str) -> None:
+    names = ("keeps the row format where episodes end", AGENTS, "collects two lanes, and two tickets of one")
+    checks = [check for check in PROFILES["collector"] if check.name in (*names, "evaluates with rows, or declines")]
+    settings = Settings(EnvSpec(f"tests.support.users_code.seat_envs:{env}"))
+    results = conform(ClientCommand(WORKER, with_keys=True), checks, settings, 60.0, lambda result: None)
+    assert [result.outcome for result in results] == ["passed"] * 4, [explanation(result) for result in results]
+
+
+@pytest.mark.clients
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("turns", ["wait", "ALL=1"])
+def test_the_cpp_client_keeps_the_rows_of_agents_that_come_wait_and_leave(turns: str, cpp: Path) -> None:
+    names = ("row format", "two lanes", "lost rollout", "evaluates", "agents")
+    checks = [check for check in PROFILES["collector"] if any(name in check.name for name in names)]
+    command = ("env", *([turns] if "=" in turns else []), str(cpp / "gathering"), "{address}")
+    results = conform(ClientCommand(command), checks, Settings(EnvSpec("Gathering-v0")), 60.0, lambda result: None)
+    unlike = {result.name: explanation(result) for result in results if result.outcome != "passed"}
+    assert list(unlike) == SKIPPED["collector"][1:], unlike
 
 
 @pytest.mark.clients
@@ -82,6 +109,8 @@ def command_of(client: str, request: pytest.FixtureRequest) -> tuple[str, ...]:
         ("python", "collector", True),
         ("cpp", "environment", False),
         ("cpp", "collector", True),
+        ("cpp nim", "collector", False),
+        ("cpp tag", "collector", False),
         ("js", "environment", False),
         ("js", "environment", True),
     ],
@@ -91,12 +120,14 @@ def test_a_client_conforms(client: str, profile: str, keys: bool, tmp_path: Path
     report = tmp_path / "report.json"
     flags = ["--profile", profile, "--patience-s", "20", "--limit-s", "500", "--json", str(report)]
     token = ["--token", "{token}"] if keys and client != "python" else []
-    words = [*flags, *(["--with-keys"] if keys else []), "--", *command_of(client, request), *token]
+    env = ["--env", f"{client[4:].title()}-v0"] if " " in client else []
+    words = [*flags, *env, *(["--with-keys"] if keys else []), "--", *command_of(client, request), *token]
     command = [sys.executable, "-m", "millrace", "conform", *words]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(report.read_text())
     assert found["conforms"]
     skipped = [check["name"] for check in found["checks"] if check["outcome"] == "skipped"]
-    assert skipped == ([] if client == "python" else SKIPPED[profile])
+    too_short = ["truncates an episode at the time limit"] if client == "cpp nim" else []
+    assert skipped == ([] if client == "python" else too_short + SKIPPED[profile])
     assert len(found["checks"]) == len(PROFILES[profile])

@@ -14,12 +14,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import zmq
 
 from learner.run_folder.metrics_log import read_rows
-from protocol.messages import PROTOCOL_VERSION, Drain, Hello, Refuse
-from protocol.wire.codec import decode_to_learner, encode
+from protocol.messages import PROTOCOL_VERSION, Drain, Refuse
+from protocol.wire.codec import encode
 from tests.clients.messages_to_clients import corpus
+from tests.clients.programs import FalseLearner
 from tests.system.stage.processes import START_S, Running, Stage, free_port, wait_for
 from tests.system.stage.run_folders import policy_of
 
@@ -139,7 +139,10 @@ def test_the_weights_are_those_of_a_python_worker(stage: Stage, cpp: Path) -> No
 # ---------------------------------------------------------------- the collector profile
 
 
-@pytest.mark.parametrize(("env", "program"), [("CartPole-v1", "cartpole"), ("Pendulum-v1", "pendulum")])
+@pytest.mark.parametrize(
+    ("env", "program"),
+    [("CartPole-v1", "cartpole"), ("Pendulum-v1", "pendulum"), ("Tag-v0", "tag"), ("Gathering-v0", "gathering")],
+)
 @pytest.mark.parametrize("normalize", [False, True])
 def test_the_client_acts_as_the_learner_would(stage: Stage, cpp: Path, env: str, program: str, normalize: bool) -> None:
     """With one gradient step for each update, the policy that acted is the learner's, but for rounding."""
@@ -252,25 +255,6 @@ def test_another_environment_is_declined_with_the_reason(stage: Stage, cpp: Path
     assert client.ends(START_S) == 2
     assert "this client has the environment CartPole-v1, the learner asks for Pendulum-v1" in client.said()
     runs.hears("the learner asks for Pendulum-v1")
-
-
-class FalseLearner:
-    """A ROUTER socket at which a client says Hello. A context manager."""
-
-    def __enter__(self) -> FalseLearner:
-        self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
-        self.address = f"tcp://127.0.0.1:{self.socket.bind_to_random_port('tcp://127.0.0.1')}"
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.socket.close(linger=0)
-
-    def hello(self) -> tuple[bytes, Hello]:
-        assert self.socket.poll(10_000), "no Hello within 10 s"
-        peer, *frames = self.socket.recv_multipart()
-        hello = decode_to_learner(frames)
-        assert isinstance(hello, Hello)
-        return peer, hello
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,11 @@ def mutated(mutant: Mutant, include: Path) -> None:
 
 def build(mutant: Mutant, folder: Path) -> Path:
     """The client with this mistake."""
-    include, program = folder / "include", folder / "cartpole"
+    include, program = folder / "include", folder / mutant.program
     shutil.copytree(CPP / "include", include)
     mutated(mutant, include)
-    command = ["g++", "-I", str(include), str(CPP / "examples" / "cartpole.cpp"), "-o", str(program), *FLAGS]
+    (source,) = CPP.glob(f"*/{mutant.program}.cpp")
+    command = ["g++", "-I", str(include), str(source), "-o", str(program), *FLAGS]
     done = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_S)
     assert done.returncode == 0, done.stderr
     return program
@@ -56,7 +57,8 @@ def test_the_report_names_the_rule_that_a_mutant_breaks(mutant: Mutant, compiler
     checks = [check for check in PROFILES[mutant.profile] if mutant.check in check.name]
     assert checks, mutant.check
     client = ClientCommand((str(build(mutant, tmp_path)), "{address}"))
-    results = conform(client, checks, Settings(EnvSpec("CartPole-v1"), patience_s=3.0), 100.0, lambda result: None)
+    env = "CartPole-v1" if mutant.program == "cartpole" else f"{mutant.program.title()}-v0"
+    results = conform(client, checks, Settings(EnvSpec(env), patience_s=3.0), 100.0, lambda result: None)
     failed = [each for each in results if each.outcome == "failed"]
     assert failed, f"{mutant.name} was not caught"
     assert failed[0].rule == mutant.rule, explanation(failed[0])

@@ -13,7 +13,7 @@ from millrace.conformance.profiles import PROFILES
 from tests.clients.client_page import Step, steps
 from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port
 
-pytestmark = [pytest.mark.clients, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.clients, pytest.mark.timeout(400), pytest.mark.usefixtures("ruby")]
 RUBY = ROOT / "clients" / "ruby"
 GRID_WORLD = RUBY / "examples" / "grid_world.rb"
 OTHER = """require "{grid_world}"
@@ -25,14 +25,6 @@ class Other < GridWorld
 end
 exit Worker.new(ARGV[0], Other, ARGV[1] || "other").run
 """
-
-
-@pytest.fixture(autouse=True)
-def _with_ruby() -> None:
-    """Skips, saying so, without Ruby or its libraries."""
-    command = ["ruby", "-e", 'require "ffi-rzmq"; require "msgpack"']
-    if shutil.which("ruby") is None or subprocess.run(command, capture_output=True, timeout=60).returncode:
-        pytest.skip("ruby or a library of it is missing: make packages")
 
 
 def learner(stage: Stage, address: str, *flags: str) -> Learner:

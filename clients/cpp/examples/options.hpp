@@ -1,9 +1,9 @@
-// The command line of the examples: ADDRESS [--name NAME] [--token FILE]
+// The command line of the examples, ADDRESS [--name NAME] [--token FILE], and how they run.
 #pragma once
 #include <cstdlib>
 #include <sstream>
 
-#include "millrace/session.hpp"
+#include "millrace/worker.hpp"
 
 inline millrace::Options options_from(int count, char** words) {
   millrace::Options options;
@@ -32,4 +32,19 @@ inline millrace::Options options_from(int count, char** words) {
     options.token = text.str();
   }
   return options;
+}
+
+template <class Environment>
+int run_example(int count, char** words) {  // as a worker. Returns the exit code
+  try {
+    std::random_device random;  // a learner that gives seeds replaces these
+    millrace::drain_on_signals();
+    millrace::Worker worker(options_from(count, words), Environment::description(), [&] { return std::make_unique<Environment>(random()); });
+    const int code = worker.run();
+    std::fprintf(stderr, "%s\n", worker.reason().c_str());
+    return code;
+  } catch (const millrace::UsageError& error) {
+    std::fprintf(stderr, "error: %s\n", error.what());
+    return 2;
+  }
 }

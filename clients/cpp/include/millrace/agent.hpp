@@ -7,6 +7,44 @@
 
 namespace millrace {
 
+class OwnRows : public Rows {  // the rows of one copy, which the client's program steps
+ public:
+  using Rows::Rows;
+  void result(Rollout& r, double reward, bool terminated, bool truncated, double now) {
+    const bool valid = !ended && !gap;
+    if (ended) reward = 0;  // this row only resets the copy
+    count(reward, now);
+    write(r, 0, valid, reward, terminated, truncated);
+    check(next_obs_at(r, 0));
+    ended = terminated || truncated, gap = false;
+    if (ended && valid) report(r, now);
+  }
+  void not_applied(Rollout& r, double now) {  // the action of this row: call it before `result`
+    // The row must not be learned from, so the episode ends as truncated with the row before, and another begins after it.
+    if (r.rows && !ended) {
+      r.truncated[r.rows - 1] = 1;
+      if (r.valid[r.rows - 1]) report(r, now);
+    }
+    ended = true;
+  }
+  void outside_of_rows(double reward, bool end, double now) {  // a step that is in no rollout
+    count(reward, now);
+    ended = end, gap = true;
+  }
+
+  bool ended = false, gap = true;  // the next row only resets the copy; does not continue the row before it
+
+ private:
+  void count(double reward, double now) {  // a step, or the reset after an end
+    if (ended) episode_ = {0, 0, now};
+    else episode_.reward += reward, ++episode_.length;
+  }
+  void report(Rollout& r, double now) {  // steps in no rollout count, as far as the learner can check the length
+    r.episodes.push_back({episode_.reward, std::min<std::uint64_t>(episode_.length, (r.sequence + 1) * T), now - episode_.seconds});
+  }
+  Episode episode_{0, 0, now_s()};  // that runs; `seconds` holds when it began
+};
+
 class Agent : public CollectorSession {
  public:
   struct Counts {
@@ -18,7 +56,9 @@ class Agent : public CollectorSession {
   // `fallback`: the action, as the environment takes it, when there is no other. It must stay where it is.
   Agent(Options options, Description description, const void* fallback, double deadline_s)
       : CollectorSession(std::move(options), std::move(description)), fallback_(fallback), deadline_s_(deadline_s),
-        stored_(description_.action.bytes()), action_(description_.action.bytes()) {}
+        stored_(description_.action.bytes()), action_(description_.action.bytes()) {
+    if (!description_.seats.empty()) throw UsageError("description: expected no agents of an Agent, which is one");
+  }
 
   ~Agent() override { close(); }
 
@@ -68,8 +108,7 @@ class Agent : public CollectorSession {
     if (run.type == "StepSpec") return "this client chooses its own actions; start the learner without --inference learner";
     if (run.copies != 1) return "this client has one env copy, the learner asks for " + std::to_string(run.copies) + " in a lane; give it --envs and --lanes equal to the number of clients";
     if (std::string why = begin_collecting(run); !why.empty()) return why;
-    rows_ = std::make_unique<Recorder>(run, description_.observation, description_.action);
-    rows_->started(0, now_s()), rows_->gap[0] = 1;  // in the middle of an episode, perhaps
+    rows_ = std::make_unique<OwnRows>(run, description_.observation, description_.action);  // in the middle of an episode, perhaps
     random_ = Random{run.seed, session_};
     return "";
   }
@@ -90,12 +129,12 @@ class Agent : public CollectorSession {
     if (evaluation_) evaluate(reward, end, now);
     if (!rollout_ || !wanted(*rollout_, session_)) {
       rollout_.reset();
-      rows_->outside_of_rows(0, reward, end, now);
+      rows_->outside_of_rows(reward, end, now);
       return;
     }
     std::memcpy(rows_->next_obs_at(*rollout_, 0), obs, rows_->obs_bytes);
-    if (late_) rows_->not_applied(*rollout_, 0, now);
-    rows_->result(*rollout_, 0, reward, terminated, truncated, now);
+    if (late_) rows_->not_applied(*rollout_, now);
+    rows_->result(*rollout_, reward, terminated, truncated, now);
     ++counts_.recorded;
     if (rows_->end_row(*rollout_)) finished(std::move(rollout_)), drained();
   }
@@ -103,7 +142,7 @@ class Agent : public CollectorSession {
   void begin_rows(const void* obs) {
     if (evaluation_) return;
     if (const Evaluation* order = next_evaluation()) {  // on the one environment that there is, from the next episode on
-      if (rows_->ended[0]) evaluation_ = std::make_unique<Playing>(Playing{*order, {}, now_s(), false});
+      if (rows_->ended) evaluation_ = std::make_unique<Playing>(Playing{*order, {}, now_s(), false});
       return;
     }
     rollout_ = next_rollout();
@@ -115,7 +154,7 @@ class Agent : public CollectorSession {
   struct Playing { Evaluation evaluation; Episode episode; double start_s; bool counts; };
   void evaluate(double reward, bool end, double now) {  // seeds are not used: the client resets its environment as it does
     Playing& p = *evaluation_;
-    if (rows_->ended[0]) {  // a new episode began
+    if (rows_->ended) {  // a new episode began
       p.episode = {}, p.start_s = now, p.counts = true;
       return;
     }
@@ -131,7 +170,7 @@ class Agent : public CollectorSession {
   const void* fallback_;
   double deadline_s_, pumped_s_ = 0;
   std::vector<unsigned char> stored_, action_;
-  std::unique_ptr<Recorder> rows_;
+  std::unique_ptr<OwnRows> rows_;
   std::unique_ptr<Rollout> rollout_;
   std::unique_ptr<Playing> evaluation_;
   Random random_;

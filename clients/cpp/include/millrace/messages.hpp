@@ -12,7 +12,8 @@
 namespace millrace {
 
 constexpr std::uint64_t PROTOCOL_VERSION = 8;
-constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16;
+constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16,
+                      MAX_SEATS = 1 << 10;
 
 struct Frame {  // bytes that belong to somebody else
   const void* data;
@@ -39,10 +40,14 @@ struct Run {  // DescribeSpec, RunSpec or StepSpec
   std::vector<std::size_t> lanes;  // StepSpec: how many copies each lane has
   std::vector<Leaf> observation;
   std::vector<Leaf> action;
-  std::size_t rollout_steps = 0, copies = 0, facts = 0;  // of a RunSpec, as is all that follows
+  std::size_t rollout_steps = 0, copies = 0;  // of a RunSpec, as is all that follows
+  std::vector<std::string> facts, seats;
+  bool takes_turns = false, has_seat_returns = false;  // has_seat_returns: the last facts of an episode are those of its seats
   std::uint64_t seed = 0;
   std::vector<std::size_t> net{64, 64};
   bool relu = false, normalize = false;
+
+  std::size_t columns() const { return copies * std::max<std::size_t>(1, seats.size()); }
 };
 
 struct Permit { std::uint64_t ticket, lane, incarnation, sequence; };
@@ -200,6 +205,11 @@ class Decoder {
     }
   }
 
+  static void names(Reader& r, std::vector<std::string>& into) {
+    into.clear();
+    for (std::size_t n = r.array(); n; --n) into.emplace_back(r.text(4000));
+  }
+
   static Leaf leaf(Reader& r) {
     Leaf leaf;
     r.fields([&](std::string_view name) {
@@ -241,6 +251,7 @@ class Decoder {
       else if (name == "head") { if (r.text(40) != "actor_critic") run.beyond = "a policy of this algorithm"; }
       else if (name == "encoder") must_be_nil("an encoder");
       else if (name == "core") must_be_nil("a recurrent core");
+      else if (name == "critic") { if (std::size_t n = r.array()) for (run.beyond = "observations that only the critic sees"; n; --n) r.skip(); }
       else if (name == "own") {
         if (r.nil()) return true;
         run.beyond = "a policy written in Python";
@@ -268,7 +279,9 @@ class Decoder {
       else if (name == "rollout_steps") run.rollout_steps = r.natural();
       else if (name == "seed") run.seed = r.natural();
       else if (name == "masked") { if (r.boolean()) run.beyond = "action masks"; }
-      else if (name == "facts") { run.facts = r.array(); for (std::size_t n = run.facts; n; --n) r.skip(); }
+      else if (name == "facts") names(r, run.facts);
+      else if (name == "seats") names(r, run.seats);
+      else if (name == "takes_turns") run.takes_turns = r.boolean();
       else if (name == "extras") { if (std::size_t n = r.array()) for (run.beyond = "further arrays"; n; --n) r.skip(); }
       else if (name == "heartbeat_s") run.heartbeat_s = r.real();
       else if (name == "learner_timeout_s") run.learner_timeout_s = r.real();
@@ -281,7 +294,9 @@ class Decoder {
     if (collects && (!run.rollout_steps || !run.copies || run.observation.empty() || run.action.empty()))
       throw BadMessage("RunSpec: expected its steps, copies and spaces");
     bool many = run.copies > MAX_COPIES || std::any_of(run.lanes.begin(), run.lanes.end(), [](std::size_t n) { return n > MAX_COPIES; });
-    if (many) throw BadMessage("Welcome: expected at most 65536 copies in a lane");
+    if (many || run.seats.size() > MAX_SEATS) throw BadMessage("Welcome: expected at most 65536 copies in a lane, and 1024 agents in each");
+    auto of_seat = [](const std::string& seat, const std::string& fact) { return fact == "return_" + seat; };
+    run.has_seat_returns = run.facts.size() >= run.seats.size() && std::equal(run.seats.rbegin(), run.seats.rend(), run.facts.rbegin(), of_seat);
     if (!(run.heartbeat_s > 0) || !(run.learner_timeout_s > 0)) throw BadMessage("Welcome: expected times above 0");
     return run;
   }

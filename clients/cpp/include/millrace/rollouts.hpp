@@ -1,4 +1,4 @@
-// The tickets, weights, rollouts and evaluation orders of the collector profile, and the columns of a rollout.
+// The tickets, weights, rollouts and evaluation orders of the collector profile, and the rows of a lane.
 //
 // Rule: a ticket is collected once, under the version that it names, and after those before it of its lane. Its rollout is
 // kept until the learner has received it, and sent again when the learner asks for it again. The memory of a rollout that has
@@ -15,80 +15,50 @@ struct Episode { double reward = 0; std::uint64_t length = 0; double seconds = 0
 struct Rollout {  // T rows of N copies: in obs[t] we did action[t], got reward[t] and saw obs[t+1], wherever valid[t]
   std::uint64_t lane = 0, incarnation = 0, ticket = 0, version = 0, sequence = 0;
   std::size_t rows = 0;                                 // that are complete
-  std::vector<unsigned char> obs, action;               // [T+1, N, …], [T, N, …]
-  std::vector<float> log_prob, reward;                  // [T, N]
+  std::vector<unsigned char> obs, action;               // [T+1, C, …], [T, C, …]: C columns, one for each seat of each copy
+  std::vector<float> log_prob, reward;                  // [T, C]
   std::vector<unsigned char> terminated, truncated, valid;
+  std::vector<unsigned char> resets;                    // [T+1, N] of copies with seats: the step only resets the copy
   std::vector<Episode> episodes;
+  std::vector<double> seat_returns;                     // [episodes, A]
 };
 
-class Recorder {  // writes the rows of a lane, and counts its episodes from one rollout to the next
+class Rows {  // writes the rows of a lane, from one rollout to the next
  public:
-  Recorder(const Run& run, const Space& observation, const Space& action)
-      : T(run.rollout_steps), N(run.copies), obs_bytes(observation.bytes()), action_bytes(action.bytes()), obs(N * obs_bytes),
-        ended(N), gap(N), episodes_(N), floats_(observation.dtype == "float32"), doubles_(observation.dtype == "float64"),
-        elements_(observation.elements()) {}
+  Rows(const Run& run, const Space& observation, const Space& action)
+      : T(run.rollout_steps), C(run.columns()), obs_bytes(observation.bytes()), action_bytes(action.bytes()), obs(C * obs_bytes),
+        floats_(observation.dtype == "float32"), doubles_(observation.dtype == "float64"), elements_(observation.elements()) {}
 
   void begin(Rollout& r) {
-    r.rows = 0, r.episodes.clear();
-    r.obs.resize((T + 1) * N * obs_bytes), r.action.resize(T * N * action_bytes);
-    r.log_prob.resize(T * N), r.reward.resize(T * N), r.terminated.resize(T * N), r.truncated.resize(T * N), r.valid.resize(T * N);
+    r.rows = 0, r.episodes.clear(), r.seat_returns.clear();
+    r.obs.resize((T + 1) * C * obs_bytes), r.action.resize(T * C * action_bytes);
+    r.log_prob.resize(T * C), r.reward.resize(T * C), r.terminated.resize(T * C), r.truncated.resize(T * C), r.valid.resize(T * C);
     std::copy(obs.begin(), obs.end(), r.obs.begin());
   }
-  void* obs_at(Rollout& r, std::size_t n) { return &r.obs[(r.rows * N + n) * obs_bytes]; }  // of the row that is not yet complete
-  void* next_obs_at(Rollout& r, std::size_t n) { return &r.obs[((r.rows + 1) * N + n) * obs_bytes]; }
-  void* action_at(Rollout& r, std::size_t n) { return &r.action[(r.rows * N + n) * action_bytes]; }
-  float* log_prob_at(Rollout& r, std::size_t n) { return &r.log_prob[r.rows * N + n]; }
-
-  void result(Rollout& r, std::size_t n, double reward, bool terminated, bool truncated, double now) {  // of copy n in this row
-    const std::size_t i = r.rows * N + n;
-    const bool valid = !ended[n] && !gap[n];
-    if (ended[n]) reward = 0;  // this row only resets the copy
+  void* obs_at(Rollout& r, std::size_t c) { return &r.obs[(r.rows * C + c) * obs_bytes]; }  // of the row that is not yet complete
+  void* next_obs_at(Rollout& r, std::size_t c) { return &r.obs[((r.rows + 1) * C + c) * obs_bytes]; }
+  void* action_at(Rollout& r, std::size_t c) { return &r.action[(r.rows * C + c) * action_bytes]; }
+  float* log_prob_at(Rollout& r, std::size_t c) { return &r.log_prob[r.rows * C + c]; }
+  void write(Rollout& r, std::size_t c, bool valid, double reward, bool terminated, bool truncated) {  // what came of the action
+    const std::size_t i = r.rows * C + c;
     if (!std::isfinite(static_cast<float>(reward))) throw std::runtime_error("reward: expected a finite number");
-    count(n, reward, now);
     r.reward[i] = valid ? static_cast<float>(reward) : 0, r.terminated[i] = terminated, r.truncated[i] = truncated, r.valid[i] = valid;
-    check(next_obs_at(r, n));
-    ended[n] = terminated || truncated, gap[n] = 0;
-    if (ended[n] && valid) report(r, n, now);
-  }
-  void not_applied(Rollout& r, std::size_t n, double now) {  // the action of this row: call it before `result`
-    // The row must not be learned from, so the episode ends as truncated with the row before, and another begins after it.
-    const std::size_t before = (r.rows - 1) * N + n;
-    if (r.rows && !ended[n]) {
-      r.truncated[before] = 1;
-      if (r.valid[before]) report(r, n, now);
-    }
-    ended[n] = 1;
-  }
-  void outside_of_rows(std::size_t n, double reward, bool end, double now) {  // a step that is in no rollout
-    count(n, reward, now);
-    ended[n] = end, gap[n] = 1;
   }
   bool end_row(Rollout& r) {  // whether the rollout is complete
     if (++r.rows < T) return false;
     std::copy(r.obs.end() - static_cast<std::ptrdiff_t>(obs.size()), r.obs.end(), obs.begin());
     return true;
   }
-  void started(std::size_t n, double now) { ended[n] = 0, episodes_[n] = {0, 0, now}; }  // an episode of copy n began outside of a row
   void check(const void* observed) const {
     for (std::size_t i = 0; i < elements_ && (floats_ || doubles_); ++i)
       if (!std::isfinite(floats_ ? static_cast<const float*>(observed)[i] : static_cast<const double*>(observed)[i]))
         throw std::runtime_error("observation: expected finite numbers");
   }
 
-  const std::size_t T, N, obs_bytes, action_bytes;
-  std::vector<unsigned char> obs;         // [N, …] the newest observations
-  std::vector<unsigned char> ended, gap;  // [N] the next row only resets this copy; does not continue the row before it
+  const std::size_t T, C, obs_bytes, action_bytes;
+  std::vector<unsigned char> obs;  // [C, …] the newest observations
 
  private:
-  void count(std::size_t n, double reward, double now) {  // a step, or the reset after an end
-    if (ended[n]) episodes_[n] = {0, 0, now};
-    else episodes_[n].reward += reward, ++episodes_[n].length;
-  }
-  void report(Rollout& r, std::size_t n, double now) {
-    const Episode& episode = episodes_[n];  // steps in no rollout count, as far as the learner can check the length
-    r.episodes.push_back({episode.reward, std::min<std::uint64_t>(episode.length, (r.sequence + 1) * T), now - episode.seconds});
-  }
-  std::vector<Episode> episodes_;  // that run; `seconds` holds when they began
   bool floats_, doubles_;
   std::size_t elements_;
 };
@@ -106,6 +76,7 @@ struct Evaluation {  // an order, and its answer: an episode for each seed
   bool greedy;
   std::vector<std::uint64_t> seeds;
   std::vector<Episode> episodes;
+  std::vector<double> seat_returns;  // [episodes, A]
   std::vector<bool> cut;
 };
 
@@ -117,13 +88,20 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   std::string other_spaces(const Run& run) const {  // why these are not our spaces, or nothing
     bool same = run.observation.size() == 1 && run.action.size() == 1 && description_.observation.is(run.observation[0]) &&
                 description_.action.is(run.action[0]);
-    return same ? "" : "environment " + description_.id + ": its observations or actions are not what the learner has; build both from the same version";
+    if (!same) return "environment " + description_.id + ": its observations or actions are not what the learner has; build both from the same version";
+    if (run.seats == description_.seats && (run.takes_turns || !description_.takes_turns)) return "";  // who may wait need not
+    auto named = [](const std::vector<std::string>& seats, bool takes_turns) {
+      std::string all;
+      for (const std::string& seat : seats) all += (all.empty() ? " " : ", ") + seat;
+      return (takes_turns ? "agents that take turns:" : "agents:") + (all.empty() ? " none" : all);
+    };
+    return "environment " + description_.id + ": expected " + named(run.seats, run.takes_turns) + ", this client has " + named(description_.seats, description_.takes_turns);
   }
   virtual std::string no_rows() const { return "the C++ client does not record episodes by itself; add --inference learner"; }
   std::string begin_collecting(const Run& run) {
     const Space &seen = description_.observation, &done = description_.action;
     if (std::string why = other_spaces(run); !why.empty()) return why;
-    if (run.rollout_steps + 1 > MAX_FRAME_BYTES / run.copies / std::max(seen.bytes(), done.bytes())) return "the learner asks for rollouts of more than 1 GB";
+    if (run.rollout_steps + 1 > MAX_FRAME_BYTES / run.columns() / std::max(seen.bytes(), done.bytes())) return "the learner asks for rollouts of more than 1 GB";
     if (seen.dtype == "uint8" && seen.shape.size() == 3) return "the C++ client has no convolutions; start the learner with --inference learner";
     if (done.kind == "box" && done.dtype != "float32") return "the C++ client chooses float32 actions; start the learner with --inference learner";
     policy_ = Policy(run, seen, done);
@@ -192,7 +170,8 @@ class CollectorSession : public Session {  // a Session that holds the weights a
            found->second.incarnation == r.incarnation && found->second.tickets.count(r.ticket);
   }
   void finished(std::unique_ptr<Rollout> rollout) {
-    for (unsigned char valid : rollout->valid) steps_ += valid;
+    if (run_.seats.empty()) for (unsigned char valid : rollout->valid) steps_ += valid;
+    else for (std::size_t i = 0; i < run_.rollout_steps * run_.copies; ++i) steps_ += !rollout->resets[i];
     Held& held = held_[rollout->lane];
     held.tickets.erase(rollout->ticket), ++held.sequence;
     send_rollout(*rollout);
@@ -265,29 +244,38 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     for (const Evaluation& order : orders_) if (order.ticket == m.ticket || (order.ticket > m.ticket && order.version != m.version)) return;
     auto over = [&](const Evaluation& order) { return order.version != m.version; };  // the order of a later evaluation ends those before it
     orders_.erase(std::remove_if(orders_.begin(), orders_.end(), over), orders_.end());
-    orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}, {}, {}});
+    orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}, {}, {}, {}});
     for (auto& seed : m.seeds) orders_.back().seeds.push_back(*seed);
   }
 
-  void write(const Episode& episode) {
-    head_.array(4).real(episode.reward).natural(episode.length).real(std::max(0.0, episode.seconds)).array(run_.facts);
-    for (std::size_t i = 0; i < run_.facts; ++i) head_.real(std::nan(""));  // facts that the learner asks for: we have none
+  void write(const std::vector<Episode>& episodes, const std::vector<double>& seat_returns) {
+    const std::size_t A = run_.seats.size(), F = run_.facts.size(), reported = run_.has_seat_returns ? A : 0;
+    head_.array(episodes.size());
+    for (std::size_t i = 0; i < episodes.size(); ++i) {
+      head_.array(4).real(episodes[i].reward).natural(episodes[i].length).real(std::max(0.0, episodes[i].seconds)).array(F);
+      for (std::size_t f = 0; f < F - reported; ++f) head_.real(std::nan(""));  // facts that the learner asks for: we have none
+      for (std::size_t a = 0; a < reported; ++a) head_.real(seat_returns[i * A + a]);
+    }
   }
   void send_rollout(const Rollout& r) {
-    const std::size_t T = run_.rollout_steps, N = run_.copies;
+    const std::size_t T = run_.rollout_steps, C = run_.columns(), N = run_.copies;
     const Space &seen = description_.observation, &done = description_.action;
-    head_.begin("Rollout", 14).natural(session_).natural(r.lane).natural(r.ticket).natural(r.version).natural(r.sequence);
-    head_.array(1).described(seen.wire(), 1, {T + 1, N}, seen.shape);
-    head_.described(done.kind == "discrete" ? "<i8" : "<f4", 2, {T, N}, done.shape);
-    head_.described("<f4", 3, {T, N}).described("<f4", 4, {T, N}).described("|b1", 5, {T, N}).described("|b1", 6, {T, N});
-    head_.described("|b1", 7, {T, N}).described("<f4", 8, {N, 0}).array(r.episodes.size());
-    for (const Episode& episode : r.episodes) write(episode);
-    send(head_, {{r.obs.data(), r.obs.size()}, {r.action.data(), r.action.size()}, {r.log_prob.data(), 4 * T * N},
-                 {r.reward.data(), 4 * T * N}, {r.terminated.data(), T * N}, {r.truncated.data(), T * N}, {r.valid.data(), T * N}, {nullptr, 0}});
+    const bool seats = !run_.seats.empty();
+    head_.begin("Rollout", seats ? 17 : 14).natural(session_).natural(r.lane).natural(r.ticket).natural(r.version).natural(r.sequence);
+    head_.array(1).described(seen.wire(), 1, {T + 1, C}, seen.shape);
+    head_.described(done.kind == "discrete" ? "<i8" : "<f4", 2, {T, C}, done.shape);
+    head_.described("<f4", 3, {T, C}).described("<f4", 4, {T, C}).described("|b1", 5, {T, C}).described("|b1", 6, {T, C});
+    head_.described("|b1", 7, {T, C}).described("<f4", 8, {C, 0});
+    write(r.episodes, r.seat_returns);
+    if (seats) head_.nil().array(0).described("|b1", 9, {T + 1, N});
+    const std::array<Frame, 9> frames{{{r.obs.data(), r.obs.size()}, {r.action.data(), r.action.size()}, {r.log_prob.data(), 4 * T * C},
+                                       {r.reward.data(), 4 * T * C}, {r.terminated.data(), T * C}, {r.truncated.data(), T * C},
+                                       {r.valid.data(), T * C}, {nullptr, 0}, {r.resets.data(), (T + 1) * N}}};
+    send(head_, frames.data(), seats ? 9 : 8);
   }
   void send_evaluation(const Evaluation& e) {
-    head_.begin("Evaluated", 4).natural(session_).natural(e.ticket).array(e.episodes.size());
-    for (const Episode& episode : e.episodes) write(episode);
+    head_.begin("Evaluated", 4).natural(session_).natural(e.ticket);
+    write(e.episodes, e.seat_returns);
     head_.array(e.cut.size());
     for (bool cut : e.cut) head_.boolean(cut);
     send(head_);

@@ -30,7 +30,10 @@ struct Space {  // one array: a Box of float32, float64, uint8 or int64, or a Di
   std::int64_t n = 0, start = 0;  // of a Discrete
 
   static Space box(std::vector<std::size_t> shape, std::vector<double> low, std::vector<double> high, std::string dtype = "float32") {
-    return {"box", std::move(dtype), std::move(shape), std::move(low), std::move(high), 0, 0};
+    Space made{"box", std::move(dtype), std::move(shape), std::move(low), std::move(high), 0, 0};
+    for (const std::vector<double>* bound : {&made.low, &made.high})
+      if (bound->size() != 1 && bound->size() != made.elements()) throw UsageError("space: expected a bound for each element, or one");
+    return made;
   }
   static Space discrete(std::int64_t n, std::int64_t start = 0) { return {"discrete", "int64", {}, {}, {}, n, start}; }
   const char* wire() const {  // the dtype as the wire writes it
@@ -43,6 +46,19 @@ struct Space {  // one array: a Box of float32, float64, uint8 or int64, or a Di
     return all;
   }
   std::size_t bytes() const { return elements() * item_bytes(wire()); }
+  void append(double value, std::vector<unsigned char>& bytes) const {  // in the dtype
+    auto as = [&](auto number) { bytes.insert(bytes.end(), reinterpret_cast<unsigned char*>(&number), reinterpret_cast<unsigned char*>(&number + 1)); };
+    if (dtype == "float32") as(static_cast<float>(value));
+    else if (dtype == "float64") as(value);
+    else if (dtype == "uint8") as(static_cast<std::uint8_t>(value));
+    else as(static_cast<std::int64_t>(value));
+  }
+  std::vector<unsigned char> any() const {  // a value of the space, always the same
+    std::vector<unsigned char> value;
+    if (kind == "discrete") append(static_cast<double>(start), value);
+    else for (std::size_t i = 0; i < elements(); ++i) append(std::clamp(0.0, low[i % low.size()], high[i % high.size()]), value);
+    return value;
+  }
   bool is(const Leaf& leaf) const {
     return leaf.kind == kind && leaf.shape == shape && leaf.dtype == dtype &&
            (kind == "box" || (leaf.sizes == std::vector{n} && leaf.start == std::vector{start}));
@@ -53,6 +69,8 @@ struct Description {  // the environment, for a learner that does not know it
   std::string id;
   Space observation, action;
   std::uint64_t longest_episode = 0;  // time limit in steps; 0: none
+  std::vector<std::string> seats{};   // the names of its agents, if it has several; the spaces are those of each
+  bool takes_turns = false;           // whether an agent may have to wait for others between two of its actions
 };
 
 struct Options {
@@ -183,7 +201,8 @@ class Session {
   Writer head_;
   std::mutex mutex_;
   Options options_;
-  void send(const Writer& head, std::initializer_list<Frame> arrays = {}) { link_.send(head, arrays.begin(), arrays.size()); }
+  void send(const Writer& head, const Frame* arrays, std::size_t count) { link_.send(head, arrays, count); }
+  void send(const Writer& head, std::initializer_list<Frame> arrays = {}) { send(head, arrays.begin(), arrays.size()); }
 
  private:
   static std::optional<Token> token_of(const Options& options) {
@@ -293,16 +312,21 @@ class Session {
   void leave(int code, const std::string& why) { state_ = State::left, exit_code_ = code, reason_ = why; }
 
   void describe() {
-    std::vector<std::vector<char>> bounds;  // the arrays, in the order of their frames
-    beat_head_.begin("Described", 2).natural(session_).array(6);
+    std::vector<std::vector<unsigned char>> bounds;  // the arrays, in the order of their frames
+    beat_head_.begin("Described", 2).natural(session_).array(description_.seats.empty() ? 6 : 10);
     space(description_.observation, bounds), space(description_.action, bounds);
-    bounds.push_back({char(0x80)});  // an empty dict
+    bounds.push_back({0x80});  // an empty dict
     beat_head_.described("|u1", bounds.size(), {1}).text("").natural(description_.longest_episode).text("");
+    if (!description_.seats.empty()) {
+      beat_head_.array(0).array(0).array(description_.seats.size());
+      for (const std::string& seat : description_.seats) beat_head_.text(seat);
+      beat_head_.boolean(description_.takes_turns);
+    }
     std::vector<Frame> frames;
-    for (const std::vector<char>& bound : bounds) frames.push_back({bound.data(), bound.size()});
+    for (const std::vector<unsigned char>& bound : bounds) frames.push_back({bound.data(), bound.size()});
     link_.send(beat_head_, frames.data(), frames.size());
   }
-  void space(const Space& space, std::vector<std::vector<char>>& bounds) {
+  void space(const Space& space, std::vector<std::vector<unsigned char>>& bounds) {
     if (space.kind == "discrete") {
       beat_head_.array(4).text("DiscreteSpace").natural(static_cast<std::uint64_t>(space.n)).whole(space.start).text("int64");
       return;
@@ -311,15 +335,10 @@ class Session {
     for (std::size_t side : space.shape) beat_head_.natural(side);
     beat_head_.text(space.dtype);
     for (const std::vector<double>* bound : {&space.low, &space.high}) {
-      if (bound->size() != 1 && bound->size() != space.elements()) throw UsageError("space: expected a bound for each element, or one");
       bool one = std::all_of(bound->begin(), bound->end(), [&](double each) { return each == bound->front(); });
-      std::vector<char>& bytes = bounds.emplace_back();
+      std::vector<unsigned char>& bytes = bounds.emplace_back();
       for (double value : *bound) {
-        auto append = [&](auto number) { bytes.insert(bytes.end(), reinterpret_cast<char*>(&number), reinterpret_cast<char*>(&number + 1)); };
-        if (space.dtype == "float32") append(static_cast<float>(value));
-        else if (space.dtype == "float64") append(value);
-        else if (space.dtype == "uint8") append(static_cast<std::uint8_t>(value));
-        else append(static_cast<std::int64_t>(value));
+        space.append(value, bytes);
         if (one) break;
       }
       one ? beat_head_.described(space.wire(), bounds.size(), {}) : beat_head_.described(space.wire(), bounds.size(), {}, space.shape);

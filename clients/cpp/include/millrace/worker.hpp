@@ -6,15 +6,9 @@
 #pragma once
 #include <functional>
 
-#include "rollouts.hpp"
+#include "seats.hpp"
 
 namespace millrace {
-
-struct Action {  // views of what the learner sent
-  const void* data;
-  std::int64_t discrete() const { return *static_cast<const std::int64_t*>(data); }  // counted from the space's start
-  const float* box() const { return static_cast<const float*>(data); }
-};
 
 struct Result {
   double reward = 0;
@@ -22,18 +16,38 @@ struct Result {
   bool truncated = false;   // a time limit cut the episode off
 };
 
-class Env {  // one env copy. What it throws ends the client, and the learner is told
+class Env {  // one env copy with one agent. What it throws ends the client, and the learner is told
  public:
   virtual ~Env() = default;
   virtual void reset(std::optional<std::uint64_t> seed, void* obs) = 0;  // no seed: go on with the same random numbers
   virtual Result step(Action action, void* obs) = 0;
 };
 
+class Alone : public SeatedEnv {  // an Env, whose agent acts until its episode ends
+ public:
+  explicit Alone(std::unique_ptr<Env> env) : env_(std::move(env)) {}
+  void reset(std::optional<std::uint64_t> seed, std::vector<Seat>& seats) override { env_->reset(seed, seats[0].obs), seats[0].acts = true; }
+  void step(const std::vector<Action>& actions, std::vector<Seat>& seats) override {
+    const Result result = env_->step(actions[0], seats[0].obs);
+    seats[0] = {seats[0].obs, result.reward, !result.terminated && !result.truncated, result.terminated, result.truncated};
+  }
+
+ private:
+  std::unique_ptr<Env> env_;
+};
+
 class Worker : public CollectorSession {
  public:
   using Make = std::function<std::unique_ptr<Env>()>;
+  using MakeSeated = std::function<std::unique_ptr<SeatedEnv>()>;
   Worker(Options options, Description description, Make make)
-      : CollectorSession(std::move(options), std::move(description)), make_(std::move(make)) {}
+      : CollectorSession(std::move(options), std::move(description)), make_(make), make_seated_([make] { return std::make_unique<Alone>(make()); }) {
+    if (!description_.seats.empty()) throw UsageError("description: expected no agents of an Env, which has one; derive from SeatedEnv");
+  }
+  Worker(Options options, Description description, MakeSeated make)  // collector profile only
+      : CollectorSession(std::move(options), std::move(description)), make_seated_(std::move(make)) {
+    if (description_.seats.empty()) throw UsageError("description: expected the names of the agents");
+  }
 
   ~Worker() override { close(); }
 
@@ -58,10 +72,11 @@ class Worker : public CollectorSession {
 
   std::string begin(const Run& run) override {
     if (run.type == "RunSpec") return begin_collecting(run);
+    if (!make_) return "an environment with several agents needs a client that acts; start the learner without --inference learner";
     if (run.autoreset == "SameStep") return "the C++ client resets a copy in the next step, the learner asks for autoreset SameStep";
     return other_spaces(run);
   }
-  void end() override { lanes_.clear(), collected_.clear(), evaluation_env_.reset(), end_collecting(); }
+  void end() override { lanes_.clear(), collected_.clear(), evaluated_.reset(), end_collecting(); }
   bool busy() const override { return busy_; }
   std::vector<std::uint64_t> lanes() const override {
     std::vector<std::uint64_t> all = CollectorSession::lanes();
@@ -175,11 +190,11 @@ class Worker : public CollectorSession {
 
   struct Collected {  // a lane
     std::uint64_t incarnation;
-    std::vector<std::unique_ptr<Env>> envs;
-    Recorder rows;
+    std::vector<SeatedCopy> copies;
+    SeatRows rows;
     Random random;
-    std::vector<unsigned char> action;
   };
+  SeatedCopy copy() { return {make_seated_(), std::max<std::size_t>(1, description_.seats.size()), description_.observation, description_.action}; }
 
   bool work() {  // the next evaluation or rollout; false if there is none
     if (run_.type != "RunSpec") return false;
@@ -196,25 +211,28 @@ class Worker : public CollectorSession {
     busy_ = true;
     try {
       std::shared_ptr<Collected> lane = lane_of(*rollout);  // ours, even if a pulse releases it
-      Recorder& rows = lane->rows;
+      SeatRows& rows = lane->rows;
       for (rows.begin(*rollout);;) {
         pulse();
         if (!wanted(*rollout, session)) break;
         double began_s = now_s();
-        for (std::size_t n = 0; n < rows.N; ++n)
-          policy_.act(rows.obs_at(*rollout, n), &lane->random, rows.action_at(*rollout, n), rows.log_prob_at(*rollout, n));
+        for (std::size_t c = 0; c < rows.C; ++c) {
+          SeatedCopy& copy = lane->copies[c / rows.A];
+          if (!copy.seats[c % rows.A].acts) {
+            rows.repeat(*rollout, c);
+            continue;
+          }
+          policy_.act(rows.obs_at(*rollout, c), &lane->random, rows.action_at(*rollout, c), rows.log_prob_at(*rollout, c));
+          policy_.to_env(rows.action_at(*rollout, c), copy.action_at(c % rows.A));
+          rows.acted(*rollout, c);
+        }
         double acted_s = now_s();
         {
           InEnv stepping(*this, "stepping");
           for (std::size_t n = 0; n < rows.N; ++n) {
-            Result result;
-            if (rows.ended[n]) {
-              lane->envs[n]->reset(std::nullopt, rows.next_obs_at(*rollout, n));
-            } else {
-              policy_.to_env(rows.action_at(*rollout, n), lane->action.data());
-              result = lane->envs[n]->step({lane->action.data()}, rows.next_obs_at(*rollout, n));
-            }
-            rows.result(*rollout, n, result.reward, result.terminated, result.truncated, acted_s);
+            if (rows.resets[n]) lane->copies[n].reset(std::nullopt);
+            else lane->copies[n].step();
+            rows.result(*rollout, n, lane->copies[n], acted_s);
           }
         }
         act_s_ += acted_s - began_s, step_s_ += now_s() - acted_s;
@@ -233,16 +251,14 @@ class Worker : public CollectorSession {
   std::shared_ptr<Collected> lane_of(const Rollout& r) {  // opened, if this incarnation of it is not yet here
     auto found = collected_.find(r.lane);
     if (found != collected_.end() && found->second->incarnation == r.incarnation) return found->second;
-    auto lane = std::make_shared<Collected>(Collected{r.incarnation, {}, Recorder(run_, description_.observation, description_.action),
-                                                      Random{run_.seed, r.lane, r.incarnation}, {}});
-    lane->action.resize(description_.action.bytes());
+    auto lane = std::make_shared<Collected>(Collected{r.incarnation, {}, SeatRows(run_, description_.observation, description_.action),
+                                                      Random{run_.seed, r.lane, r.incarnation}});
     {
       InEnv making(*this, "making");
       for (std::size_t n = 0; n < run_.copies; ++n) {
-        lane->envs.push_back(make_());
-        lane->envs[n]->reset(Random{run_.seed, r.lane, r.incarnation, n + 1}.bits() >> 1, &lane->rows.obs[n * lane->rows.obs_bytes]);
-        lane->rows.check(&lane->rows.obs[n * lane->rows.obs_bytes]);
-        lane->rows.started(n, now_s());
+        lane->copies.push_back(copy());
+        lane->copies[n].reset(Random{run_.seed, r.lane, r.incarnation, n + 1}.bits() >> 1);
+        lane->rows.started(n, lane->copies[n], now_s());
       }
     }
     return collected_[r.lane] = lane;
@@ -253,28 +269,35 @@ class Worker : public CollectorSession {
     busy_ = true;
     double began_s = now_s();
     try {
-      if (!evaluation_env_) evaluation_env_ = make_();
-      std::shared_ptr<Env> env = evaluation_env_;
-      std::vector<unsigned char> obs(description_.observation.bytes()), stored(description_.action.bytes()), action(stored.size());
+      if (!evaluated_) evaluated_ = std::make_shared<SeatedCopy>(copy());
+      const std::shared_ptr<SeatedCopy> copy = evaluated_;
+      std::vector<unsigned char> stored(description_.action.bytes());
       Random random{evaluation.seeds[0], 1};  // 1: an environment may draw from Random{seed}
       float log_prob;
       for (std::uint64_t seed : evaluation.seeds) {
         double start_s = now_s();
         Episode episode;
-        Result result;
-        env->reset(seed, obs.data());
-        while (!result.terminated && !result.truncated && episode.length < evaluation.most_steps) {
+        std::vector<double> returns(copy->seats.size());
+        auto count = [&] {
+          for (std::size_t a = 0; a < returns.size(); ++a) returns[a] += copy->seats[a].reward, episode.reward += copy->seats[a].reward;
+        };
+        copy->reset(seed), count();
+        while (!copy->over() && episode.length < evaluation.most_steps) {
           pulse();
           if (state_ != State::ready || session != session_) return busy_ = false, drained();  // a client that leaves does not finish it
-          policy_.act(obs.data(), evaluation.greedy ? nullptr : &random, stored.data(), &log_prob);
-          policy_.to_env(stored.data(), action.data());
+          for (std::size_t a = 0; a < returns.size(); ++a) {
+            if (!copy->seats[a].acts) continue;
+            policy_.act(copy->seats[a].obs, evaluation.greedy ? nullptr : &random, stored.data(), &log_prob);
+            policy_.to_env(stored.data(), copy->action_at(a));
+          }
           InEnv evaluating(*this, "evaluating");
-          result = env->step({action.data()}, obs.data());
-          episode.reward += result.reward, ++episode.length, ++steps_;
+          copy->step(), count();
+          ++episode.length, ++steps_;
         }
         episode.seconds = now_s() - start_s;
         evaluation.episodes.push_back(episode);
-        evaluation.cut.push_back(!result.terminated && !result.truncated);
+        evaluation.seat_returns.insert(evaluation.seat_returns.end(), returns.begin(), returns.end());
+        evaluation.cut.push_back(!copy->over());
       }
     } catch (const std::exception& error) {
       return busy_ = false, fail(std::string("while the policy was evaluated: its environment raised: ") + error.what(), std::nullopt);
@@ -284,9 +307,10 @@ class Worker : public CollectorSession {
     evaluated(evaluation);
   }
 
-  Make make_;
+  Make make_;  // none of an environment with seats
+  MakeSeated make_seated_;
   std::map<std::uint64_t, std::shared_ptr<Collected>> collected_;
-  std::shared_ptr<Env> evaluation_env_;
+  std::shared_ptr<SeatedCopy> evaluated_;  // the copy that plays evaluations
   bool busy_ = false;
   double pulse_due_s_ = 0;
   std::map<std::uint64_t, Lane> lanes_;
