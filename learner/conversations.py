@@ -16,12 +16,12 @@ from learner.members.describe import DescribeSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.opponent_pool import OpponentPool
 from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.bounds import MAX_FACTS
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import ExtraArray, PolicySpec, RunSpec, seat_returns
+from protocol.specs import ExtraArray, PolicySpec, RunSpec, counted_facts
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import has_zstd
 from protocol.wire.learner_link import LearnerLink
@@ -49,7 +49,6 @@ def rollout_spec(
         )
     if seats and config.vector != "loop":
         raise UsageError(f"vector {config.vector}: {env.id} has several agents, whose copies are looped; use --vector loop")
-    returns = seat_returns(seats) if len(seats) + len(config.info_keys) <= MAX_FACTS else ()
     run = RunSpec(
         env=env,
         policy=policy,
@@ -62,7 +61,7 @@ def rollout_spec(
         images_dtype=config.acting_dtype if policy.convolves else "float32",
         masked=masked,
         extras=extras,
-        facts=config.info_keys + returns,
+        facts=counted_facts(config.info_keys, seats, opponents=False),
         seats=seats,
         takes_turns=spaces.takes_turns,
         heartbeat_s=config.heartbeat_s(),
@@ -90,12 +89,13 @@ def open_hub(
     check_interrupt: Callable[[], None],
     observer: HubObserver = lambda hub: None,
     past: tuple[Ledger, Sequence[int]] | None = None,
+    opponents: OpponentPool | None = None,
 ) -> Hub:
     """The hub of a run for the workers that connect to this link. An update takes one rollout for each lane.
 
     `processes`: the worker processes that this program started. `check_interrupt` is called while the hub waits: what it
     raises ends the wait. `observer` is called each time the hub has listened. `past`: the ledger, and the next
-    incarnation of each lane, of a run that goes on.
+    incarnation of each lane, of a run that goes on. `opponents`: those of a run with teams.
     """
     ledger, incarnations = (None, ()) if past is None else past
     coordinator = TicketCoordinator(
@@ -105,6 +105,7 @@ def open_hub(
         first_session=int.from_bytes(os.urandom(6), "little"),
         ledger=ledger,
         incarnations=incarnations,
+        opponents=opponents,
     )
     limits = [most for most in (config.max_env_copies, processes.most_copies) if most]
     if limits:

@@ -1,13 +1,14 @@
 """A learner that trains nothing: it has workers play episodes of the policy of a run folder.
 
-Rule: the policy is published as version 0, once. The learner's process runs no environment code. Timeouts and the number of
-failures that are allowed are those of a training run.
+Rule: the policy is published as version 1, once; one that plays against it, as version 0. The learner's process runs no
+environment code. Timeouts and the number of failures that are allowed are those of a training run.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,13 +20,18 @@ from learner.members.describe import described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.hub import Hub
+from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
-from protocol.specs import DescribeSpec, PolicySpec, RunSpec
+from protocol.errors import UsageError
+from protocol.specs import DescribeSpec, PolicySpec, RunSpec, counted_facts, teams_of
 from protocol.wire.learner_link import LearnerLink
+
+RIVAL, POLICY = 0, 1
+"""The versions of the weights."""
 
 
 class SavedPolicy(NamedTuple):
@@ -41,6 +47,8 @@ class SavedPolicy(NamedTuple):
     """whether the environment says which actions are allowed"""
     seats: tuple[str, ...] = ()
     """the names of its agents"""
+    teams: tuple[tuple[int, ...], ...] = ()
+    """the seats of each team, if it has met opponents"""
 
 
 def saved_policy(
@@ -54,7 +62,7 @@ def saved_policy(
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     outer = card.wrappers if wrappers is None else wrappers
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
-    return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked, card.seats)
+    return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked, card.seats, card.teams)
 
 
 class PolicyPlayer:
@@ -69,16 +77,24 @@ class PolicyPlayer:
         watch: Callable[[str], None],
         settings: RolloutConfig,
         described: DescribedEnv | None = None,
+        against: SavedPolicy | None = None,
     ) -> None:
         """`check_interrupt` is called while it waits: what it raises ends the wait. `settings`: timeouts and failures.
 
         `watch` is called several times a second with how far it is, as text. `described`: the environment, if a worker has
-        described it.
+        described it. `against`: a policy that plays the other teams. Raises `UsageError` if it cannot.
         """
-        self.policy = policy
+        self.policy, self._against = policy, against
+        if against is not None:
+            _check_rival(policy, against)
         self._link, self._processes = link, processes
         self._check_interrupt, self._watch, self._settings, self._described = check_interrupt, watch, settings, described
         self._hub: Hub | None = None
+
+    @property
+    def facts(self) -> tuple[str, ...]:
+        """The names of the facts of the episodes that were played."""
+        return self.policy.facts if self._hub is None else self._hub.coordinator.run.facts
 
     @property
     def workers(self) -> int:
@@ -103,11 +119,15 @@ class PolicyPlayer:
     ) -> list[PlayedEpisode]:
         """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
 
+        Against another policy, both draw their actions, because two greedy ones would repeat the same few games.
+
         `bound` and `before` are those of `EvaluationPlan.how_far`, which makes the text that `watch` gets.
         """
         if self._hub is None:
             self._hub = self._published()
         show = self._watch
+        if self._against is not None:
+            plan = replace(plan, greedy=False, opponents=(RIVAL,))
         self._hub.begin_evaluation(plan, on_rows)
         return self._hub.end_evaluation(lambda played, steps: show(plan.how_far(played, steps, bound, before)))
 
@@ -133,9 +153,32 @@ class PolicyPlayer:
             takes_turns=bool(policy.seats),  # perhaps
             heartbeat_s=settings.heartbeat_s(),
         )
-        hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
-        hub.publish(0, policy.parameters, policy.buffers, deal=False)
+        if (against := self._against) is None:
+            hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
+        else:
+            teams, keys = policy.teams or teams_of(policy.seats), run.info_keys
+            facts = counted_facts(keys, policy.seats, opponents=True)
+            run = msgspec.structs.replace(run, teams=teams, facts=facts, opponent=against.spec)
+            pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
+            pool.made(RIVAL, 0)
+            hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt, opponents=pool)
+            hub.publish(RIVAL, against.parameters, against.buffers, deal=False)
+        hub.publish(POLICY, policy.parameters, policy.buffers, deal=False)
         return hub
+
+
+def _check_rival(policy: SavedPolicy, rival: SavedPolicy) -> None:
+    """Raises `UsageError` unless this policy can play against the other one."""
+    if len(policy.seats) < 2:
+        raise UsageError(f"against: expected an environment of several agents, got {policy.env.id}")
+    for what, expected, got in (
+        ("agents", policy.seats, rival.seats),
+        ("observations", policy.spec.observation, rival.spec.observation),
+        ("actions", policy.spec.action, rival.spec.action),
+        ("action masks", policy.masked, rival.masked),
+    ):
+        if expected != got:
+            raise UsageError(f"against: expected a policy for the same {what}, {expected}; got {got}")
 
 
 def useful_workers(workers: int, episodes: int, copies: int) -> int:

@@ -26,6 +26,7 @@ from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.prior_dataset import PriorDataset
 from learner.recording.training_recorder import TrainingRecorder
 from learner.rollouts.hub import Hub, HubObserver
+from learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from learner.run_folder.lease import Closed, Listens
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_setup import KnownEnvironment, RunSetup
@@ -144,13 +145,16 @@ def open_run(
     # The last save gets half of what is left of the grace time, and the workers need time to leave.
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
     past = (state.ledger, state.incarnations)
-    hub = open_hub(config, spec, link, processes, setup.check_running, observer, past)
+    pool = opponent_pool(config, spec, state.opponents)
+    hub = open_hub(config, spec, link, processes, setup.check_running, observer, past, pool)
+    if state.opponent_policies is not None:
+        hub.keep_opponents(*state.opponent_policies)
     dataset = _training_recorder(config, folder, setup.known, spec)
     setup.check_interrupt()
     folder.remove_temporary()
     folder.write_config(config, workers_elsewhere=not processes.expected)
     folder.remove_summary()
-    tally = Tally(config, spec, state, lambda: callbacks.stop_reason)
+    tally = Tally(config, spec, state, lambda: callbacks.stop_reason, pool)
     parts = RunParts(config, spec, folder, algorithm, hub, tally)
     between = open_files(parts, callbacks, dataset, setup.known.evaluation_limit)
     run = OpenRun(setup, algorithm, hub, between, prior)
@@ -160,6 +164,17 @@ def open_run(
     folder.keep()
     run.announce(link.address, config.advertise, link.keyring)
     return run
+
+
+def opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentPool | None:
+    """The opponents of the run, if the policy does not play all teams."""
+    if not spec.teams:
+        return None
+    window, scripted = config.self_play, len(spec.scripted)
+    settings = PoolSettings(
+        config.seed, window, config.self_play_save_steps, config.self_play_latest, config.max_lag, scripted
+    )
+    return OpponentPool(settings, state)
 
 
 def _use_threads(setup: RunSetup, policy: PolicySpec, processes: ProcessCallbacks) -> RunSetup:

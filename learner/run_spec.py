@@ -11,7 +11,8 @@ from learner.env_spaces import EnvSpaces
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
-from protocol.specs import PolicySpec, RunSpec
+from protocol.specs import PolicySpec, RunSpec, counted_facts, teams_of
+from protocol.wire.codec import check_can_be_sent
 
 
 def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
@@ -28,7 +29,26 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
                 raise UsageError(f"{setting}: expected none, because {why}, which a dataset has not")
         if given and config.inference == "learner":
             raise UsageError(f"inference learner: {why}, and workers must act; use --inference workers")
-    return rollout_spec(config, env, policy, config.algorithm.rollout_steps, spaces=spaces)
+    spec = rollout_spec(config, env, policy, config.algorithm.rollout_steps, spaces=spaces)
+    return _with_opponents(config, spec)
+
+
+def _with_opponents(config: Config, spec: RunSpec) -> RunSpec:
+    """The specification with teams and opponents, if the run has any. Raises `UsageError`."""
+    if not (config.self_play or config.opponents):
+        if config.teams:
+            raise UsageError("teams: expected none without opponents; give self_play, or opponents")
+        return spec
+    what = "self_play" if config.self_play else "opponents"
+    if len(spec.seats) < 2:
+        raise UsageError(f"{what}: expected an environment of several agents, got {config.env}")
+    teams = teams_of(spec.seats, config.teams)
+    if config.envs < len(teams):
+        raise UsageError(f"{what}: expected envs {len(teams)} or more, so that each team is played, got {config.envs}")
+    facts = counted_facts(config.info_keys, spec.seats, opponents=True)
+    spec = msgspec.structs.replace(spec, teams=teams, scripted=config.opponents, facts=facts)
+    check_can_be_sent(config.env, spec)
+    return spec
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:

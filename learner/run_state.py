@@ -17,6 +17,7 @@ from learner.algorithms.algorithm import Start
 from learner.config.config import Config
 from learner.resume_checks import first_difference, policy_to_start_from
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.opponent_pool import PoolState
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import AttributesState, EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
@@ -33,7 +34,7 @@ log = logging.getLogger("millrace.learner")
 
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, BadMessage)
 """What loading a state of another form raises."""
-POLICIES = ("best_policy", "pending_policy")  # of a `RunState`; a checkpoint has them as tensors
+POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # of a `RunState`; a checkpoint has them as tensors
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
@@ -63,6 +64,10 @@ class RunState(msgspec.Struct, kw_only=True):
     """Of the evaluation beside training that has no result yet."""
     pending_policy: Any = None
     """Its parameters [P] and buffers, both float32."""
+    opponents: PoolState = msgspec.field(default_factory=PoolState)
+    """The opponents of self-play, and the ratings."""
+    opponent_policies: Any = None
+    """Parameters [n, P] and buffers [n, B] of its snapshots, both float32."""
     next_evaluation: Natural = 0
     """Env steps at which the next evaluation is due; 0 if that is not known."""
 

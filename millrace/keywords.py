@@ -160,6 +160,23 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: float | None
     """Stop as soon as the mean return of the last 100 training episodes is at least this."""
+    self_play: int
+    """Self-play: of an environment of several agents, the policy plays one team, and opponents play the others. They are
+    drawn from so many earlier versions of the policy, the newest snapshots. 0: it plays all agents, or meets opponents
+    alone.
+    """
+    self_play_save_steps: int
+    """Env steps between two snapshots."""
+    self_play_latest: float
+    """Share of the rollouts in which the policy meets itself, as it is then, in place of an earlier version."""
+    opponents: Sequence[str]
+    """Opponents of your own, which are drawn as the snapshots are, and which evaluations are played against. Without
+    self_play the policy meets them alone. docs/how-to/self_play.md shows what the factory returns.
+    """
+    teams: Sequence[str]
+    """The teams, all of one size: a pattern of the names of the agents of each, as in "red_*" "blue_*". Without any, each
+    agent is a team. In different env copies, the policy plays different teams.
+    """
     inference: Literal["workers", "learner"]
     """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at
     once; workers then only step the environments.
@@ -384,6 +401,8 @@ class PlayKeywords(TypedDict, total=False):
 class EvaluateKeywords(PlayKeywords, total=False):
     """Keywords of `millrace.evaluate`."""
 
+    against: str | PathLike[str] | None
+    """run folder of a policy that plays the other teams; both draw their actions, and each team is played in turn"""
     seed: int
     """seed of the episodes"""
     copies: int

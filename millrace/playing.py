@@ -155,11 +155,12 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     copies = 1 if flags.video else flags.copies
     count = useful_workers(flags.workers, episodes, copies)
     workers = _workers(flags, count, min(copies, episodes))
-    with policy_player(saved, workers, watch) as player:
+    rival = None if flags.against is None else _saved(flags, given, flags.against)
+    with policy_player(saved, workers, watch, rival) as player:
         if flags.video:
             return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps)
         played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps), bound="--max-steps:")
-        return evaluation_of(played, saved.facts), []
+        return evaluation_of(played, player.facts), []
 
 
 def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
@@ -179,9 +180,10 @@ def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> Pla
     return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
 
 
-def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
+def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None, run: Path | None = None) -> SavedPolicy:
+    """The policy to play, of `flags.run` or of another `run`."""
     env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
-    saved = saved_policy(flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
+    saved = saved_policy(run or flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
     if saved.seats and flags.inference == "learner":
         raise UsageError(
             f"inference learner: {saved.env.id} has several agents, and workers must act; use --inference workers"

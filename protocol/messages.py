@@ -6,6 +6,7 @@ not used. Every field has a bound (`protocol/bounds.py`), which decoding checks.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated
 
 import msgspec
@@ -97,6 +98,11 @@ class Weights(Message, frozen=True):
     """
 
 
+def versions_of(version: int, opponents: Iterable[int | None]) -> set[int]:
+    """The versions of the weights that act, and of those opponents that are weights."""
+    return {version, *(number for number in opponents if number is not None and number >= 0)}
+
+
 class Permit(msgspec.Struct, frozen=True, array_like=True):
     """A ticket as it travels: permission for one rollout, on this lane and incarnation."""
 
@@ -105,6 +111,9 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     incarnation: Natural
     sequence: Natural
     """number of the rollout: they are collected in this order, from 0 in every incarnation"""
+    opponent: Whole | None = None
+    """who plays the other teams in the episodes that begin in it: the version of these weights, or −1 − k for
+    `RunSpec.scripted[k]`"""
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
@@ -126,6 +135,11 @@ class Collect(Message, frozen=True):
     permits: Annotated[tuple[Permit, ...], Meta(max_length=MAX_TICKETS)]
     received: tuple[Received, ...]
     """one entry for each lane of this worker; a lane that is not listed belongs to another worker"""
+
+    @property
+    def versions(self) -> set[int]:
+        """Those of the weights that it names."""
+        return versions_of(self.version, [permit.opponent for permit in self.permits])
 
 
 class LaneIncarnation(msgspec.Struct, frozen=True, array_like=True):
@@ -223,6 +237,15 @@ class Evaluate(Message, frozen=True):
     """also send every row, as `EpisodeRows`"""
     send_frames: bool
     """also send what the environment renders, as `EpisodeRows`"""
+    opponents: Annotated[tuple[Whole, ...], Meta(max_length=MAX_SEEDS)] = ()
+    """with `RunSpec.teams`: who plays the other teams, as in a `Permit`, one for each seed"""
+    teams: Annotated[tuple[Natural, ...], Meta(max_length=MAX_SEEDS)] = ()
+    """the team that the weights play, one for each of `opponents`"""
+
+    @property
+    def versions(self) -> set[int]:
+        """Those of the weights that it names."""
+        return versions_of(self.version, self.opponents)
 
 
 class EpisodeRows(Message, frozen=True):
@@ -433,5 +456,5 @@ __all__ = [
     "EpisodeRows", "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire",
     "LaneIncarnation", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset", "Returned",
     "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
-    "WorkerActivity", "WorkerExit", "WorkerStatus",
+    "WorkerActivity", "WorkerExit", "WorkerStatus", "versions_of",
 ]  # fmt: skip

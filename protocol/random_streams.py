@@ -47,6 +47,12 @@ class Purpose(IntEnum):
     """reset seed of the second instance of `ResetAhead`, from that of the first"""
     CLONING = 16
     """the order of demonstrations; epoch"""
+    OPPONENTS = 17
+    """actions of opponents; lane, incarnation"""
+    MATCHES = 18
+    """which opponent plays in a rollout; lane, incarnation, sequence"""
+    PLAYED_OPPONENTS = 19
+    """actions of opponents in an episode, from its reset seed"""
 
 
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:

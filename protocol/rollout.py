@@ -32,7 +32,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from protocol.arrays import Array, Bools, Floats
-from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
+from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds, Whole
 from protocol.specs import RunSpec
 
 
@@ -45,6 +45,8 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     seconds: Seconds
     facts: Annotated[tuple[float, ...], Meta(max_length=MAX_FACTS)] = ()
     """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where it had none"""
+    opponent: Whole | None = None
+    """who played the other teams, as in a `Permit`; none if the policy played all seats"""
 
 
 class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
@@ -80,7 +82,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     """one array [T, N, *shape] for each of `RunSpec.extras`"""
     resets: Array | None = None
     """[T+1, N] bool, with seats: whether step t only resets this copy; the last row is of the next rollout's first step. The
-    N of all other arrays is then `RunSpec.columns`. None without seats: it is ~valid"""
+    N of all other arrays is then `RunSpec.copies` · `RunSpec.sent_seats`. None without seats: it is ~valid"""
 
     @property
     def env_steps(self) -> int:
@@ -96,7 +98,7 @@ def _env_steps(valid: Array, resets: Array | None) -> int:
 
 def rollout_bytes(run: RunSpec) -> int:
     """Number of bytes of all arrays of a rollout of this run."""
-    T, N = run.rollout_steps, run.columns
+    T, N = run.rollout_steps, run.copies * run.sent_seats
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
     if run.masked:

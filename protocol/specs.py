@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from typing import Literal
 
 import msgspec
 
-from protocol.bounds import MAX_NAME, one_line
+from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
+from protocol.errors import UsageError
 from protocol.space_spec import Shape
 from protocol.wire.weight_dtypes import ActingDtype
 
@@ -227,19 +230,41 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """names of the A agents of each copy; empty if the environment is gymnasium's, which has one"""
     takes_turns: bool = False
     """whether a seat may have to wait for others between two of its actions"""
+    teams: tuple[tuple[int, ...], ...] = ()
+    """with opponents: the seats of each team, all of one size. In each copy the policy plays one team, and rollouts have the
+    rows of that one alone. Empty: it plays all seats"""
+    scripted: tuple[str, ...] = ()
+    """opponents that are no weights: each is a callable that makes a policy (`protocol/policy/called_policy.py`)"""
+    opponent: PolicySpec | None = None
+    """the policy of opponents, if it is not `policy`"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
 
     @property
     def columns(self) -> int:
-        """N · A, the columns of a rollout: those of a copy's seats are adjacent."""
+        """N · A, the columns of a lane: those of a copy's seats are adjacent."""
         return self.copies * self.seats_of_copy
 
     @property
+    def sent_seats(self) -> int:
+        """How many seats of each copy a rollout has the rows of."""
+        return len(self.teams[0]) if self.teams else self.seats_of_copy
+
+    def team_of(self, lane: int, copy: int) -> int:
+        """The team that the policy plays in this copy of a lane, for all episodes."""
+        return (lane * self.copies + copy) % len(self.teams)
+
+    @property
     def info_keys(self) -> tuple[str, ...]:
-        """The facts that an environment reports; the others, the last ones, are the returns of the seats."""
-        return self.facts[: len(self.facts) - len(self.seats)] if self.has_seat_returns else self.facts
+        """The facts that an environment reports. Those after them are counted: the score, or the returns of the seats."""
+        counted = 1 if self.teams else len(self.seats) if self.has_seat_returns else 0
+        return self.facts[: len(self.facts) - counted]
+
+    @property
+    def facts_of_all_seats(self) -> tuple[str, ...]:
+        """Those of an episode in which the policy plays all seats."""
+        return counted_facts(self.info_keys, self.seats, opponents=False)
 
     @property
     def has_seat_returns(self) -> bool:
@@ -256,12 +281,44 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         """The axes of the rows of a rollout, as errors name them (`protocol.rows.array_checks`)."""
         return "step", self.seats or "copy"
 
+    @property
+    def sent_axes(self) -> tuple[str, str | tuple[str, ...]]:
+        """Those of the rows that are sent. With teams, a column is of one seat in one copy and of another in the next."""
+        return ("step", "column") if self.teams else self.row_axes
+
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
-        for what, called in (("encoder", self.policy.encoder), ("policy", self.policy.own)):
-            if called is not None and (why := code.refuses_to_call(f"{what} {called.factory}")):
+        called = [("encoder", self.policy.encoder), ("policy", self.policy.own)]
+        if self.opponent is not None:
+            called.append(("encoder", self.opponent.encoder))
+        factories = [f"{what} {each.factory}" for what, each in called if each is not None]
+        for what in (*factories, *(f"opponent {factory}" for factory in self.scripted)):
+            if why := code.refuses_to_call(what):
                 return why
         return self.env.rejection_reason(code)
+
+
+SCORE = "score"
+"""Name of the last fact of an episode with opponents: 1 if the policy's team had the highest return, 1/2 in a tie, or 0."""
+
+
+def counted_facts(info_keys: tuple[str, ...], seats: tuple[str, ...], *, opponents: bool) -> tuple[str, ...]:
+    """The names of the facts of an episode: what the environment reports, then what is counted."""
+    if opponents:
+        return (*info_keys, SCORE)
+    return info_keys + (seat_returns(seats) if len(seats) + len(info_keys) <= MAX_FACTS else ())
+
+
+def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tuple[int, ...], ...]:
+    """The seats of each team, by these patterns of their names; without any, each seat is a team. Raises `UsageError`."""
+    if not patterns:
+        return tuple((seat,) for seat in range(len(seats)))
+    found = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
+    if len(found) < 2 or sorted(n for team in found for n in team) != list(range(len(seats))):
+        raise UsageError(f"teams: expected patterns that put each of {', '.join(seats)} into one team, got {list(patterns)}")
+    if len({len(team) for team in found}) > 1:
+        raise UsageError(f"teams: expected as many agents in each, got {[len(team) for team in found]}")
+    return tuple(found)
 
 
 def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:

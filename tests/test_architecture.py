@@ -57,8 +57,9 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "envs": {"copy_slots"},
     "copies": {"activity", "copy_slots", "envs"},
     "acting": set[str](),
-    "collect": {"activity", "acting", "conversation", "copies", "copy_slots"},
-    "evaluate": {"acting", "activity", "copies"},
+    "opponents": {"acting"},
+    "collect": {"activity", "acting", "conversation", "copies", "copy_slots", "opponents"},
+    "evaluate": {"acting", "activity", "copies", "opponents"},
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package

@@ -176,12 +176,12 @@ class Worker:
             self._pulse(work)
 
         match work:
-            case RolloutTask(session, weights, assignments):
-                return self._loaded_collector(weights).collect(assignments, weights.version, session, pulse)
-            case EvaluationTask(weights, order):
+            case RolloutTask(session, weights, assignments, held):
+                return self._loaded_collector(weights).collect(assignments, weights.version, session, pulse, held)
+            case EvaluationTask(weights, order, held):
                 self._loaded_collector(weights)
                 assert self._evaluator is not None
-                return [self._evaluator.play(order, lambda rows: self._do([SendMessage(rows)]), pulse)]
+                return [self._evaluator.play(order, lambda rows: self._do([SendMessage(rows)]), pulse, held)]
         assert self._stepper is not None
         with self._heartbeats.lock_released():
             return [self._stepper.execute(work, lambda: self._pulse_from_env_code(work))]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from learner.between_updates.run_parts import RunParts
 from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
@@ -102,7 +103,15 @@ class Evaluations:
         folder.writes.write(
             "best policy",
             lambda: folder.write_policy(
-                spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked, spec.seats
+                spec.policy,
+                spec.env,
+                parameters,
+                buffers,
+                "best",
+                spec.facts_of_all_seats,
+                spec.masked,
+                spec.seats,
+                spec.teams,
             ),
         )
 
@@ -143,7 +152,9 @@ class Evaluations:
         self._run.hub.begin_evaluation(self._plan(Purpose.EVALUATION, evaluation_size(self._config)), beside=True)
 
     def _plan(self, purpose: Purpose, size: EvaluationSize) -> EvaluationPlan:
-        return EvaluationPlan.of(size.episodes, self._config.seed, self._config.eval_copies, size.max_steps, purpose)
+        plan = EvaluationPlan.of(size.episodes, self._config.seed, self._config.eval_copies, size.max_steps, purpose)
+        pool = self._tally.pool
+        return plan if pool is None else replace(plan, opponents=pool.yardsticks)
 
     def _end(self, watch: Callable[[], None]) -> Evaluation:
         """Wait for the evaluation that was begun."""

@@ -171,13 +171,20 @@ class RunFiles:
             wall_s=self._tally.wall_s(snapshot),
             ledger=snapshot.ledger,
             incarnations=snapshot.incarnations,
+            opponent_policies=self._hub.opponent_policies(),
             episodes=self._tally.window.state(),
             facts=list(spec.facts),
             env_attributes=self._attributes.state(self._state.version),
         ).checkpoint_content(self._algorithm)
         try:
             self._folder.write_policy(
-                spec.policy, spec.env, *self.weights(), facts=spec.facts, masked=spec.masked, seats=spec.seats
+                spec.policy,
+                spec.env,
+                *self.weights(),
+                facts=spec.facts_of_all_seats,
+                masked=spec.masked,
+                seats=spec.seats,
+                teams=spec.teams,
             )
             self._policy_env_steps = env_steps
         finally:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from learner.between_updates.stop_rules import reason_to_stop
 from learner.config.config import Config
 from learner.rollouts.hub import HubSnapshot
+from learner.rollouts.opponent_pool import OpponentPool
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_state import RunState
 from protocol.rollout import Batch, Episode
@@ -28,9 +29,10 @@ class Tally:
         spec: RunSpec,
         state: RunState,
         ended_by: Callable[[], str | None] = lambda: None,
+        pool: OpponentPool | None = None,
     ) -> None:
-        """`state`: where the run stands. `ended_by`: why a callback has ended the run, or None."""
-        self.state = state
+        """`state`: where the run stands. `ended_by`: why a callback has ended the run, or None. `pool`: of self-play."""
+        self.pool, self.state = pool, state
         """Also the evaluations change it. A checkpoint adds what others hold."""
         self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self.new_episodes: tuple[Episode, ...] = ()
@@ -54,6 +56,8 @@ class Tally:
         self.state.version += 1
         self.state.env_steps += batch.env_steps
         self.window.extend(batch.episodes)
+        if self.pool is not None:
+            self.pool.played(batch.episodes)
         self.new_episodes = batch.episodes
 
     def stop_reason(self) -> str | None:

@@ -38,8 +38,11 @@ BASIC = (
 )  # fmt: skip
 GROUPS = {
     "evaluation": ("eval_env_kwargs", "eval_workers", "eval_copies", "eval_max_steps", "info_keys"),
+    "several agents": (
+        "seat_id", "self_play", "self_play_save_steps", "self_play_latest", "opponents", "teams",
+    ),
     "workers": (
-        "lanes", "max_lag", "vector", "seat_id", "critic_keys", "action_masks", "inference", "acting_dtype", "torch_threads",
+        "lanes", "max_lag", "vector", "critic_keys", "action_masks", "inference", "acting_dtype", "torch_threads",
         "max_env_copies", "min_workers", "launched_workers",
     ),
     "network": ("transport", "bind", "advertise", "keys", "insecure"),

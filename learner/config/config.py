@@ -78,6 +78,26 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     target_mean_return: Free[float | None] = None
     """Stop as soon as the mean return of the last 100 training episodes is at least this."""
 
+    # ---------------------------------------------------------------------------------------------------------- self-play
+
+    self_play: Fixed[Natural] = 0
+    """Self-play: of an environment of several agents, the policy plays one team, and opponents play the others. They are
+    drawn from so many earlier versions of the policy, the newest snapshots. 0: it plays all agents, or meets opponents
+    alone.
+    """
+    self_play_save_steps: Free[Count] = 20_000
+    """Env steps between two snapshots."""
+    self_play_latest: Free[Annotated[float, Meta(ge=0, le=1)]] = 0.5
+    """Share of the rollouts in which the policy meets itself, as it is then, in place of an earlier version."""
+    opponents: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:FACTORY ...")] = ()
+    """Opponents of your own, which are drawn as the snapshots are, and which evaluations are played against. Without
+    self_play the policy meets them alone. docs/how-to/self_play.md shows what the factory returns.
+    """
+    teams: Annotated[Fixed[tuple[str, ...]], Flag("PATTERN ...")] = ()
+    """The teams, all of one size: a pattern of the names of the agents of each, as in "red_*" "blue_*". Without any, each
+    agent is a team. In different env copies, the policy plays different teams.
+    """
+
     # ------------------------------------------------------------------------------------------------------------ workers
 
     inference: Free[Literal["workers", "learner"]] = "workers"

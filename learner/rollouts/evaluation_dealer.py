@@ -21,7 +21,7 @@ import msgspec
 from learner.members.membership import Member, Outgoing
 from learner.run_folder.results import Evaluation, fact_means
 from protocol.bounds import LARGEST
-from protocol.messages import EpisodeRows, Evaluate, Evaluated
+from protocol.messages import EpisodeRows, Evaluate, Evaluated, versions_of
 from protocol.random_streams import Purpose, env_seed
 from protocol.rollout import Episode
 from protocol.rows.played import reason_to_reject
@@ -54,6 +54,8 @@ class EvaluationPlan:
     send_frames: bool = False
     of_best: bool = False
     """the weights are those of the best policy of the run"""
+    opponents: tuple[int, ...] = ()
+    """with teams: who plays the others, as in a `Permit`; they take turns"""
 
     @staticmethod
     def of(episodes: int, seed: int, copies: int, max_steps: int, purpose: Purpose = Purpose.EPISODES) -> EvaluationPlan:
@@ -195,7 +197,8 @@ class EvaluationDealer:
 
     def versions(self, tickets: Iterable[int]) -> set[int]:
         """The versions that these tickets name, those of an evaluation among them."""
-        return {self.version for number in tickets if number in self.held}
+        held = [number for number in tickets if number in self.held]
+        return {version for number in held for version in versions_of(self.version, self._matches(number)[0])}
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
         """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""
@@ -251,6 +254,7 @@ class EvaluationDealer:
         plan = self._plan
         assert plan is not None
         member.tickets[number] = member.replies
+        opponents, teams = self._matches(number)
         return Evaluate(
             session=member.session,
             ticket=number,
@@ -260,7 +264,19 @@ class EvaluationDealer:
             most_steps=plan.most_steps,
             send_rows=plan.send_rows,
             send_frames=plan.send_frames,
+            opponents=opponents,
+            teams=teams,
         )
+
+    def _matches(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The opponent of each episode of a ticket, and the team that is evaluated: each opponent meets all teams."""
+        plan, count = self._plan, len(self._run.teams)
+        if plan is None or not count:
+            return (), ()
+        index = number - self._first
+        episodes = range(index * plan.copies, index * plan.copies + len(self._seeds[index]))
+        opponents = tuple(plan.opponents[episode // count % len(plan.opponents)] for episode in episodes)
+        return opponents, tuple(episode % count for episode in episodes)
 
     def _wrong(self, answer: Evaluated, seeds: int) -> str:
         assert self._plan is not None
@@ -268,8 +284,12 @@ class EvaluationDealer:
         if len(answer.episodes) != seeds or len(answer.cut) != seeds:
             return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
         for episode in answer.episodes:
-            if why := wrong_facts(episode, len(self._run.facts)):
+            if why := wrong_facts(episode, self._run):
                 return f"episode: {why}"
+        opponents, _ = self._matches(answer.ticket)
+        if self._run.teams and tuple(episode.opponent for episode in answer.episodes) != opponents:
+            return f"expected the opponents {opponents}, got {[episode.opponent for episode in answer.episodes]}"
+        for episode in answer.episodes:
             if episode.length > most:
                 return f"expected episodes of at most {most} steps, got {episode.length}"
             rewards = episode.length * self._run.seats_of_copy

@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from learner.members.failure_count import FailureCount
 from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
@@ -30,15 +32,15 @@ from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
 from protocol.address import name_for_people, worker_name
 from protocol.alive import NO_TIMEOUTS, CallTimeouts
-from protocol.arrays import Array
+from protocol.arrays import Array, Floats
 from protocol.bounds import Stages, one_line
 from protocol.errors import BadRollout, Stalled
 from protocol.logs.long_wait import LongWait
-from protocol.messages import Evaluated, Rollout, Status, ToLearner
+from protocol.messages import Evaluated, Rollout, Status, ToLearner, Weights
 from protocol.rollout import rollout_bytes
 from protocol.rows.rollout_checks import validate
 from protocol.wire.learner_link import LearnerLink
-from protocol.wire.weight_dtypes import ActingDtype, to_wire_dtype
+from protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 
 log = logging.getLogger("millrace.learner")
 
@@ -151,6 +153,22 @@ class Hub:
         self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes)
         if deal:
             self._server.send(self.coordinator.begin_update())
+
+    def keep_opponents(self, parameters: Array, buffers: Array) -> None:
+        """Keep the weights [n, P] and buffers [n, B] of the snapshots of a run that goes on."""
+        pool = self.coordinator.rollouts.opponents
+        versions = [] if pool is None else pool.versions
+        for version, *arrays in zip(versions, parameters, buffers, strict=True):
+            sent = to_wire_dtype(arrays[0], self.settings.acting_dtype)
+            self.coordinator.weights.kept[version] = Weights(version, sent, arrays[1])
+
+    def opponent_policies(self) -> tuple[Floats, Floats] | None:
+        """Those of all snapshots, float32, if there are any."""
+        kept, pool = self.coordinator.weights.kept, self.coordinator.rollouts.opponents
+        if pool is None or not pool.versions:
+            return None
+        found = [kept[version] for version in pool.versions]
+        return np.stack([to_float32(each.parameters) for each in found]), np.stack([each.buffers for each in found])
 
     def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.

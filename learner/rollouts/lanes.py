@@ -41,10 +41,10 @@ class TicketedLane(PlacedLane):
             self.incarnation += 1
             self.dealt, self.next_sequence, self.out_of_order = 0, 0, set()
 
-    def deal(self, number: int, round_number: int, version: int) -> Ticket:
+    def deal(self, number: int, round_number: int, version: int, opponent: int | None) -> Ticket:
         """A ticket for the next rollout, for the lane's owner."""
         assert self.owner is not None
-        ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner)
+        ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner, opponent)
         self.outstanding.add(number)
         self.dealt += 1
         return ticket
@@ -76,6 +76,8 @@ class Ticket:
     version: int
     """Version of the weights that act."""
     peer: bytes
+    opponent: int | None = None
+    """As in a `Permit`."""
 
 
 @dataclass(frozen=True, slots=True)

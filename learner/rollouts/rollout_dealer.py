@@ -14,15 +14,24 @@ from dataclasses import replace
 from learner.members.membership import Member, Outgoing
 from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.opponent_pool import OpponentPool
 from learner.rollouts.rounds import Rounds
-from protocol.messages import Collect, Permit, Received, Rollout
+from protocol.messages import Collect, Permit, Received, Rollout, versions_of
 
 
 class RolloutDealer:
     """Lanes, rounds, tickets and the ledger."""
 
-    def __init__(self, lanes: int, max_lag: int, ledger: Ledger | None = None, incarnations: Sequence[int] = ()) -> None:
-        """`incarnations`: the first of each lane; there may be more or fewer of them than lanes."""
+    def __init__(
+        self,
+        lanes: int,
+        max_lag: int,
+        ledger: Ledger | None = None,
+        incarnations: Sequence[int] = (),
+        opponents: OpponentPool | None = None,
+    ) -> None:
+        """`incarnations`: the first of each lane; there may be more or fewer of them than lanes. `opponents`: if any."""
+        self.opponents = opponents
         self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(lanes)]
         self.ledger = ledger or Ledger()
         self.held: dict[int, Ticket] = {}
@@ -81,7 +90,11 @@ class RolloutDealer:
             if lane.owner is None or lane.moving:
                 continue
             for round_number in lane.due:
-                ticket = lane.deal(self.ledger.issued, round_number, self.rounds.version(round_number))
+                version = self.rounds.version(round_number)
+                opponent = (
+                    None if self.opponents is None else self.opponents.of(lane.number, lane.incarnation, lane.dealt, version)
+                )
+                ticket = lane.deal(self.ledger.issued, round_number, version, opponent)
                 self.held[ticket.number] = ticket
                 dealt.setdefault(lane.owner, []).append(ticket.number)
                 self.ledger.issued += 1
@@ -96,14 +109,17 @@ class RolloutDealer:
         out: list[Outgoing] = []
         for version in sorted({ticket.version for ticket in chosen}):
             permits = tuple(
-                Permit(each.number, each.lane, each.incarnation, each.sequence) for each in chosen if each.version == version
+                Permit(each.number, each.lane, each.incarnation, each.sequence, each.opponent)
+                for each in chosen
+                if each.version == version
             )
             out.append((member.peer, Collect(member.session, version, permits, self.received(member))))
         return out
 
     def versions(self, tickets: Iterable[int]) -> set[int]:
         """The versions that these tickets name, those of a rollout among them."""
-        return {self.held[number].version for number in tickets if number in self.held}
+        named = [self.held[number] for number in tickets if number in self.held]
+        return {version for ticket in named for version in versions_of(ticket.version, [ticket.opponent])}
 
     def received(self, member: Member) -> tuple[Received, ...]:
         """The lanes of this worker, and what has come of them."""

@@ -43,8 +43,9 @@ class SentWeights:
         for peer, message in orders:
             out.append((peer, message))
             member = members[peer]
-            if isinstance(message, Collect | Evaluate) and message.version not in member.versions:
-                version, supervisor = message.version, member.shared_by
+            asked = message.versions if isinstance(message, Collect | Evaluate) else set[int]()
+            for version in sorted(asked - member.versions.keys()):
+                supervisor = member.shared_by
                 if supervisor is None:
                     out.append((peer, self.kept[version]))
                 elif version not in supervisor.versions:

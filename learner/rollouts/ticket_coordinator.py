@@ -22,6 +22,7 @@ from learner.members.membership import Member, Membership, Outgoing
 from learner.rollouts.collecting_member import CollectingMember
 from learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.opponent_pool import OpponentPool
 from learner.rollouts.rollout_dealer import RolloutDealer
 from learner.rollouts.sent_weights import SentWeights, drop_versions
 from protocol.messages import (
@@ -56,9 +57,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         first_session: int,
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
+        opponents: OpponentPool | None = None,
     ) -> None:
-        """`ledger` and `incarnations` come from a checkpoint."""
-        self.rollouts = RolloutDealer(run.lanes, max_lag, ledger, incarnations)
+        """`ledger` and `incarnations` come from a checkpoint. `opponents`: those of a run with teams."""
+        self.rollouts = RolloutDealer(run.lanes, max_lag, ledger, incarnations, opponents)
         self.evaluation = EvaluationDealer(run)
         lanes = self.rollouts.lanes
         membership = Membership(run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, lanes))
@@ -132,6 +134,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _is_needed(self, version: int) -> bool:
         """Whether these weights are needed, although they are not the newest."""
+        opponents = self.rollouts.opponents
+        if opponents is not None and version in opponents.versions:
+            return True
         return self.rollouts.rounds.acts(version) or (self.evaluation.pending and version == self.evaluation.version)
 
     def _named(self, tickets: Collection[int]) -> set[int]:
@@ -189,7 +194,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _kind(self, failure: Failure) -> type[Failed]:
         # No worker can blame a policy that is not the user's.
-        return PolicyRaised if failure.of_policy and self.run.policy.own is not None else super()._kind(failure)
+        has_code = self.run.policy.own is not None or self.run.scripted
+        return PolicyRaised if failure.of_policy and has_code else super()._kind(failure)
 
 
 def _by_joining(member: Member) -> int:

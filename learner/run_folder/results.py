@@ -12,11 +12,14 @@ import numpy as np
 
 from learner.run_folder.regular_files import read
 from protocol.bounds import Natural, Real, Seconds, Version
+from protocol.specs import SCORE
 
 SUMMARY_FILE = "summary.json"
 ALL_STEPS_DONE = "all steps done"
 """why a run ended that was not ended before"""
 EVALUATION_KEY, EVALUATION_LENGTH_KEY = "eval/mean_reward", "eval/mean_ep_length"
+Z_95 = 1.959964
+"""Quantile of the normal distribution for an interval of 95 %."""
 EVALUATED_AT_KEY = "eval/env_steps"
 """env steps of the policy that was evaluated beside training: fewer than those of the row with the result"""
 
@@ -91,7 +94,18 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     def __str__(self) -> str:
         cut = f", {self.cut} of them cut short" if self.cut else ""
         facts = "".join(f", {name} {fact}" for name, fact in self.facts.items())
+        if (interval := self.score_interval) is not None:
+            facts += " ({:.3g} to {:.3g} with 95 % confidence)".format(*interval)
         return f"return {self.return_mean:.1f} ± {self.return_std:.1f} over {self.episodes} episodes{cut}{facts}"
+
+    @property
+    def score_interval(self) -> tuple[float, float] | None:
+        """Between which scores the true one lies with 95 % confidence (Wilson 1927), if there were opponents."""
+        if (score := self.facts.get(SCORE)) is None or score.mean is None:
+            return None
+        n, z2 = self.episodes, Z_95**2
+        middle, half = score.mean + z2 / (2 * n), math.sqrt(z2 * score.mean * (1 - score.mean) / n + (z2 / (2 * n)) ** 2)
+        return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
 
     def metrics(self) -> dict[str, float | None]:
         """The numbers that are logged with a row of metrics."""

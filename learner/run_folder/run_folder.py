@@ -54,7 +54,7 @@ from learner.run_folder.run_format import (
 )
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
-from protocol.bounds import MAX_FACTS, Line, Name, one_line
+from protocol.bounds import MAX_FACTS, Line, Name, Natural, one_line
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
@@ -106,6 +106,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """keyword arguments of evaluation copies, in addition to `env_kwargs` or in place of those of the same name"""
     seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
     """the names of the environment's agents; empty if it is gymnasium's"""
+    teams: Annotated[tuple[tuple[Natural, ...], ...], Meta(max_length=MAX_SEATS)] = ()
+    """the seats of each team, if it has met opponents"""
 
 
 class RunSettings(Protocol):
@@ -267,11 +269,13 @@ class RunFolder:
         facts: tuple[str, ...] = (),
         masked: bool = False,
         seats: tuple[str, ...] = (),
+        teams: tuple[tuple[int, ...], ...] = (),
     ) -> None:
         """Write the arrays and policy.json.
 
         `parameters` [P] begins with the acting part; the rest (the critic) is not written. `facts`: names of the numbers
         that the run logs of each episode. `masked`: whether the run uses action masks. `seats`: the environment's agents.
+        `teams`: the seats of each, if it has met opponents.
         """
         acting, _ = parameter_layout(spec)
         arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
@@ -287,6 +291,7 @@ class RunFolder:
             masked=masked,
             eval_env_kwargs=env.eval_kwargs,
             seats=seats,
+            teams=teams,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))

@@ -40,6 +40,8 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
 
     episodes: Annotated[Count | None, Flag("INT")] = None
     """number of episodes; if not given: 100, or 3 with --video"""
+    against: Annotated[Path | None, Flag("RUN")] = None
+    """run folder of a policy that plays the other teams; both draw their actions, and each team is played in turn"""
     seed: Natural = 1_000_000
     """seed of the episodes"""
     copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4

@@ -59,12 +59,12 @@ class CalledPolicy:
         self._extras = (*extras, LOG_PROB) if spec.own.has_log_prob else extras
         self._names = {extra.name for extra in self._extras}
         self._made: Any = self._guarded("cannot be made: it", lambda: _factory(self._own)(**self._own.kwargs))
-        for name in ("load", "act"):
+        for name in ("load", "act") if spec.own.arrays else ("act",):
             if not callable(getattr(self._made, name, None)):
                 raise self._wrong(f"expected an object with load and act, got {type(self._made).__name__} without {name}")
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Give it these weights."""
+        """Give it these weights, if it has any."""
         self._guarded("load", lambda: self._made.load(named_views(parameters.copy(), self._fields)))
 
     def act(

@@ -18,8 +18,8 @@ LARGEST_REWARD = float(np.finfo(np.float32).max)
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
-    T, N = run.rollout_steps, run.columns
-    action, axes = run.policy.action, run.row_axes
+    T, N = run.rollout_steps, run.copies * run.sent_seats
+    action, axes = run.policy.action, run.sent_axes
     expected = [
         Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),
         Expected("log_prob", rollout.log_prob, (T, N), "float32"),
@@ -65,13 +65,13 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             raise BadRollout(
                 f"episode: expected a finite return of 1 to {steps_so_far} float32 rewards and a duration, got {episode}"
             )
-        if why := wrong_facts(episode, len(run.facts)):
+        if why := wrong_facts(episode, run):
             raise BadRollout(f"episode: {why}")
 
 
 def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:
     """Raise `BadRollout` if the rows of seats break the law of `protocol.rollout`. Arrays [T, N·A], `resets` [T+1, N]."""
-    reset = np.repeat(resets, run.seats_of_copy, axis=1)  # [T+1, N·A]
+    reset = np.repeat(resets, run.sent_seats, axis=1)  # [T+1, N·A]
     steps = np.arange(len(valid))[:, None]
     row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last
     gone, plays = np.zeros_like(reset), np.zeros_like(reset)  # the seat has left this episode; it has a row in it
@@ -86,7 +86,7 @@ def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> Non
         (idle, "valid: expected no gap after a row that has not ended, because no agent waits for others"),
     ):
         if wrong.any():
-            raise BadRollout(f"{expected}, got one at {place_of(np.argwhere(wrong)[0], run.row_axes)}")
+            raise BadRollout(f"{expected}, got one at {place_of(np.argwhere(wrong)[0], run.sent_axes)}")
 
 
 def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -> None:
@@ -99,10 +99,17 @@ def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -
         raise BadRollout(f"action: expected one that the mask allows at {place_of((t, n), axes)}, got {got}")
 
 
-def wrong_facts(episode: Episode, count: int) -> str:
-    """What is wrong with the facts of an episode; empty if they are `count` numbers, each finite or NaN (missing)."""
-    if len(episode.facts) != count:
-        return f"expected {count} facts, got {len(episode.facts)}"
+def wrong_facts(episode: Episode, run: RunSpec) -> str:
+    """What is wrong with the facts of an episode; empty if they are those of the run, each finite or NaN (missing)."""
+    if len(episode.facts) != len(run.facts):
+        return f"expected {len(run.facts)} facts, got {len(episode.facts)}"
     if any(map(math.isinf, episode.facts)):
         return f"expected finite facts, got {episode.facts}"
+    if (episode.opponent is not None) != bool(run.teams):
+        return f"expected {'an opponent' if run.teams else 'no opponent'}, got {episode.opponent}"
+    if episode.opponent is not None:
+        if episode.opponent < -len(run.scripted):
+            return f"expected an opponent from {-len(run.scripted)}, got {episode.opponent}"
+        if episode.facts[-1] not in (0.0, 0.5, 1.0):
+            return f"expected the score 0, 0.5 or 1, got {episode.facts[-1]}"
     return ""

@@ -86,12 +86,13 @@ class Worker(Process):
             for each in work.assignments:
                 lane = lanes[each.lane]
                 assert each.sequence == lane.sequence, "rollouts of a lane are not collected in their order"
-                assert lane.asked[each.ticket] == (each.sequence, version), "other weights act than the order names"
+                expected = (each.sequence, version, each.opponent)
+                assert lane.asked[each.ticket] == expected, "other weights act than the order names"
             startable = [
                 asked.version
                 for lane in lanes.values()
                 for asked in lane.asked.values()
-                if asked.sequence == lane.sequence and asked.version in held.weights
+                if asked.sequence == lane.sequence and asked.versions <= held.weights.keys()
             ]
             lowest = [each for each in startable if each == min(startable)]
             assert [version] * len(work.assignments) == lowest, "others are collected than all of the lowest version"
@@ -180,5 +181,5 @@ def loaded(content: Content, number: int, settings: Settings, kind: type[W]) -> 
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
     if work is not None:
         assignments = tuple(Assignment(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in work[2])
-        worker.task = RolloutTask(work[0].value, weights(work[1]), assignments)
+        worker.task = RolloutTask(work[0].value, weights(work[1]), assignments, {})
     return worker

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from time import perf_counter
 
 import numpy as np
+import numpy.typing as npt
 
 from protocol.arrays import Array, Bools
 from protocol.policy.masks import stored_leaves
@@ -26,6 +27,7 @@ from workers.copies.env_loop import Pulse
 from workers.copies.facts import Facts
 from workers.copies.row_writers import ObservationWriter
 from workers.copies.seated_copies import SeatedCopies
+from workers.opponents import Opponent
 
 
 class CollectedLane:
@@ -36,6 +38,7 @@ class CollectedLane:
         self.incarnation = incarnation
         self.copies = copies
         self.generator = generator(run.seed, Purpose.ACTIONS, number, incarnation)
+        self._opponents_draw = generator(run.seed, Purpose.OPPONENTS, number, incarnation)
         self.obs = tuple(np.empty((run.columns, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))  # [N, *leaf] each
         self.state = zero_state(run.policy, run.columns)  # [N, S] recurrent state of the policy
         self.state_before = self.state  # of this rollout
@@ -78,9 +81,18 @@ class CollectedLane:
             assert isinstance(self.copies, SeatedCopies)
             self.seats.start(self.copies.columns, self._start_s[0])
 
-    def begin(self) -> None:
-        """A rollout begins."""
-        self.state_before = self.state if self.seats is None else self.seats.begin(self.state)
+    def begin(self, opponent: Opponent | None) -> None:
+        """A rollout begins. `opponent`: of the episodes that begin in it, if the policy plays one team alone."""
+        if self.seats is None:
+            self.state_before = self.state
+        else:
+            self.state_before = self.seats.begin(self.state, self.number, opponent, self._opponents_draw)
+
+    @property
+    def sent(self) -> slice | npt.NDArray[np.intp]:
+        """The columns of a rollout's rows."""
+        others = None if self.seats is None else self.seats.others
+        return slice(None) if others is None else np.flatnonzero(others.mine)
 
     def close(self) -> None:
         """Close the copies. Raises nothing."""

@@ -7,8 +7,9 @@ The arrays of a rollout are new each time and are never written again, so they c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from protocol.envs.spaces import action_converter_of
 from protocol.envs.vectorized import make_native
 from protocol.envs.which_copy import EnvCopy
 from protocol.errors import EnvironmentFailed, PolicyFailed
+from protocol.messages import Weights
 from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.masks import stored_leaves
 from protocol.policy.policy import Policy
@@ -39,6 +41,7 @@ from workers.copies.row_writers import write_numbers
 from workers.copies.seated_copies import SeatedCopies
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.copy_slots import make_copy
+from workers.opponents import KnownOpponents, Opponents
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""
@@ -99,6 +102,7 @@ class Collector:
         self._acting = acting_of(run, policy)
         self._open_copies, self._step_all = open_copies, step_all
         self._to_env_action = action_converter_of(run.policy)
+        self._opponents = KnownOpponents(run)
         self.lanes = OpenLanes[CollectedLane]()
         """the lanes with a rollout, until they are closed"""
 
@@ -106,26 +110,36 @@ class Collector:
         """Use these weights from now on."""
         self._acting.load(parameters, buffers)
 
-    def collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
+    def collect(
+        self,
+        assignments: Sequence[Assignment],
+        version: int,
+        session: int,
+        pulse: Pulse,
+        held: Mapping[int, Weights] = MappingProxyType({}),
+    ) -> list[Rollout]:
         """Collect one rollout for each assignment. Returns them in the order of the assignments.
 
-        Each assignment must name a different lane. `pulse` is called at every step and may raise. If `pulse` raises, or an
-        environment does (`EnvironmentFailed`), these lanes are closed and the unfinished rollouts are dropped.
+        Each assignment must name a different lane. `held`: the weights of opponents that may be new, by version. `pulse` is
+        called at every step and may raise. If `pulse` raises, or an environment does (`EnvironmentFailed`), these lanes are
+        closed and the unfinished rollouts are dropped.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect: expected one assignment for each lane, got {assignments}")
         with self.lanes.in_use():
             try:
-                return self._collect(assignments, version, session, pulse)
+                return self._collect(assignments, version, session, pulse, self._opponents.among(held))
             except BaseException:
                 self.lanes.close(assignment.lane for assignment in assignments)
                 raise
 
-    def _collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
+    def _collect(
+        self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse, opponents: Opponents
+    ) -> list[Rollout]:
         lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
-        for lane in lanes:
+        for lane, assignment in zip(lanes, assignments, strict=True):
             lane.set_attributes(self.env_attributes, pulse)
-            lane.begin()
+            lane.begin(None if assignment.opponent is None else opponents(assignment.opponent))
         rows = self._new_rows(lanes)
         actions = self._acting.begin([lane.generator for lane in lanes])
         try:
@@ -198,9 +212,11 @@ class Collector:
             with np.errstate(all="ignore"):  # a NaN is reported once the rollout is complete
                 before = rows.state.copy() if with_seats else rows.state
                 chosen = actions.act(t, [leaf[:, t] for leaf in rows.obs], rows.state)
-                for i, seats in with_seats:
-                    seats.acted(t, actions.written(i), before[i], rows.state[i])
                 taken = self._to_env_action(chosen)
+                for i, seats in with_seats:
+                    if seats.others is not None:
+                        seats.others.act([leaf[i, t] for leaf in rows.obs], seats.acts, taken[i])
+                    seats.acted(t, actions.written(i), before[i], rows.state[i])
             acted = perf_counter()
             self._step_all(lane_numbers, taken, pulse)
             for i, (lane, numbers, obs) in enumerate(views):
@@ -245,7 +261,7 @@ class Collector:
         check_acted(lane.number, "log_prob", acted.log_prob, obs, axes)
         lane.obs = tuple(array[-1].copy() for array in obs)
         lane.state = rows.state[i].copy()
-        resets = None if lane.seats is None else lane.seats.resets
+        resets, sent = None if lane.seats is None else lane.seats.resets, lane.sent
         self.steps += int(np.count_nonzero(valid if resets is None else ~resets[:-1]))
         return Rollout(
             session=session,
@@ -253,17 +269,17 @@ class Collector:
             ticket=assignment.ticket,
             version=version,
             sequence=assignment.sequence,
-            obs=obs[:-1] if self._run.masked else obs,
-            action=acted.action,
-            log_prob=acted.log_prob,
-            reward=reward,
-            terminated=rows.terminated[i],
-            truncated=rows.truncated[i],
-            valid=valid,
-            state=lane.state_before,
+            obs=tuple(array[:, sent] for array in (obs[:-1] if self._run.masked else obs)),
+            action=acted.action[:, sent],
+            log_prob=acted.log_prob[:, sent],
+            reward=reward[:, sent],
+            terminated=rows.terminated[i][:, sent],
+            truncated=rows.truncated[i][:, sent],
+            valid=valid[:, sent],
+            state=lane.state_before[sent],
             episodes=episodes,
-            mask=obs[-1] if self._run.masked else None,
-            extras=acted.extras,
+            mask=obs[-1][:, sent] if self._run.masked else None,
+            extras=tuple(extra[:, sent] for extra in acted.extras),
             resets=resets,
         )
 

@@ -17,6 +17,7 @@ from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from workers.copies.env_copies import SeatColumns, StepResult
 from workers.copies.facts import Facts
+from workers.opponents import Match, Opponent, OtherTeams, whole_episode
 
 
 class SeatRows:
@@ -24,6 +25,9 @@ class SeatRows:
 
     def __init__(self, run: RunSpec) -> None:
         self._run, self._seats = run, run.seats_of_copy
+        self.others: OtherTeams | None = None
+        """those of other teams, once the first episodes have begun, if the policy plays one team alone"""
+        self._opponent: Opponent | None = None  # in the episodes that begin in this rollout
         columns = run.columns
         self.acts: Bools
         """[N · A] whether the next step takes the seat's action"""
@@ -41,9 +45,16 @@ class SeatRows:
         self._return += first.outside.reshape(self._return.shape)
         self._start_s[:] = now_s
 
-    def begin(self, state: Floats) -> Floats:
-        """A rollout begins, with the policy in this state [N · A, S]. Returns the state before the first rows."""
+    def begin(self, state: Floats, lane: int, opponent: Opponent | None, drawn: np.random.Generator) -> Floats:
+        """A rollout of this lane begins, with the policy in this state [N · A, S]. Returns the state before the first rows.
+
+        `opponent`: in the episodes that begin in it. `drawn`: where opponents draw their actions.
+        """
         T, run = self._run.rollout_steps, self._run
+        self._opponent = opponent
+        if opponent is not None and self.others is None:
+            matches = [Match(run.team_of(lane, n), opponent) for n in range(run.copies)]
+            self.others = OtherTeams(run, matches, drawn)
         self.valid = np.zeros((T, run.columns), bool)
         self.resets = np.zeros((T + 1, run.copies), bool)
         self.resets[0] = self._resets
@@ -70,6 +81,8 @@ class SeatRows:
         self._return += (np.asarray(row.reward, np.float64) + outside).reshape(self._return.shape)
         self._length += ~self._resets
         state[np.repeat(self._resets, self._seats)] = 0.0
+        if self.others is not None and self._opponent is not None:
+            self.others.begin(np.flatnonzero(self._resets).tolist(), self._opponent)
         self.resets[t + 1] = self._resets = over
         for n in np.flatnonzero(over).tolist():
             self._episodes.append(self._ended(n, row.facts, now_s))
@@ -77,8 +90,8 @@ class SeatRows:
     def _ended(self, n: int, facts: Facts, now_s: float) -> Episode:
         """The episode of copy n, which is over."""
         of_seats: list[float] = self._return[n].tolist()
-        named = (*facts.get(n, ()), *(of_seats if self._run.has_seat_returns else ()))
-        episode = Episode(sum(of_seats), int(self._length[n]), now_s - float(self._start_s[n]), named)
+        seconds = now_s - float(self._start_s[n])
+        episode = whole_episode(self._run, self.others, n, of_seats, int(self._length[n]), seconds, facts.get(n, ()))
         self._return[n], self._length[n], self._start_s[n] = 0.0, 0, now_s
         return episode
 

@@ -15,7 +15,17 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from protocol.messages import Answer, Evaluate, Evaluated, LaneIncarnation, Order, Permit, Received, Rollout
+from protocol.messages import (
+    Answer,
+    Evaluate,
+    Evaluated,
+    LaneIncarnation,
+    Order,
+    Permit,
+    Received,
+    Rollout,
+    versions_of,
+)
 
 KEPT_RESULTS = 8  # a learner gives a worker at most two evaluations at a time, so only the last two results can be missing
 
@@ -56,12 +66,12 @@ class HeldEvaluations(Held[Evaluate, Evaluated]):
 
     def next(self, versions: Collection[int]) -> Evaluate | None:
         """The oldest whose weights are held."""
-        due = [ticket for ticket, order in self.asked.items() if order.version in versions]
+        due = [ticket for ticket, order in self.asked.items() if order.versions.issubset(versions)]
         return self.asked[min(due)] if due else None
 
     def versions(self) -> set[int]:
         """The versions that are asked for."""
-        return {order.version for order in self.asked.values()}
+        return {version for order in self.asked.values() for version in order.versions}
 
     def keep(self, answer: Evaluated) -> bool:
         """Keep a result, unless rows belong to it; False if it is no longer asked for."""
@@ -130,6 +140,8 @@ class Assignment:
     incarnation: int
     """If the worker has another incarnation of the lane, the lane starts on new env copies."""
     sequence: int
+    opponent: int | None = None
+    """Who plays the other teams in the episodes that begin in it."""
 
 
 class Permitted(NamedTuple):
@@ -138,6 +150,13 @@ class Permitted(NamedTuple):
     sequence: int
     version: int
     """of the weights to act under"""
+    opponent: int | None
+    """as in the `Permit`"""
+
+    @property
+    def versions(self) -> set[int]:
+        """Those of the weights that it needs."""
+        return versions_of(self.version, [self.opponent])
 
 
 @dataclass
@@ -163,7 +182,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
             return None  # a late repeat: the learner has this rollout
-        return lane.take(permit.ticket, Permitted(permit.sequence, version))
+        return lane.take(permit.ticket, Permitted(permit.sequence, version, permit.opponent))
 
     def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
         """The next rollouts of the lanes whose weights are held: the lowest version of them, and those under it.
@@ -172,16 +191,16 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         """
         startable: dict[int, list[Assignment]] = {}
         for number, lane in sorted(self._lanes.items()):
-            for ticket, (sequence, version) in lane.asked.items():
-                if sequence == lane.sequence and version in versions:
-                    assignment = Assignment(ticket, number, lane.incarnation, sequence)
-                    startable.setdefault(version, []).append(assignment)
+            for ticket, asked in lane.asked.items():
+                if asked.sequence == lane.sequence and asked.versions.issubset(versions):
+                    assignment = Assignment(ticket, number, lane.incarnation, asked.sequence, asked.opponent)
+                    startable.setdefault(asked.version, []).append(assignment)
         version = min(startable, default=-1)
         return version, tuple(startable.get(version, ()))
 
     def versions(self) -> set[int]:
         """The versions that are asked for."""
-        return {permitted.version for lane in self._lanes.values() for permitted in lane.asked.values()}
+        return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}
 
     def forget_received(self, received: Sequence[Received]) -> None:
         """Drop the rollouts that the learner has received."""

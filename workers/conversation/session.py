@@ -91,6 +91,8 @@ class RolloutTask:
     session: int
     weights: Weights
     assignments: tuple[Assignment, ...]
+    held: Mapping[int, Weights]
+    """All weights that are held, by version: those of opponents are among them."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ class EvaluationTask:
 
     weights: Weights
     order: Evaluate
+    held: Mapping[int, Weights]
+    """All weights that are held, by version."""
 
     @property
     def session(self) -> int:
@@ -178,9 +182,11 @@ class _SessionState:
     def next_work(self, session: int) -> Work | None:
         """The next piece of work: an evaluation, else rollouts to collect together, else an order."""
         if (evaluation := self.evaluations.next(self.weights)) is not None:
-            return EvaluationTask(self.weights[evaluation.version], evaluation)
+            return EvaluationTask(self.weights[evaluation.version], evaluation, self.weights)
         version, assignments = self.rollouts.startable(self.weights)
-        return RolloutTask(session, self.weights[version], assignments) if assignments else self.orders.next()
+        if not assignments:
+            return self.orders.next()
+        return RolloutTask(session, self.weights[version], assignments, self.weights)
 
     def missing_versions(self) -> set[int]:
         """Versions that are asked for and not held."""

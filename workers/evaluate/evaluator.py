@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,13 +21,12 @@ from protocol.arrays import Array
 from protocol.envs.spaces import action_converter_of
 from protocol.envs.which_copy import EnvCopy
 from protocol.errors import UsageError
-from protocol.messages import Evaluate, Evaluated
+from protocol.messages import Evaluate, Evaluated, Weights
 from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.masks import stored_leaves
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
-from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from workers.acting import acting_of
 from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
@@ -36,6 +36,7 @@ from workers.copies.row_writers import ObservationWriter, write_numbers
 from workers.copies.seated_copies import SeatedCopies
 from workers.copies.value_checks import check_acted, check_observed, check_rewards
 from workers.evaluate.episode_rows import RowSender, SendRows, as_frame
+from workers.opponents import KnownOpponents, Match, OtherTeams, whole_episode
 
 
 class EvaluationCopies(EnvCopies, Protocol):
@@ -90,19 +91,24 @@ class Evaluator:
         self._run, self._open_copies = run, open_copies
         self._acting = acting_of(run, policy)
         self._stored = stored_leaves(run)
+        self._opponents = KnownOpponents(run)
         self._writer = ObservationWriter(self._stored, 1, run.seats)
         self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
-    def play(self, order: Evaluate, send: SendRows, pulse: Pulse) -> Evaluated:
-        """Play one episode for each seed. `send` gets the rows, if the order asks for them.
+    def play(
+        self, order: Evaluate, send: SendRows, pulse: Pulse, held: Mapping[int, Weights] = MappingProxyType({})
+    ) -> Evaluated:
+        """Play one episode for each seed. `send` gets the rows, if the order asks for them. `held`: weights of opponents.
 
         `pulse` is called at every step and may raise. If it raises, or the environment does (`EnvironmentFailed`), all
         copies are closed.
         """
         began_s = perf_counter()
         try:
-            while (answer := self._play(order, send, pulse)) is None:
+            find = self._opponents.among(held)
+            matches = [Match(team, find(number)) for team, number in zip(order.teams, order.opponents, strict=True)]
+            while (answer := self._play(order, send, pulse, matches)) is None:
                 pass  # the episodes of lost copies are played again from their seeds
             return answer
         except CopyFailed as error:
@@ -119,13 +125,15 @@ class Evaluator:
         while self._copies:
             self._copies.popitem()[1].close()
 
-    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse) -> Evaluated | None:
+    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, matches: Sequence[Match]) -> Evaluated | None:
         """The answer; None if a worker was lost, and with it copies whose episodes had not ended."""
         k, A, policy = len(order.seeds), self._run.seats_of_copy, self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         obs = tuple(np.empty((1, k * A, *leaf.shape), leaf.dtype) for leaf in self._stored)
         numbers = np.zeros(k * A), np.zeros(k * A, bool), np.zeros(k * A, bool)
         state, drawn = zero_state(policy, 1, k * A), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
+        drawn_by_others = generator(order.seeds[0], Purpose.PLAYED_OPPONENTS)
+        others = OtherTeams(self._run, matches, drawn_by_others) if matches else None
         returns, lengths, cut, seconds = np.zeros((k, A)), [0] * k, [False] * k, [0.0] * k
         no_facts = (math.nan,) * len(self._run.info_keys)
         facts = [no_facts] * k
@@ -146,6 +154,8 @@ class Evaluator:
                     waits = ~copies.columns.acts[: k * A]
                     state[0][waits] = before[0][waits]
                 taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=False)
+                if others is not None and isinstance(copies, SeatedCopies):
+                    others.act([leaf[0] for leaf in obs], copies.columns.acts[: k * A], taken)
             self._check_acted(chosen, running, obs, t)
             # The actions are a new array at each step, because an environment may keep its action.
             try:
@@ -181,10 +191,10 @@ class Evaluator:
             t += 1
             if ended:
                 running = [n for n in running if n not in ended]
-        if self._run.has_seat_returns:
-            facts = [(*of_info, *of_seats) for of_info, of_seats in zip(facts, returns.tolist(), strict=True)]
-        totals = returns.sum(1).tolist()
-        episodes = tuple(Episode(*figures) for figures in zip(totals, lengths, seconds, facts, strict=True))
+        episodes = tuple(
+            whole_episode(self._run, others, n, *figures)
+            for n, figures in enumerate(zip(returns.tolist(), lengths, seconds, facts, strict=True))
+        )
         return Evaluated(order.session, order.ticket, episodes, tuple(cut))
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:

@@ -106,7 +106,7 @@ def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWor
     }
     worker.played = {(number.value, each.value) for number, each in played}
     if running is not None:
-        worker.task = EvaluationTask(weights(running[0]), _order(running[1]))
+        worker.task = EvaluationTask(weights(running[0]), _order(running[1]), {})
     return worker
 
 

@@ -225,9 +225,9 @@ def test_values_that_are_not_of_the_space_are_refused() -> None:
 
 
 def test_facts_are_as_many_as_the_run_asks_for_and_finite_or_missing() -> None:
-    episode = Episode(1.0, 1, 1.0)
+    episode, run = Episode(1.0, 1, 1.0), msgspec.structs.replace(spaces_run(), facts=("a", "b"))
     for facts in ((1.0, -1e308), (float("nan"), 0.0)):
-        assert wrong_facts(msgspec.structs.replace(episode, facts=facts), 2) == ""
-    assert wrong_facts(episode, 1) == "expected 1 facts, got 0"
+        assert wrong_facts(msgspec.structs.replace(episode, facts=facts), run) == ""
+    assert wrong_facts(episode, run) == "expected 2 facts, got 0"
     for facts in ((float("inf"), 0.0), (0.0, -float("inf"))):
-        assert wrong_facts(msgspec.structs.replace(episode, facts=facts), 2).startswith("expected finite facts, got ")
+        assert wrong_facts(msgspec.structs.replace(episode, facts=facts), run).startswith("expected finite facts, got ")

@@ -24,6 +24,7 @@ from protocol.errors import BadMessage
 from protocol.messages import (
     Alive,
     EpisodeRows,
+    Evaluate,
     Failure,
     Heartbeat,
     Hello,
@@ -204,6 +205,7 @@ def test_a_default_stands_at_the_end_alone() -> None:
     assert defaults == {
         Hello: (False,), Alive: (None,),
         Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
+        Evaluate: ((), ()),
     }  # fmt: skip
     assert Rollout.__struct_fields__[-4:] == ("episodes", "mask", "extras", "resets")
 

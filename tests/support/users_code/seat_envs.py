@@ -309,3 +309,36 @@ class RandomTeam(RandomCrowd):
     """All agents act at every step of an episode."""
 
     present, leaves = 1.0, 0.0
+
+
+class RockPaperScissors(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
+    """One throw. Its only equilibrium is to throw each with probability 1/3."""
+
+    metadata: dict[str, Any] = {}
+    render_mode = None
+
+    def __init__(self) -> None:
+        self.possible_agents = ["left", "right"]
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return spaces.Box(0, 1, (1,))
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        return spaces.Discrete(3)
+
+    def _seen(self) -> dict[str, Any]:
+        return {agent: np.ones(1, np.float32) for agent in self.possible_agents}
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        self.agents = self.possible_agents[:]
+        return self._seen(), {}
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        won = (0, 1, -1)[(int(actions["left"]) - int(actions["right"])) % 3]
+        self.agents = []
+        yes, no = dict.fromkeys(self.possible_agents, True), dict.fromkeys(self.possible_agents, False)
+        return self._seen(), {"left": float(won), "right": -float(won)}, yes, no, {}
+
+    def render(self) -> None: ...
+
+    def close(self) -> None: ...

@@ -1,0 +1,129 @@
+"""Self-play: which opponents there are, who meets whom, and how strong they are. Pure.
+
+Rule: the opponent of a rollout is a pure function of the seed, the lane, its incarnation, the number of the rollout, and the
+pool as it was when the weights that act were made. So it depends on nobody's speed, and on no number of workers. Opponents
+are snapshots of the policy, of which the newest play, and programs of the user's.
+
+Rule: ratings follow from the episodes that updates used, in their order (Elo 1978; ML-Agents' self-play). An opponent's
+rating changes as the policy's does, by the opposite amount. Episodes against the policy itself change none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import msgspec
+
+from protocol.bounds import Count, Natural, Real
+from protocol.random_streams import Purpose, generator
+from protocol.rollout import Episode
+
+FIRST_RATING = 1200.0
+K = 8.0
+"""Largest change of a rating by one episode is K."""
+SCALE = 400.0
+"""An opponent whose rating is lower by so much loses ten times as often as it wins."""
+
+
+class Snapshot(msgspec.Struct):
+    """A version of the policy that is an opponent."""
+
+    version: Natural
+    env_steps: Natural
+    rating: Real
+
+
+class PoolState(msgspec.Struct, kw_only=True):
+    """What a checkpoint keeps, besides the weights of the snapshots."""
+
+    rating: Real = FIRST_RATING
+    """of the policy"""
+    snapshots: list[Snapshot] = []
+    """The first one, and the newest, in order."""
+    scripted: list[Real] = []
+    """ratings of the programs"""
+
+
+class PoolSettings(NamedTuple):
+    """The settings of self-play."""
+
+    seed: int
+    window: int
+    """How many snapshots play, the newest ones."""
+    save_steps: Count
+    """Env steps between two snapshots."""
+    latest: float
+    """The share of rollouts in which the policy meets itself."""
+    max_lag: int
+    scripted: int = 0
+    """How many programs there are."""
+
+
+class OpponentPool:
+    """The opponents of one run."""
+
+    def __init__(self, settings: PoolSettings, state: PoolState | None = None) -> None:
+        self._settings, self.state = settings, state or PoolState()
+        missing = settings.scripted - len(self.state.scripted)
+        self.state.scripted.extend([FIRST_RATING] * missing)
+
+    @property
+    def versions(self) -> list[int]:
+        """Those of the snapshots."""
+        return [snapshot.version for snapshot in self.state.snapshots]
+
+    @property
+    def yardsticks(self) -> tuple[int, ...]:
+        """The opponents of evaluations, always the same: the programs, or else the first snapshot."""
+        programs = self._settings.scripted
+        return tuple(-1 - k for k in range(programs)) or tuple(self.versions[:1])
+
+    def made(self, version: int, env_steps: int) -> bool:
+        """New weights were made. Returns whether they are a snapshot."""
+        snapshots, settings = self.state.snapshots, self._settings
+        if not settings.window:
+            return False
+        if snapshots and (version <= snapshots[-1].version or env_steps < snapshots[-1].env_steps + settings.save_steps):
+            return False
+        snapshots.append(Snapshot(version, env_steps, self.state.rating))
+        # Weights that acted before the newest snapshots were made may still meet as many as those.
+        del snapshots[1 : max(1, len(snapshots) - settings.window - settings.max_lag)]
+        return True
+
+    def of(self, lane: int, incarnation: int, sequence: int, version: int) -> int:
+        """The opponent in the episodes that begin in this rollout, in which this version acts."""
+        settings = self._settings
+        window = [each for each in self.versions if each <= version][-settings.window :] if settings.window else []
+        drawn = generator(settings.seed, Purpose.MATCHES, lane, incarnation, sequence)
+        others = [*window, *(-1 - k for k in range(settings.scripted))]
+        if settings.window and (not others or drawn.random() < settings.latest):
+            return version
+        return others[int(drawn.integers(len(others)))]
+
+    def metrics(self) -> dict[str, float]:
+        """What a row of the metrics has of it."""
+        return {"self_play/elo": self.state.rating, "self_play/snapshots": float(len(self.versions))}
+
+    def played(self, episodes: Iterable[Episode]) -> None:
+        """An update used these episodes."""
+        state = self.state
+        by_version = {snapshot.version: snapshot for snapshot in state.snapshots}
+        for episode in episodes:
+            number = episode.opponent
+            if number is None:
+                continue
+            if number < 0:
+                change = _change(state.rating, state.scripted[-1 - number], episode.facts[-1])
+                state.scripted[-1 - number] -= change
+            elif (snapshot := by_version.get(number)) is not None:
+                change = _change(state.rating, snapshot.rating, episode.facts[-1])
+                snapshot.rating -= change
+            else:
+                continue
+            state.rating += change
+
+
+def _change(rating: float, of_opponent: float, score: float) -> float:
+    """How the rating changes by this score."""
+    return K * (score - 1 / (1 + 10 ** ((of_opponent - rating) / SCALE)))

@@ -1,0 +1,128 @@
+"""Who acts for the seats of the other teams: earlier weights of the policy, or a program of the user's.
+
+Rule: in each env copy the policy plays one team, and one opponent all others, for whole episodes: another opponent comes
+where the copy is reset. So a lane keeps its opponents from rollout to rollout, although their weights may be asked for no
+more. An opponent draws its actions, from random numbers of the lane that no other choice uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import NamedTuple
+from weakref import WeakValueDictionary
+
+import msgspec
+import numpy as np
+
+from protocol.arrays import Array, Bools
+from protocol.envs.spaces import action_converter_of
+from protocol.messages import Weights
+from protocol.policy.called_policy import CalledPolicy
+from protocol.policy.policy import make_policy
+from protocol.policy.recurrent import zero_state
+from protocol.rollout import Episode
+from protocol.specs import OwnPolicySpec, RunSpec
+from protocol.wire.weight_dtypes import to_float32
+from workers.acting import Acting, acting_of
+
+
+class Opponent:
+    """One opponent: a policy that acts, by the number that tickets have for it."""
+
+    def __init__(self, run: RunSpec, number: int, weights: Weights | None) -> None:
+        """`weights`: those of this version; none for a program of the user's."""
+        self.number = number
+        spec = run.opponent or run.policy
+        if weights is None:
+            own = OwnPolicySpec(run.scripted[-1 - number], ())
+            spec = msgspec.structs.replace(run.policy, own=own, core=None)
+            self.acting: Acting = acting_of(msgspec.structs.replace(run, policy=spec), CalledPolicy(spec, ()))
+        else:
+            self.acting = acting_of(msgspec.structs.replace(run, policy=spec), make_policy(spec, run.images_dtype))
+            self.acting.load(to_float32(weights.parameters), weights.buffers)
+        self.to_env_action = action_converter_of(spec)
+        self.state_size = spec.state_size
+
+
+Opponents = Callable[[int], Opponent]
+"""The opponent of a number."""
+
+
+class KnownOpponents:
+    """The opponents of one session, which exist while an episode is played against them."""
+
+    def __init__(self, run: RunSpec) -> None:
+        self._run = run
+        self._known = WeakValueDictionary[int, Opponent]()
+
+    def among(self, weights: Mapping[int, Weights]) -> Opponents:
+        """How to find an opponent. `weights`: by version, of those that may be new."""
+
+        def find(number: int) -> Opponent:
+            if (found := self._known.get(number)) is None:
+                found = self._known[number] = Opponent(self._run, number, weights[number] if number >= 0 else None)
+            return found
+
+        return find
+
+
+class Match(NamedTuple):
+    """Who plays in a copy."""
+
+    team: int
+    """that of the policy"""
+    opponent: Opponent
+
+
+class OtherTeams:
+    """The other teams in some env copies."""
+
+    def __init__(self, run: RunSpec, matches: Sequence[Match], generator: np.random.Generator) -> None:
+        self._run, self._generator = run, generator
+        self._matches = list(matches)
+        seats = np.zeros((len(matches), run.seats_of_copy), bool)
+        for n, match in enumerate(matches):
+            seats[n, run.teams[match.team]] = True
+        self.mine: Bools = seats.ravel()
+        """[N · A] the seats that the policy plays"""
+        self._state = zero_state(run.opponent or run.policy, len(self.mine))  # [N · A, S]
+
+    def act(self, obs: Sequence[Array], acts: Bools, taken: Array) -> None:
+        """Replace the actions `taken` [N · A, *action] of the seats of other teams that act."""
+        theirs = acts & ~self.mine
+        for opponent in dict.fromkeys(match.opponent for match in self._matches):
+            playing = np.repeat([match.opponent is opponent for match in self._matches], self._run.seats_of_copy)
+            if (columns := np.flatnonzero(playing & theirs)).size:
+                state = self._state[None, columns, : opponent.state_size]
+                chosen = opponent.acting.choose([leaf[None, columns] for leaf in obs], state, self._generator, greedy=False)
+                self._state[columns, : opponent.state_size] = state[0]
+                taken[columns] = opponent.to_env_action(chosen)
+
+    def begin(self, copies: Collection[int], opponent: Opponent) -> None:
+        """Episodes of these copies begin, against this opponent."""
+        for n in copies:
+            self._matches[n] = self._matches[n]._replace(opponent=opponent)
+            self._state[n * self._run.seats_of_copy : (n + 1) * self._run.seats_of_copy] = 0.0
+
+    def result(self, n: int, returns: Sequence[float]) -> tuple[float, float, int]:
+        """Of an episode of copy n, by the returns of its seats: the return of the policy's team, the score, the opponent."""
+        of_teams = [sum(returns[seat] for seat in team) for team in self._run.teams]
+        own = of_teams.pop(self._matches[n].team)
+        return own, 0.5 * ((own > max(of_teams)) + (own >= max(of_teams))), self._matches[n].opponent.number
+
+
+def whole_episode(
+    run: RunSpec,
+    others: OtherTeams | None,
+    n: int,
+    returns: Sequence[float],
+    length: int,
+    seconds: float,
+    of_info: tuple[float, ...],
+) -> Episode:
+    """An episode of copy n that has ended, with the returns of its seats. `of_info`: facts that the environment reports."""
+    if others is None:
+        counted = returns if run.has_seat_returns else ()
+        return Episode(sum(returns), length, seconds, (*of_info, *counted))
+    total, score, opponent = others.result(n, returns)
+    return Episode(total, length, seconds, (*of_info, score), opponent)
