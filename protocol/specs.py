@@ -262,11 +262,6 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         return self.facts[: len(self.facts) - counted]
 
     @property
-    def facts_of_all_seats(self) -> tuple[str, ...]:
-        """Those of an episode in which the policy plays all seats."""
-        return counted_facts(self.info_keys, self.seats, opponents=False)
-
-    @property
     def has_seat_returns(self) -> bool:
         """Whether the return of each seat is a fact of an episode: where there are not too many."""
         return bool(self.seats) and self.facts[-len(self.seats) :] == seat_returns(self.seats)

@@ -99,21 +99,8 @@ class Evaluations:
         """Write the best policy into the run folder, if it is known."""
         if self._state.best_policy is None:
             return
-        (parameters, buffers), spec, folder = self._state.best_policy, self._run.spec, self._run.folder
-        folder.writes.write(
-            "best policy",
-            lambda: folder.write_policy(
-                spec.policy,
-                spec.env,
-                parameters,
-                buffers,
-                "best",
-                spec.facts_of_all_seats,
-                spec.masked,
-                spec.seats,
-                spec.teams,
-            ),
-        )
+        policy, spec, folder = self._state.best_policy, self._run.spec, self._run.folder
+        folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def of_newest(self) -> Evaluation | None:
         """The evaluation of the newest policy, if there is one."""

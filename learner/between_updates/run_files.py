@@ -177,15 +177,7 @@ class RunFiles:
             env_attributes=self._attributes.state(self._state.version),
         ).checkpoint_content(self._algorithm)
         try:
-            self._folder.write_policy(
-                spec.policy,
-                spec.env,
-                *self.weights(),
-                facts=spec.facts_of_all_seats,
-                masked=spec.masked,
-                seats=spec.seats,
-                teams=spec.teams,
-            )
+            self._folder.write_policy(self._spec, *self.weights())
             self._policy_env_steps = env_steps
         finally:
             path = checkpoint.save(self._folder.path, state, env_steps, self._config.keep_checkpoints)

@@ -55,13 +55,13 @@ from learner.run_folder.run_format import (
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
 from protocol.bounds import MAX_FACTS, Line, Name, Natural, one_line
-from protocol.env_spec import EnvSpec, Scalar
+from protocol.env_spec import Scalar
 from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from protocol.policy.possible import why_impossible
 from protocol.space_spec import MAX_SEATS
-from protocol.specs import PolicySpec
+from protocol.specs import PolicySpec, RunSpec, counted_facts
 
 POLICY_FORMAT = 1
 Which = Literal["final", "best"]
@@ -259,24 +259,12 @@ class RunFolder:
         write_format(self.path, workers_elsewhere=workers_elsewhere, started_from=self.started_from)
         self._write(CONFIG_FILE, f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"))
 
-    def write_policy(
-        self,
-        spec: PolicySpec,
-        env: EnvSpec,
-        parameters: Floats,
-        buffers: Floats,
-        which: Which = "final",
-        facts: tuple[str, ...] = (),
-        masked: bool = False,
-        seats: tuple[str, ...] = (),
-        teams: tuple[tuple[int, ...], ...] = (),
-    ) -> None:
+    def write_policy(self, run: RunSpec, parameters: Floats, buffers: Floats, which: Which = "final") -> None:
         """Write the arrays and policy.json.
 
-        `parameters` [P] begins with the acting part; the rest (the critic) is not written. `facts`: names of the numbers
-        that the run logs of each episode. `masked`: whether the run uses action masks. `seats`: the environment's agents.
-        `teams`: the seats of each, if it has met opponents.
+        `parameters` [P] begins with the acting part; the rest (the critic) is not written.
         """
+        spec, env = run.policy, run.env
         acting, _ = parameter_layout(spec)
         arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
         description = PolicyDescription(
@@ -287,11 +275,11 @@ class RunFolder:
             arrays=_array_positions(acting),
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
             wrappers=env.wrappers,
-            facts=facts,
-            masked=masked,
+            facts=counted_facts(run.info_keys, run.seats, opponents=False),
+            masked=run.masked,
             eval_env_kwargs=env.eval_kwargs,
-            seats=seats,
-            teams=teams,
+            seats=run.seats,
+            teams=run.teams,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))

@@ -53,7 +53,7 @@ class Fakes:
     def publish(self, version: int, *weights: Any, deal: bool) -> None:
         self.published.append(version)
 
-    def write_policy(self, policy: Any, env: Any, parameters: Any, *rest: Any) -> None:
+    def write_policy(self, run: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
 
     def evaluations(self, every: int, state: RunState, seed: int = 1, **settings: Any) -> tuple[Tally, Evaluations]:

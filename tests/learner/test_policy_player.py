@@ -27,7 +27,7 @@ from protocol.wire.codec import Buffer, decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.conversation.fake_link import FakeLink
-from tests.support.in_process.saved_policies import load_policy
+from tests.support.in_process.saved_policies import load_policy, policy_run
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -40,13 +40,13 @@ def test_a_run_folder_is_enough_to_act_again(tmp_path: Path, env_id: str) -> Non
     rng = np.random.default_rng(0)
     folder = RunFolder.create(resolve(env_id, run_dir=str(tmp_path)))
     parameters = rng.standard_normal(acting_size(spec), dtype=np.float32)
-    folder.write_policy(spec, env, parameters, rng.random(buffer_size(spec), dtype=np.float32) + 0.5)
+    folder.write_policy(policy_run(spec, env), parameters, rng.random(buffer_size(spec), dtype=np.float32) + 0.5)
     policy, found_spec, found_env = load_policy(folder.path)
     assert (found_spec, found_env) == (spec, env)
     seen = [rng.standard_normal((1, 3, *leaf.shape), dtype=np.float32) for leaf in spec.observation]
     first = policy(seen, zero_state(spec, 1, 3))
     assert np.array_equal(first, load_policy(folder.path)[0](seen, zero_state(spec, 1, 3)))
-    folder.write_policy(spec, env, -parameters, np.ones(buffer_size(spec), np.float32))
+    folder.write_policy(policy_run(spec, env), -parameters, np.ones(buffer_size(spec), np.float32))
     assert not np.array_equal(first, load_policy(folder.path)[0](seen, zero_state(spec, 1, 3)))
 
 
@@ -55,7 +55,9 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(8,))
     folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path), info_keys=("of_config",)))
-    folder.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32), facts=("of_card",))
+    folder.write_policy(
+        policy_run(spec, env, facts=("of_card",)), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32)
+    )
     assert saved_policy(folder.path).facts == ("of_card",)
 
 

@@ -25,6 +25,7 @@ from protocol.errors import UserFacingError
 from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
+from tests.support.in_process.saved_policies import policy_run
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
 
 SMALL: dict[str, Any] = {"net": (16,), "normalize_observations": True, "normalize_rewards": True, "rollout_steps": 20}
@@ -57,7 +58,7 @@ def rows(algorithm: Any, seed: int) -> Batch:
 def save(run: RunFolder, algorithm: Any, *, best: bool = False) -> None:
     parameters, buffers = algorithm.weights()
     which: Which = "best" if best else "final"
-    run.write_policy(algorithm.policy, EnvSpec("made:Env-v0"), parameters, buffers, which)
+    run.write_policy(policy_run(algorithm.policy, EnvSpec("made:Env-v0")), parameters, buffers, which)
 
 
 def earlier_run(algo: str, folder: Path, **settings: Any) -> tuple[Path, Any]:

@@ -29,7 +29,7 @@ def folder_of(run: RunSpec, tmp_path: Path, which: Any = "final", scale: float =
     """A run folder with random weights."""
     parameters, buffers = random_weights(run.policy)
     folder = RunFolder.create(resolve(run.env.id, run_dir=str(tmp_path)))
-    folder.write_policy(run.policy, run.env, (parameters * np.float32(scale)).astype(np.float32), buffers, which)
+    folder.write_policy(run, (parameters * np.float32(scale)).astype(np.float32), buffers, which)
     return folder.path
 
 
@@ -139,7 +139,7 @@ def test_the_best_policy_is_another_file(tmp_path: Path) -> None:
     with pytest.raises(millrace.UsageError, match=r"expected the best policy, best\.safetensors, got none"):
         millrace.load(folder, best=True)
     parameters, buffers = random_weights(run.policy)
-    RunFolder.open(folder).write_policy(run.policy, run.env, -parameters, buffers, "best")
+    RunFolder.open(folder).write_policy(run, -parameters, buffers, "best")
     obs = np.array([1.0, 0.0, 0.5], np.float32)
     assert millrace.load(folder, best=True)(obs) != millrace.load(folder)(obs)
 

@@ -29,6 +29,7 @@ from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.policy import make_policy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import PolicySpec
+from tests.support.in_process.saved_policies import policy_run
 from tests.support.numbers.batches import batch, no_pulse
 
 pytest.importorskip("stable_baselines3")
@@ -243,7 +244,7 @@ def test_the_example_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, 
     net.flat.normal_(0, 0.5, generator=torch.Generator().manual_seed(2))
     count = sum(int(np.prod(leaf.shape)) for leaf in spec.observation)
     buffers = np.random.default_rng(3).uniform(0.5, 2, 2 * count).astype(np.float32) if normal else np.zeros(0, np.float32)
-    RunFolder(tmp_path).write_policy(spec, EnvSpec(env), net.flat.numpy(), buffers)
+    RunFolder(tmp_path).write_policy(policy_run(spec, EnvSpec(env)), net.flat.numpy(), buffers)
     act = stable_baselines3_actor(tmp_path)
 
     ours, over, write = make_policy(spec), distribution(spec), make_action_converter(spec.action)

@@ -257,8 +257,7 @@ def a_run(folder: Path, env: EnvSpec) -> Path:
     run = RunFolder.create(resolve(env.id, run_dir=str(folder)))
     rng = np.random.default_rng(0)
     run.write_policy(
-        spec,
-        env,
+        policy_run(spec, env),
         0.1 * rng.standard_normal(acting_size(spec), np.float32),
         np.zeros(buffer_size(spec), np.float32),
     )

@@ -25,6 +25,7 @@ from protocol.errors import RunError, UsageError
 from protocol.policy.layout import acting_size, buffer_size, parameter_layout, total_size
 from protocol.rollout import Episode
 from protocol.specs import PolicySpec
+from tests.support.in_process.saved_policies import policy_run
 
 STARTED_S = 1_700_000_000.0
 
@@ -108,7 +109,7 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, bound: float) -> None:
     spec = pendulum_like(bound)
     parameters, buffers = weights(spec)
     folder = RunFolder(tmp_path)
-    folder.write_policy(spec, EnvSpec("Mine-v0", {"g": 9.8}), parameters, buffers)
+    folder.write_policy(policy_run(spec, EnvSpec("Mine-v0", {"g": 9.8})), parameters, buffers)
     card, acting, normal = folder.read_policy()
     assert (card.policy, card.env, card.env_kwargs) == (spec, "Mine-v0", {"g": 9.8})
     assert acting.tobytes() == parameters[: acting_size(spec)].tobytes()
@@ -121,7 +122,7 @@ def test_another_program_can_act_from_the_two_files(tmp_path: Path) -> None:
 
     spec = pendulum_like(2.0)
     parameters, buffers = weights(spec)
-    RunFolder(tmp_path).write_policy(spec, EnvSpec("Mine-v0"), parameters, buffers)
+    RunFolder(tmp_path).write_policy(policy_run(spec, EnvSpec("Mine-v0")), parameters, buffers)
     arrays = load_file(tmp_path / "policy.safetensors")
     card = json.loads((tmp_path / "policy.json").read_text())
     assert [entry["name"] for entry in card["arrays"]] == [
@@ -139,7 +140,7 @@ def test_the_same_policy_gives_the_same_bytes(tmp_path: Path) -> None:
     spec = pendulum_like(2.0)
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        RunFolder(tmp_path / name).write_policy(spec, EnvSpec("Mine-v0"), *weights(spec))
+        RunFolder(tmp_path / name).write_policy(policy_run(spec, EnvSpec("Mine-v0")), *weights(spec))
     for name in ("policy.safetensors", "policy.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
@@ -149,7 +150,7 @@ def test_a_policy_that_does_not_fit_its_card_is_refused(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     with pytest.raises(UsageError, match="has the run saved its policy yet"):
         folder.read_policy()
-    folder.write_policy(spec, EnvSpec("Mine-v0"), *weights(spec))
+    folder.write_policy(policy_run(spec, EnvSpec("Mine-v0")), *weights(spec))
     with pytest.raises(UsageError, match=r"expected the best policy, best\.safetensors, got none"):
         folder.read_policy("best")
     card = tmp_path / "policy.json"
@@ -330,7 +331,7 @@ def test_a_resumed_run_adds_an_evaluation_to_the_row_of_its_update(tmp_path: Pat
 )
 def test_a_description_of_which_no_policy_can_be_made_is_one_line(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
     spec = pendulum_like(2.0)
-    RunFolder(tmp_path).write_policy(spec, EnvSpec("Mine-v0"), *weights(spec))
+    RunFolder(tmp_path).write_policy(policy_run(spec, EnvSpec("Mine-v0")), *weights(spec))
     card = json.loads((tmp_path / "policy.json").read_text())
 
     def changed(whole: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:

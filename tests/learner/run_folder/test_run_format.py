@@ -22,7 +22,7 @@ from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
-from tests.support.in_process.saved_policies import load_policy
+from tests.support.in_process.saved_policies import load_policy, policy_run
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def run(tmp_path: Path) -> Path:
     env = EnvSpec("CartPole-v1")
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
-    folder.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32))
+    folder.write_policy(policy_run(spec, env), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32))
     log = MetricsLog(folder.path)
     for steps in (100, 200):
         log.write(Progress(env_steps=steps, return_mean=1.0), {})

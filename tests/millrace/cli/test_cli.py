@@ -35,6 +35,7 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, NoWorkers
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
+from tests.support.in_process.saved_policies import policy_run
 
 ROOT = Path(__file__).parents[3]
 Captured = pytest.CaptureFixture[str]
@@ -494,7 +495,7 @@ def a_run_that_acts(tmp_path: Path, env_id: str = "CartPole-v1", facts: tuple[st
     env = EnvSpec(env_id)
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
-    run.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32), facts=facts)
+    run.write_policy(policy_run(spec, env, facts=facts), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32))
     return run.path
 
 

@@ -24,7 +24,7 @@ from protocol.policy.policy import make_policy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import NamedShape, PolicySpec
 from tests.support.in_process.described import run_spec
-from tests.support.in_process.saved_policies import load_policy
+from tests.support.in_process.saved_policies import load_policy, policy_run
 from tests.support.numbers.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 from tests.support.numbers.rounding import in_float64, sampled
 
@@ -137,7 +137,7 @@ def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
     assert spec.encoder is not None
     assert spec.encoder.size == 12
     net, folder = QNetwork(spec), RunFolder.create(config)
-    folder.write_policy(spec, EnvSpec("CartPole-v1"), net.flat.numpy(), np.zeros(1, np.float32))
+    folder.write_policy(policy_run(spec, EnvSpec("CartPole-v1")), net.flat.numpy(), np.zeros(1, np.float32))
     policy, found, _ = load_policy(folder.path)
     assert found == spec
     obs = np.ones((1, 1, 4), np.float32)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from learner.policy_player import saved_policy
 from learner.run_folder.run_folder import Which
 from protocol.env_spec import EnvSpec
 from protocol.policy.policy import Policy, make_policy
-from protocol.specs import PolicySpec
+from protocol.specs import PolicySpec, RunSpec
 
 
 def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
@@ -17,3 +18,8 @@ def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, 
     policy = make_policy(saved.spec)
     policy.load(saved.parameters, saved.buffers)
     return policy, saved.spec, saved.env
+
+
+def policy_run(policy: PolicySpec, env: EnvSpec, **more: Any) -> RunSpec:
+    """A run of this policy, as its card needs it."""
+    return RunSpec(env, policy, rollout_steps=1, copies=1, lanes=1, seed=0, **more)
