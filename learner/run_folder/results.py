@@ -105,7 +105,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
             return None
         n, z2 = self.episodes, Z_95**2
         middle, half = score.mean + z2 / (2 * n), math.sqrt(z2 * score.mean * (1 - score.mean) / n + (z2 / (2 * n)) ** 2)
-        return (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
+        return max(0.0, (middle - half) / (1 + z2 / n)), min(1.0, (middle + half) / (1 + z2 / n))
 
     def metrics(self) -> dict[str, float | None]:
         """The numbers that are logged with a row of metrics."""

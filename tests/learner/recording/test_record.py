@@ -38,7 +38,7 @@ from protocol.rollout import Rollout
 from protocol.specs import PolicySpec
 from tests.support.in_process.collectors import TOY, no_pulse, random_policy, run_of
 from tests.support.in_process.described import described
-from tests.support.in_process.saved_policies import load_policy
+from tests.support.in_process.saved_policies import load_policy, policy_run
 from workers.collect.collector import Collector
 from workers.conversation.held import Assignment
 

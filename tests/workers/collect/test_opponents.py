@@ -1,0 +1,245 @@
+"""Rows with opponents: in each copy the policy plays one team, and one opponent all others, for whole episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.algorithms.minibatches import log_probs
+from learner.algorithms.ppo import PPO
+from learner.config.hyperparameters import PPOConfig
+from protocol.arrays import Array, Floats
+from protocol.errors import PolicyFailed, UsageError
+from protocol.messages import Evaluate, Weights
+from protocol.policy.layout import acting_size
+from protocol.policy.policy import make_policy
+from protocol.rollout import Rollout, stack_rollouts
+from protocol.rows.rollout_checks import validate
+from protocol.specs import PolicySpec, RunSpec, counted_facts, teams_of
+from tests.support.in_process.collectors import no_pulse, random_policy
+from tests.support.users_code.seat_envs import AGENTS
+from tests.workers.collect.test_seat_rows import FORMS, seated_run
+from workers.collect.collector import Collector
+from workers.conversation.held import Assignment
+from workers.evaluate.evaluator import Evaluator
+from workers.opponents import KnownOpponents, Match, Opponent, OtherTeams
+
+A = len(AGENTS)
+SCRIPTED = f"{__name__}:always_two"
+
+
+def with_teams(run: RunSpec, patterns: Sequence[str] = (), **changes: Any) -> RunSpec:
+    facts = counted_facts((), run.seats, opponents=True)
+    return msgspec.structs.replace(run, teams=teams_of(run.seats, patterns), facts=facts, **changes)
+
+
+def always(action: int, version: int, spec: PolicySpec) -> Weights:
+    """Weights of a policy without hidden layers that always takes this action."""
+    parameters = np.zeros(acting_size(spec), np.float32)
+    parameters[-3 + action] = 1e4  # the last are the biases of the three actions
+    return Weights(version, parameters, np.zeros(0, np.float32))
+
+
+def always_two() -> Any:
+    def act(obs: Array, state: Floats, rng: np.random.Generator) -> Any:
+        return np.full(len(obs), 2), state, {}
+
+    return SimpleNamespace(act=act)
+
+
+def collector_of(run: RunSpec, action: int = 0) -> Collector:
+    """A collector whose policy always takes this action."""
+    policy, weights = make_policy(run.policy), always(action, 0, run.policy)
+    policy.load(weights.parameters, weights.buffers)
+    return Collector(run, policy)
+
+
+def collect(collector: Collector, run: RunSpec, opponents: Sequence[int | None], lane: int = 0) -> list[Rollout]:
+    """A rollout for each of these opponents; version v always takes action v."""
+    held = {number: always(number, number, run.policy) for number in opponents if number is not None and number >= 0}
+    found = []
+    for sequence, opponent in enumerate(opponents):
+        found += collector.collect([Assignment(sequence, lane, 0, sequence, opponent)], 0, 1, no_pulse, held)
+        validate(found[-1], run)
+    return found
+
+
+def told(collector: Collector, lane: int = 0) -> list[list[dict[str, Any]]]:
+    """What the agents of each copy lived through, episode by episode."""
+    return [env.env.told for env in collector.lanes[lane].copies.envs]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("second", [2, -1])
+def test_one_opponent_plays_the_other_seats_for_a_whole_episode(form: str, second: int) -> None:
+    run = with_teams(seated_run(form, T=7, N=4, net=()), scripted=(SCRIPTED,))
+    collector = collector_of(run)
+    order = [1, second] * 10
+    rollouts = collect(collector, run, order, lane=1)
+    met = set()
+    ended = [[e.opponent for e in rollout.episodes] for rollout in rollouts]
+    for n, episodes in enumerate(told(collector, 1)):
+        mine = AGENTS[(4 + n) % A]
+        for episode in episodes:
+            assert set(episode[mine].did) <= {0}
+            others = {action for agent in AGENTS if agent != mine for action in episode[agent].did}
+            assert len(others) <= 1
+            met |= others
+    assert met == {1, 2}
+    assert {number for of_rollout in ended for number in of_rollout} == {1, second}
+
+
+def test_another_opponent_comes_where_the_copy_is_reset() -> None:
+    run = with_teams(seated_run("together", T=5, N=1, net=()))
+    collector = collector_of(run)
+    order = [1, 2, 2, 1, 1, 2, 1, 2, 2, 1, 2, 1, 1, 1, 2, 2]
+    rollouts = collect(collector, run, order)
+    resets = np.concatenate([rollout.resets[:-1, 0] for rollout in rollouts if rollout.resets is not None])
+    began = [order[0], *(order[t // run.rollout_steps] for t in np.flatnonzero(resets))]
+    played = [episode.opponent for rollout in rollouts for episode in rollout.episodes]
+    assert played == began[: len(played)]
+    assert len(played) > 6
+
+
+def test_teams_are_of_one_size_and_every_agent_is_in_one() -> None:
+    assert teams_of(("r1", "b1", "r2", "b2"), ("r*", "b*")) == ((0, 2), (1, 3))
+    assert teams_of(AGENTS) == ((0,), (1,), (2,))
+    for patterns, says in (
+        (("[ab]", "c"), r"expected as many agents in each, got \[2, 1\]"),
+        (("*",), "expected patterns that put each of a, b, c into one team"),
+        (("a", "b"), "expected patterns that put each"),
+        (("*", "c"), "expected patterns that put each"),
+        (("a", "b", "c", "d"), "expected as many agents in each"),
+    ):
+        with pytest.raises(UsageError, match=f"^teams: {says}"):
+            teams_of(AGENTS, patterns)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_rollout_has_the_rows_of_its_team_bit_for_bit(form: str) -> None:
+    """The opponent does what the policy does, so the environment tells the same histories without one."""
+    alone = msgspec.structs.replace(seated_run(form, T=9, N=6, net=()), facts=())
+    run = with_teams(alone)
+    ours, all_seats = collect(collector_of(run), run, [0] * 5), collect(collector_of(alone), alone, [None] * 5)
+    for got, whole in zip(ours, all_seats, strict=True):
+        columns = [n * A + n % A for n in range(6)]
+        for name in ("action", "log_prob", "reward", "terminated", "truncated", "valid"):
+            assert np.array_equal(getattr(got, name), getattr(whole, name)[:, columns]), name
+        assert np.array_equal(got.obs[0], whole.obs[0][:, columns])
+        assert np.array_equal(got.state, whole.state[columns])
+        assert np.array_equal(got.resets, whole.resets)  # type: ignore[arg-type]
+        assert [(e.length, e.opponent) for e in got.episodes] == [(e.length, 0) for e in whole.episodes]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_learner_finds_the_log_probabilities_of_its_team(form: str) -> None:
+    run = with_teams(seated_run(form, T=5, N=6, core="gru", core_size=7))
+    ppo = PPO(PPOConfig(core="gru", core_size=7), run.policy, total_steps=1, seed=3)
+    policy = make_policy(run.policy)
+    policy.load(*ppo.weights())
+    collector, other = Collector(run, policy), PPO(PPOConfig(core="gru", core_size=7), run.policy, total_steps=1, seed=4)
+    held = {4: Weights(4, *other.weights())}
+    for k in range(6):
+        (rollout,) = collector.collect([Assignment(k, 0, 0, k, 4)], 0, 1, no_pulse, held)
+        batch = stack_rollouts([rollout])
+        found = log_probs(ppo.net, ppo.observations(batch), batch, no_pulse)
+        # A chain of some hundred float32 operations on numbers of the size of 1, in other orders.
+        np.testing.assert_allclose(found[batch.valid], batch.log_prob[batch.valid], atol=1e-4)
+
+
+class _Counts:
+    """Its state is how often it has acted."""
+
+    def __init__(self) -> None:
+        self.found: list[list[float]] = []
+
+    def choose(self, obs: Sequence[Array], state: Floats, generator: Any, *, greedy: bool) -> Array:
+        assert not greedy
+        self.found.append(state[0, :, 0].tolist())
+        state += 1
+        return np.full(state.shape[1], 7)
+
+
+def test_an_opponent_has_a_state_of_its_own_which_is_zeros_when_an_episode_begins() -> None:
+    run = with_teams(seated_run("turns", T=5, N=2, core="gru", core_size=7))
+    acting: Any = _Counts()
+    opponent = Opponent.__new__(Opponent)
+    opponent.number, opponent.acting, opponent.to_env_action, opponent.state_size = 3, acting, lambda action: action, 7
+    others = OtherTeams(run, [Match(0, opponent), Match(1, opponent)], np.random.default_rng(0))
+    obs, taken = [np.zeros((6, 1), np.float32)], np.zeros(6, np.int64)
+    everybody = np.ones(6, bool)
+    others.act(obs, everybody, taken)
+    assert taken.tolist() == [0, 7, 7, 7, 0, 7]
+    others.act(obs, np.array([True, True, False, True, True, False]), taken)  # those that wait keep theirs
+    others.begin([1], opponent)
+    others.act(obs, everybody, taken)
+    others.act(obs, np.array([True, False, False, False, True, False]), taken)  # nobody of theirs: it is not asked
+    assert acting.found == [[0, 0, 0, 0], [1, 1], [2, 1, 0, 0]]
+
+
+def test_the_score_compares_the_return_of_the_team_with_the_best_of_the_others() -> None:
+    run, opponent = with_teams(seated_run("turns", T=5, N=1)), Opponent.__new__(Opponent)
+    opponent.number = 9
+    for team, returns, result in (
+        (0, (2.0, 1.0, 1.5), (2.0, 1.0, 9)),
+        (0, (2.0, 1.0, 2.0), (2.0, 0.5, 9)),
+        (1, (2.0, 1.0, -3.0), (1.0, 0.0, 9)),
+        (2, (-2.0, -1.0, -0.5), (-0.5, 1.0, 9)),
+    ):
+        assert OtherTeams(run, [Match(team, opponent)], np.random.default_rng(0)).result(0, returns) == result
+    pairs = msgspec.structs.replace(
+        run, seats=("r1", "b1", "r2", "b2"), teams=teams_of(("r1", "b1", "r2", "b2"), ("r*", "b*"))
+    )
+    others = OtherTeams(pairs, [Match(1, opponent)], np.random.default_rng(0))
+    assert others.mine.tolist() == [False, True, False, True]
+    assert others.result(0, (1.0, 2.0, 3.0, 1.0)) == (3.0, 0.0, 9)
+
+
+def test_an_evaluation_is_played_as_it_is_ordered() -> None:
+    run = with_teams(seated_run("together", T=5, N=1, net=()), scripted=(SCRIPTED,))
+    policy, weights = random_policy(run.policy), always(0, 0, run.policy)
+    policy.load(weights.parameters, weights.buffers)
+    evaluator = Evaluator(run, policy)
+    order = Evaluate(1, 1, 0, (5, 6, 7, 8), True, 100, False, False, (1, -1, 1, -1), (0, 1, 2, 0))
+    answer = evaluator.play(order, lambda rows: None, no_pulse, {1: always(1, 1, run.policy)})
+    assert [episode.opponent for episode in answer.episodes] == [1, -1, 1, -1]
+    (copies,) = evaluator._copies.values()
+    for n, (team, action) in enumerate(zip(order.teams, (1, 2, 1, 2), strict=True)):
+        (episode,) = copies.envs[n].env.told  # type: ignore[attr-defined]
+        for agent, lived in episode.items():
+            assert set(lived.did) <= {0 if agent == AGENTS[team] else action}
+        assert answer.episodes[n].reward == pytest.approx(episode[AGENTS[team]].total)
+    evaluator.close()
+
+
+def test_an_opponent_lives_while_an_episode_is_played_against_it() -> None:
+    run = with_teams(seated_run("together", T=5, N=1, net=()))
+    known = KnownOpponents(run)
+    first = known.among({1: always(1, 1, run.policy)})(1)
+    assert known.among({})(1) is first
+    del first
+    with pytest.raises(KeyError):
+        known.among({})(1)
+
+
+def fails() -> Any:
+    return SimpleNamespace(act=lambda obs, state, rng: 1 / 0)
+
+
+@pytest.mark.parametrize(
+    ("factory", "says"),
+    [
+        (f"{__name__}:fails", r"^policy .*:fails: act raised ZeroDivisionError: division by zero$"),
+        (f"{__name__}:missing", r"^policy .*:missing: .*"),
+        ("json:dumps", r"^policy json:dumps: cannot be made: it raised TypeError: "),
+    ],
+)
+def test_a_program_that_fails_is_named(factory: str, says: str) -> None:
+    run = with_teams(seated_run("together", T=5, N=1, net=()), scripted=(factory,))
+    with pytest.raises(PolicyFailed, match=says):
+        collect(collector_of(run), run, [-1])
