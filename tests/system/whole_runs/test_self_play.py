@@ -44,10 +44,8 @@ def broken() -> Any:
 
 def pool_of(run: Path) -> Any:
     state = checkpoint.newest(run)[0].state
-    arrays = (
-        None if state["opponent_policies"] is None else [array.numpy().tobytes() for array in state["opponent_policies"]]
-    )
-    return state["past"]["opponents"], arrays
+    arrays = state["opponent_policies"]
+    return state["past"]["opponents"], arrays and [array.numpy().tobytes() for array in arrays]
 
 
 @pytest.mark.parametrize(
@@ -141,5 +139,5 @@ def test_what_self_play_cannot_have_is_refused_in_a_line(
 
 
 def test_an_environment_of_one_agent_has_no_opponents(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="^self_play: expected an environment of several agents, got CartPole-v1$"):
+    with pytest.raises(UsageError, match=r"^self_play: expected an environment of several agents, got CartPole-v1$"):
         millrace.train("CartPole-v1", self_play=2, steps=100, run_dir=str(tmp_path), transport="inproc", progress=False)
