@@ -11,7 +11,7 @@ from learner.env_spaces import EnvSpaces
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
-from protocol.specs import PolicySpec, RunSpec, counted_facts, teams_of
+from protocol.specs import SCORE, PolicySpec, RunSpec, counted_facts, teams_of
 from protocol.wire.codec import check_can_be_sent
 
 
@@ -42,6 +42,8 @@ def _with_opponents(config: Config, spec: RunSpec) -> RunSpec:
     what = "self_play" if config.self_play else "opponents"
     if len(spec.seats) < 2:
         raise UsageError(f"{what}: expected an environment of several agents, got {config.env}")
+    if SCORE in config.info_keys:
+        raise UsageError(f"info_keys: expected another name than {SCORE}, which is counted in a run with opponents")
     teams = teams_of(spec.seats, config.teams)
     if config.envs < len(teams):
         raise UsageError(f"{what}: expected envs {len(teams)} or more, so that each team is played, got {config.envs}")

@@ -24,12 +24,14 @@ from rich.table import Table
 from rich.text import Text
 
 from learner.report.sentences import bottleneck, ending, went_wrong
+from learner.rollouts.opponent_pool import ELO_KEY
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import ALL_STEPS_DONE
 from millrace.sparkline import ASCII, BLOCKS, Sparkline
 from protocol.bounds import escaped, one_line
 from protocol.logs.notices import is_notice
+from protocol.specs import SCORE
 
 REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
@@ -298,11 +300,12 @@ def main_figures(progress: Progress) -> str:
         f"{progress.env_steps:,} of {progress.total_steps:,} env steps",
         f"{progress.steps_per_s:,.0f} steps/s",
         f"return {_return(progress)}",
+        _strength(progress),
         _lag(progress),
         f"workers {_workers(progress)}",
         f"update {progress.updates:,}",
     ]
-    return " | ".join(figures)
+    return " | ".join(filter(None, figures))
 
 
 def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
@@ -313,6 +316,7 @@ def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
     rows = {
         "env steps": GAP.join((steps, f"{progress.steps_per_s:,.0f} a second", f"update {progress.updates:,}")),
         "return": GAP.join(filter(None, (_return(progress), str(returns), evaluated))),
+        "opponents": _strength(progress),
         "workers": GAP.join((_workers(progress), _lag(progress))),
         "time": bottleneck("" if progress.stop_reason else progress.waiting, progress.stages),
         "lost": went_wrong(progress.ledger),
@@ -353,6 +357,13 @@ def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
 
 def _return(progress: Progress) -> str:
     return "none yet" if progress.return_mean is None else f"{progress.return_mean:,.1f}"
+
+
+def _strength(progress: Progress) -> str:
+    """Score and rating against opponents, if there are any."""
+    if (elo := progress.metrics.get(ELO_KEY)) is None:
+        return ""
+    return f"score {progress.facts[SCORE]}, Elo {elo:,.0f}"
 
 
 def _lag(progress: Progress) -> str:

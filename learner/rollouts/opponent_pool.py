@@ -20,6 +20,7 @@ from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 
 FIRST_RATING = 1200.0
+ELO_KEY = "self_play/elo"
 K = 8.0
 """Largest change of a rating by one episode is K."""
 SCALE = 400.0
@@ -103,7 +104,7 @@ class OpponentPool:
 
     def metrics(self) -> dict[str, float]:
         """What a row of the metrics has of it."""
-        return {"self_play/elo": self.state.rating, "self_play/snapshots": float(len(self.versions))}
+        return {ELO_KEY: self.state.rating, "self_play/snapshots": float(len(self.versions))}
 
     def played(self, episodes: Iterable[Episode]) -> None:
         """An update used these episodes."""

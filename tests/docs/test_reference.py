@@ -35,6 +35,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "reinforce": {"algo": "reinforce", "rollout_steps": 501, "steps": 2_100},
     "dqn": {"algo": "dqn", "learning_starts": 0, "gradient_steps": 1},
     "sac": {"env": "Pendulum-v1", "algo": "sac", "learning_starts": 0, "batch_size": 8, "net": (8,)},
+    "self-play": {"env": "tests.support.users_code.seat_envs:RockPaperScissors", "algo": "ppo", "self_play": 1},
     "td3": {"env": "Pendulum-v1", "algo": "td3", "learning_starts": 0, "batch_size": 8, "net": (8,)},
 }
 
@@ -42,7 +43,9 @@ RUNS: dict[str, dict[str, Any]] = {
 def general(name: str) -> str:
     """A name in which the user's own part is NAME."""
     group, _, last = name.partition("/")
-    return f"{group}/{last.replace('distance', 'NAME').replace('own_number', 'NAME')}"
+    for own in ("distance", "own_number", "score_missing"):
+        last = last.replace(own, own.replace(own.removesuffix("_missing"), "NAME"))
+    return f"{group}/{last}"
 
 
 @cache

@@ -127,6 +127,7 @@ def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path) -
     [
         ("RockPaperScissors", {"teams": ("left", "right")}, "^teams: expected none without opponents"),
         ("RockPaperScissors", {"self_play": 1, "teams": ("l*",)}, "^teams: expected patterns that put each of left, right"),
+        ("RockPaperScissors", {"self_play": 1, "info_keys": ("score",)}, "^info_keys: expected another name than score"),
         ("RockPaperScissors", {"self_play": 1, "envs": 1, "lanes": 1}, "^self_play: expected envs 2 or more"),
         ("RockPaperScissors", {"opponents": (f"{__name__}:broken",)}, "policy .*:broken: act raised ZeroDivisionError"),
     ],
