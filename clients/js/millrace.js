@@ -14,7 +14,7 @@ export { box, discrete, UsageError };
 
 const PROTOCOL_VERSION = 8;
 const FIELDS = { // how many fields each message of the learner has
-  Welcome: 3, Rejoin: 1, Weights: 4, Collect: 4, Release: 2, Evaluate: 8, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
+  Welcome: 3, Rejoin: 1, Weights: 4, Collect: 4, Release: 2, Evaluate: 10, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
 };
 const OF_ANY_SESSION = ["Welcome", "Refuse", "Drain", "Weights"];
 const OBEYED = { // the table of the wire document: what is not ignored in each state

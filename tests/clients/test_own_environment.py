@@ -264,6 +264,7 @@ def stepped(env: str) -> StepSpec:
         ("cpp cartpole", stepped("CartPole-v1"), "expected agents: black, white, this client has agents: none"),
         ("cpp cartpole", run_of("CartPole-v1", critic=(OBSERVATION,)), "not support observations that only the critic sees"),
         ("cpp nim", of_agents("Nim-v0"), NO_AGENTS[13:].replace("agents: none", "agents that take turns: first, second")),
+        ("cpp nim", replace(of_agents("Nim-v0"), teams=((0,), (1,))), "opponents that play some of the agents"),
         ("cpp control_50hz", of_agents("CartPole-v1"), NO_AGENTS),
         ("js cartpole", of_agents("CartPole-v1"), NO_SEATS),
         ("js cartpole", stepped("CartPole-v1"), NO_SEATS),

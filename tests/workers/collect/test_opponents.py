@@ -136,6 +136,31 @@ def test_a_rollout_has_the_rows_of_its_team_bit_for_bit(form: str) -> None:
         assert [(e.length, e.opponent) for e in got.episodes] == [(e.length, 0) for e in whole.episodes]
 
 
+def by_sight() -> Any:
+    def act(obs: Array, state: Floats, rng: np.random.Generator) -> Any:
+        return seen_as(obs[:, 0]), state, {}
+
+    return SimpleNamespace(act=act)
+
+
+def seen_as(obs: Any) -> Array:
+    """The action of that program; all observations of these environments are different multiples of 1/64."""
+    return np.asarray(np.rint(np.multiply(obs, 64)), np.int64) % 3
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_program_sees_what_its_agents_see(form: str) -> None:
+    run = with_teams(seated_run(form, T=9, N=3, net=()), scripted=(f"{__name__}:by_sight",))
+    collector, acted = collector_of(run), 0
+    collect(collector, run, [-1] * 6)
+    for n, episodes in enumerate(told(collector)):
+        for episode in episodes:
+            for agent in AGENTS[:n] + AGENTS[n + 1 :]:
+                assert episode[agent].did == seen_as(episode[agent].seen).tolist()
+                acted += len(episode[agent].did)
+    assert acted > 50
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_the_learner_finds_the_log_probabilities_of_its_team(form: str) -> None:
     run = with_teams(seated_run(form, T=5, N=6, core="gru", core_size=7))

@@ -128,9 +128,9 @@ class Decoder {
     } else if (name == "Collect") {
       m.type = Type::Collect, expect(fields == 4), session(), m.version = r.natural();
       for (std::size_t n = r.array(); n; --n) {
-        expect(r.array() == 4);
+        expect(r.array() == 5);
         Permit permit{r.natural(), r.natural(), r.natural(), r.natural()};
-        m.permits.push_back(permit);
+        m.permits.push_back(permit), r.skip();  // the opponent: a run with teams is declined
       }
       received(r, m);
     } else if (name == "Release") {
@@ -141,8 +141,8 @@ class Decoder {
         m.lanes.push_back({lane, r.natural()});
       }
     } else if (name == "Evaluate") {
-      m.type = Type::Evaluate, expect(fields == 8), session(), m.ticket = r.natural(), m.version = r.natural(), seeds(r, m);
-      m.greedy = r.boolean(), m.most_steps = r.natural(), m.send_rows = r.boolean(), m.send_rows |= r.boolean();
+      m.type = Type::Evaluate, expect(fields == 10), session(), m.ticket = r.natural(), m.version = r.natural(), seeds(r, m);
+      m.greedy = r.boolean(), m.most_steps = r.natural(), m.send_rows = r.boolean(), m.send_rows |= r.boolean(), r.skip(), r.skip();
       expect(m.seeds.size() >= 1 && m.seeds.size() <= 1024 && m.most_steps >= 1);
       for (auto& seed : m.seeds) expect(seed.has_value());
     } else if (name == "HeartbeatReply") {
@@ -270,6 +270,7 @@ class Decoder {
       else if (name == "env") env(r, run);
       else if (name == "envs") for (std::size_t n = r.array(); n; --n) env(r, run);
       else if (name == "policy") policy(r, run);
+      else if (name == "teams") { if (std::size_t n = r.array()) for (run.beyond = "opponents that play some of the agents"; n; --n) r.skip(); }
       else if (name == "vector") run.vector = r.text(40);
       else if (name == "autoreset") run.autoreset = r.text(40);
       else if (name == "observation") leaves(r, run.observation);
