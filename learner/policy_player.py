@@ -49,6 +49,8 @@ class SavedPolicy(NamedTuple):
     """the names of its agents"""
     teams: tuple[tuple[int, ...], ...] = ()
     """the seats of each team, if it has met opponents"""
+    against: SavedPolicy | None = None
+    """plays the other teams"""
 
 
 def saved_policy(
@@ -77,16 +79,15 @@ class PolicyPlayer:
         watch: Callable[[str], None],
         settings: RolloutConfig,
         described: DescribedEnv | None = None,
-        against: SavedPolicy | None = None,
     ) -> None:
         """`check_interrupt` is called while it waits: what it raises ends the wait. `settings`: timeouts and failures.
 
         `watch` is called several times a second with how far it is, as text. `described`: the environment, if a worker has
-        described it. `against`: a policy that plays the other teams. Raises `UsageError` if it cannot.
+        described it. Raises `UsageError` if one policy cannot play against the other.
         """
-        self.policy, self._against = policy, against
-        if against is not None:
-            _check_rival(policy, against)
+        self.policy = policy
+        if policy.against is not None:
+            _check_rival(policy, policy.against)
         self._link, self._processes = link, processes
         self._check_interrupt, self._watch, self._settings, self._described = check_interrupt, watch, settings, described
         self._hub: Hub | None = None
@@ -126,7 +127,7 @@ class PolicyPlayer:
         if self._hub is None:
             self._hub = self._published()
         show = self._watch
-        if self._against is not None:
+        if self.policy.against is not None:
             plan = replace(plan, greedy=False, opponents=(RIVAL,))
         self._hub.begin_evaluation(plan, on_rows)
         return self._hub.end_evaluation(lambda played, steps: show(plan.how_far(played, steps, bound, before)))
@@ -153,7 +154,7 @@ class PolicyPlayer:
             takes_turns=bool(policy.seats),  # perhaps
             heartbeat_s=settings.heartbeat_s(),
         )
-        if (against := self._against) is None:
+        if (against := policy.against) is None:
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
         else:
             teams, keys = policy.teams or teams_of(policy.seats), run.info_keys

@@ -51,10 +51,9 @@ def train(
         check_time()
 
     def publish(weights: tuple[Floats, Floats]) -> None:
-        attributes, state = audience.env_attributes(), tally.state
-        if tally.pool is not None:
-            tally.pool.made(state.version, state.env_steps)
-        hub.publish(state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
+        attributes = audience.env_attributes()
+        tally.made_weights()
+        hub.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
 
     def tell(metrics: Row | None) -> None:
         """Tell the metrics of an evaluation, if one has ended, and save its result."""
@@ -86,7 +85,7 @@ def train(
             files.write_images(batch)
             publish(weights)
             with tally.after_update(time.monotonic() - began_s):
-                audience.updated(metrics if tally.pool is None else metrics | tally.pool.metrics())
+                audience.updated(metrics | tally.ratings())
                 if tally.evaluation_is_due():
                     files.save()  # an evaluation may take long
                     tell(evaluations.evaluate_when_due(audience.show_now))

@@ -155,8 +155,9 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     copies = 1 if flags.video else flags.copies
     count = useful_workers(flags.workers, episodes, copies)
     workers = _workers(flags, count, min(copies, episodes))
-    rival = None if flags.against is None else _saved(flags, given, flags.against)
-    with policy_player(saved, workers, watch, rival) as player:
+    if flags.against is not None:
+        saved = saved._replace(against=_saved(flags, given, flags.against))
+    with policy_player(saved, workers, watch) as player:
         if flags.video:
             return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps)
         played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps), bound="--max-steps:")

@@ -43,13 +43,8 @@ class PlayingWorkers:
 
 
 @contextmanager
-def policy_player(
-    policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[str], None], against: SavedPolicy | None = None
-) -> Iterator[PolicyPlayer]:
-    """A player with its workers. `watch` gets how far it is. `against`: a policy that plays the other teams.
-
-    Raises `UserFacingError`, or `KeyboardInterrupt`.
-    """
+def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[str], None]) -> Iterator[PolicyPlayer]:
+    """A player with its workers. `watch` gets how far it is. Raises `UserFacingError`, or `KeyboardInterrupt`."""
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         if which.inference == "learner" or which.transport == "inproc":
@@ -62,7 +57,7 @@ def policy_player(
         if which.inference == "learner":
             player = _acting_player(policy, which, check_interrupt, watch, stack)
         else:
-            player = _player(policy, which, check_interrupt, watch, stack, against)
+            player = _player(policy, which, check_interrupt, watch, stack)
         reason = "all episodes played"
         try:
             yield player
@@ -79,13 +74,12 @@ def _player(
     check_interrupt: Callable[[], None],
     watch: Callable[[str], None],
     stack: ExitStack,
-    against: SavedPolicy | None,
 ) -> PolicyPlayer:
     """A player whose workers act."""
     endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
     started = endpoint.workers(which.workers, _own_logs(which, stack), which.settings.call_timeouts(), 2.0)
     _, processes = stack.enter_context(started)
-    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings, against=against)
+    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
 
 
 def _acting_player(

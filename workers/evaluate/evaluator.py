@@ -106,9 +106,7 @@ class Evaluator:
         """
         began_s = perf_counter()
         try:
-            find = self._opponents.among(held)
-            matches = [Match(team, find(number)) for team, number in zip(order.teams, order.opponents, strict=True)]
-            while (answer := self._play(order, send, pulse, matches)) is None:
+            while (answer := self._play(order, send, pulse, self._other_teams(order, held))) is None:
                 pass  # the episodes of lost copies are played again from their seeds
             return answer
         except CopyFailed as error:
@@ -125,15 +123,13 @@ class Evaluator:
         while self._copies:
             self._copies.popitem()[1].close()
 
-    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, matches: Sequence[Match]) -> Evaluated | None:
+    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, others: OtherTeams | None) -> Evaluated | None:
         """The answer; None if a worker was lost, and with it copies whose episodes had not ended."""
         k, A, policy = len(order.seeds), self._run.seats_of_copy, self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         obs = tuple(np.empty((1, k * A, *leaf.shape), leaf.dtype) for leaf in self._stored)
         numbers = np.zeros(k * A), np.zeros(k * A, bool), np.zeros(k * A, bool)
         state, drawn = zero_state(policy, 1, k * A), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
-        drawn_by_others = generator(order.seeds[0], Purpose.PLAYED_OPPONENTS)
-        others = OtherTeams(self._run, matches, drawn_by_others) if matches else None
         returns, lengths, cut, seconds = np.zeros((k, A)), [0] * k, [False] * k, [0.0] * k
         no_facts = (math.nan,) * len(self._run.info_keys)
         facts = [no_facts] * k
@@ -147,15 +143,15 @@ class Evaluator:
             self._observe(sender, obs, n, copies)
         while running:
             pulse()
+            acts = copies.columns.acts[: k * A] if isinstance(copies, SeatedCopies) else None
             with np.errstate(all="ignore"):
                 before = state.copy()
                 chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
-                if isinstance(copies, SeatedCopies):
-                    waits = ~copies.columns.acts[: k * A]
-                    state[0][waits] = before[0][waits]
                 taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=False)
-                if others is not None and isinstance(copies, SeatedCopies):
-                    others.act([leaf[0] for leaf in obs], copies.columns.acts[: k * A], taken)
+                if acts is not None:
+                    state[0][~acts] = before[0][~acts]
+                    if others is not None:
+                        others.act([leaf[0] for leaf in obs], acts, taken)
             self._check_acted(chosen, running, obs, t)
             # The actions are a new array at each step, because an environment may keep its action.
             try:
@@ -196,6 +192,12 @@ class Evaluator:
             for n, figures in enumerate(zip(returns.tolist(), lengths, seconds, facts, strict=True))
         )
         return Evaluated(order.session, order.ticket, episodes, tuple(cut))
+
+    def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
+        """The other teams, if the order says who plays them."""
+        find = self._opponents.among(held)
+        matches = [Match(team, find(number)) for team, number in zip(order.teams, order.opponents, strict=True)]
+        return OtherTeams(self._run, matches, generator(order.seeds[0], Purpose.PLAYED_OPPONENTS)) if matches else None
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
         """At least this number of copies. Raises `UsageError` when their spaces are not those of the run."""
