@@ -45,14 +45,14 @@ SAVED: dict[type, set[str]] = {
     | {"strikes", "takeovers"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order"},
-    Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer"},
+    Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
     Rounds: {"next", "_versions"},
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation"},
-    RolloutDealer: {"_absent"},
+    RolloutDealer: {"_absent", "opponents"},
     SentWeights: set(),
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
@@ -72,7 +72,8 @@ NOT_SAVED: dict[type, set[str]] = {
     LanePlacement: {"_tie_break"},
     Rounds: {"_max_lag"},
 }
-"""What is not: constants, figures for people, and parts that no event of the model uses."""
+"""What is not: constants, figures for people, what follows from the version, as the opponents do, and parts that no event of
+the model uses."""
 
 
 class Learner:
@@ -132,7 +133,9 @@ class Learner:
             first_session=self.coordinator.membership._next_session,
             ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used),
             incarnations=[number.value for number in incarnations],
+            opponents=settings.pool(version - 1),
         )
+        coordinator.weights.kept = {each: weights(each) for each in _snapshots(coordinator)}
         learner = type(self)(settings, coordinator)
         learner.checkpoints = self.checkpoints[:version]
         learner.used = {number for number in self.used if number < issued.value}
@@ -143,9 +146,10 @@ class Learner:
     def named(self) -> list[tuple[CollectingMember, int]]:
         """Which versions the orders of which workers name."""
         members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation
-        versions = {number: each.version for number, each in self.coordinator.rollouts.held.items()}
-        versions |= dict.fromkeys(evaluation.held, evaluation.version)
-        return [(member, versions[number]) for member in members for number in member.tickets]
+        versions = {number: {each.version, each.opponent} for number, each in self.coordinator.rollouts.held.items()}
+        versions |= {number: {evaluation.version} for number in evaluation.held}
+        every = ((member, version) for member in members for number in member.tickets for version in versions[number])
+        return [(member, version) for member, version in every if version is not None]
 
     # ---------------------------------------------------------------- inside
 
@@ -158,12 +162,16 @@ class Learner:
         return self.coordinator.begin_update()
 
     def _set_weights(self, version: int) -> None:
+        if (pool := self.coordinator.rollouts.opponents) is not None:
+            pool.made(version, version)
         self.coordinator.publish(version, PARAMETERS, BUFFERS)
         assert self._needed().issuperset(self.coordinator.weights.kept), "the learner keeps weights that nobody needs"
 
     def _needed(self) -> set[int]:
-        """The versions that workers may need: the newest, and those that act in open rounds."""
-        return {self.coordinator.version, *self.coordinator.rollouts.rounds._versions.values()}
+        """The versions that workers may need: the newest, those that act in open rounds, and those that may meet them."""
+        acting = {self.coordinator.version, *self.coordinator.rollouts.rounds._versions.values()}
+        met = {each for version in acting for each in range(version - self.settings.opponents + 1, version) if each >= 0}
+        return {*acting, *met, *_snapshots(self.coordinator)}
 
     def _gather(self) -> list[Outgoing]:
         """Begin to gather the rollouts of the next update."""
@@ -231,6 +239,7 @@ class Learner:
         assert len(opened) <= self.settings.max_lag + 1, "more rounds are open than the lag allows"
         versions = {number: self.acts(number) for number in opened}
         assert rounds._versions == versions, "other weights act in a round than those that were the newest"
+        self._check_opponents()
         found = [(each.lane, each.round, each.version) for each in coordinator.rollouts.held.values()]
         for number, of_round in coordinator.rollouts.ready.items():
             found += [(lane, number, arrived.rollout.version) for lane, arrived in of_round.items()]
@@ -248,6 +257,13 @@ class Learner:
             assert in_order == sorted(set(in_order)), "rollouts of a lane are not collected in the order of the rounds"
             assert all(sequence < lane.dealt for sequence in in_order), "a sequence number will be dealt twice"
         assert self._needed().issubset({-1, *coordinator.weights.kept}), "weights that are needed are dropped"
+
+    def _check_opponents(self) -> None:
+        """A version meets itself, or one of those before it: as many as play."""
+        play = self.settings.opponents
+        for each in self.coordinator.rollouts.held.values():
+            met = range(max(0, each.version - play + 1), each.version + 1) if play else [None]
+            assert each.opponent in met, "a ticket names an opponent that does not play"
 
     def _check_versions(self) -> None:
         """Of the weights that were sent to a worker, it keeps the newest and those that its tickets name. So count these."""
@@ -300,6 +316,11 @@ def saved(learner: Learner, now: float) -> Content:
     )
 
 
+def _snapshots(coordinator: TicketCoordinator) -> list[int]:
+    pool = coordinator.rollouts.opponents
+    return [] if pool is None else pool.versions
+
+
 def _accepted(lane: int, number: int) -> Name | None:
     return None if number < 0 else incarnation(lane, number)
 
@@ -318,7 +339,16 @@ def _lane(lane: TicketedLane, next_round: int) -> Content:
 
 def _ticket(each: Ticket, next_round: int) -> Content:
     number, worker = incarnation(each.lane, each.incarnation), _worker(worker_of(each.peer))
-    return ticket(each.number), each.lane, number, each.sequence, each.round - next_round, each.version, worker
+    return (
+        ticket(each.number),
+        each.lane,
+        number,
+        each.sequence,
+        each.round - next_round,
+        each.version,
+        each.opponent,
+        worker,
+    )
 
 
 def without_checkpoints(content: Content) -> Content:
@@ -335,6 +365,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
         worker_timeout_s=TIMEOUT_S,
         first_session=members[1].value,
         ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
+        opponents=settings.pool(version),
     )
     coordinator.version = version
     coordinator.rollouts.ledger.transitions_received = len(ready)
@@ -350,8 +381,8 @@ def loaded(content: Content, settings: Settings) -> Learner:
         lane.incarnation, lane.owner = number.value, None if owner is None else peer_of(owner.value)
         lane.moving, lane.due, lane.dealt = moving, list(due), dealt
         lane.next_sequence, lane.out_of_order = following, set(out_of_order)
-    for number, of_lane, inc, sequence, of_round, under, worker in tickets:
-        each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value))
+    for number, of_lane, inc, sequence, of_round, under, opponent, worker in tickets:
+        each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value), opponent)
         coordinator.rollouts.held[number.value] = each
         coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
     membership_part.load(coordinator.membership, members, CollectingMember)

@@ -105,7 +105,9 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
         case Weights(version):
             return "Weights", version
         case Collect(number, version, permits, received):
-            permitted = tuple((ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation), p.sequence) for p in permits)
+            permitted = tuple(
+                (ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation), p.sequence, p.opponent) for p in permits
+            )
             return "Collect", session(number), version, permitted, _received(received)
         case Release(number, lanes):
             return "Release", session(number), tuple((each.lane, incarnation(each.lane, each.incarnation)) for each in lanes)
@@ -140,7 +142,7 @@ def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
         case "Weights", version:
             return weights(version)
         case "Collect", number, version, permits, received:
-            allowed = tuple(Permit(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in permits)
+            allowed = tuple(Permit(each.value, lane, inc.value, *more) for each, lane, inc, *more in permits)
             return Collect(number.value, version, allowed, _received_of(received))
         case "Release", number, lanes:
             return Release(number.value, tuple(LaneIncarnation(lane, inc.value) for lane, inc in lanes))

@@ -32,6 +32,7 @@ ROLLOUTS = "learner.rollouts.rollout_dealer"
 WEIGHTS = "learner.rollouts.sent_weights"
 MEMBERS = "learner.members.coordinator"
 LANES = "learner.rollouts.lanes"
+POOL = "learner.rollouts.opponent_pool"
 ROUNDS = "learner.rollouts.rounds"
 MEMBERSHIP = "learner.members.membership"
 PLACEMENT = "learner.members.lane_placement"
@@ -58,7 +59,7 @@ MUTATIONS = {
         "self._versions = dict.fromkeys([*self._versions, *opened], newest)",
     ),
     "a round is dealt under the newest weights": Mutation(
-        ROLLOUTS, "self.rounds.version(round_number))", "max(self.rounds._versions.values()))"
+        ROLLOUTS, "version = self.rounds.version(round_number)", "version = max(self.rounds._versions.values())"
     ),
     "an update counts rollouts of later rounds": Mutation(
         ROLLOUTS,
@@ -108,8 +109,8 @@ MUTATIONS = {
     "a Collect is sent again without the weights that it names": Mutation(
         COORDINATOR, "out + self.weights.after(orders, self.members, self._named)", "out + orders"
     ),
-    "weights are never sent": Mutation(WEIGHTS, " and message.version not in member.versions:", " and False:"),
-    "weights are sent with every order": Mutation(WEIGHTS, " and message.version not in member.versions:", ":"),
+    "weights are never sent": Mutation(WEIGHTS, "in sorted(asked - member.versions.keys()):", "in ():"),
+    "weights are sent with every order": Mutation(WEIGHTS, "sorted(asked - member.versions.keys())", "sorted(asked)"),
     "weights are sent before the order that names them": Mutation(
         WEIGHTS,
         "out.append((peer, self.kept[version]))",
@@ -147,8 +148,8 @@ MUTATIONS = {
     "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
     "a worker acts under the newest weights": Mutation(
         SESSION,
-        "RolloutTask(session, self.weights[version], assignments)",
-        "RolloutTask(session, self.weights[max(self.weights)], assignments)",
+        "RolloutTask(session, self.weights[version], assignments, ",
+        "RolloutTask(session, self.weights[max(self.weights)], assignments, ",
     ),
     "a worker drops weights that a ticket names": Mutation(SESSION, "asked = {*self.rollouts.versions(), ", "asked = {"),
     "a worker drops the newest weights": Mutation(SESSION, ", max(self.weights, default=-1)}", "}"),
@@ -175,11 +176,29 @@ MUTATIONS = {
         HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"
     ),
     "a rollout is collected before an earlier one has come": Mutation(
-        HELD, "if sequence == lane.sequence and version in versions:", "if version in versions:"
+        HELD, "if asked.sequence == lane.sequence and ", "if "
     ),
-    "a rollout starts without its weights": Mutation(
-        HELD, "if sequence == lane.sequence and version in versions:", "if sequence == lane.sequence:"
+    "a rollout starts without its weights": Mutation(HELD, " and asked.versions.issubset(versions):", ":"),
+    "a rollout starts without the weights of its opponent": Mutation(
+        HELD, "asked.versions.issubset(versions):", "asked.version in versions:"
     ),
+    "a worker drops the weights of opponents": Mutation(
+        HELD,
+        "return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}",
+        "return {asked.version for lane in self._lanes.values() for asked in lane.asked.values()}",
+    ),
+    "only the weights that act are sent after an order": Mutation(
+        WEIGHTS, "asked = message.versions if", "asked = {message.version} if"
+    ),
+    "the weights of opponents do not count as named": Mutation(
+        ROLLOUTS, "for version in versions_of(ticket.version, [ticket.opponent])}", "for version in [ticket.version]}"
+    ),
+    "the weights of opponents are dropped": Mutation(COORDINATOR, "and version in opponents.versions:", "and False:"),
+    "an opponent is forgotten while a version can meet it": Mutation(
+        POOL, " - settings.window - settings.max_lag", " - settings.window"
+    ),
+    "an opponent is drawn from versions that came later": Mutation(POOL, " if each <= version]", "]"),
+    "an order does not name its opponent": Mutation(ROLLOUTS, "each.sequence, each.opponent)", "each.sequence)"),
     "later rollouts are collected first": Mutation(
         HELD, "version = min(startable, default=-1)", "version = max(startable, default=-1)"
     ),
@@ -247,9 +266,11 @@ def runs() -> list[Conversation]:
 
     return [
         Training(workers=1, lanes=1, updates=2, faults=1),
+        Training(workers=1, lanes=1, updates=3, faults=1, opponents=3),
         Training(workers=1, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
         Training(workers=2, lanes=1, updates=1, faults=1),
         Training(workers=1, lanes=1, updates=2, faults=1, max_lag=1),
+        Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
         Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1),
         Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1, only=("repeat down",)),
         Training(workers=1, lanes=1, updates=2, faults=3, only=("repeat down", "freeze")),

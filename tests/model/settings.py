@@ -10,12 +10,21 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
 from protocol.specs import RunSpec
 from tests.support.conversation.fake_ends import run_spec
 
 TICK_S = 1.0
 TIMEOUT_S = 2.0
 FOR_EVER_S = math.inf
+SEED = 16  # of the pool: a version meets itself, the one before it, or the one before that
+
+
+class DrawnOpponents(OpponentPool):
+    """Every version is a snapshot. All incarnations of a lane meet the same, because the model numbers them anew."""
+
+    def of(self, lane: int, incarnation: int, sequence: int, version: int) -> int:
+        return super().of(lane, 0, sequence, version)
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,8 @@ class Settings:
     max_lag: int = 0
     only: tuple[str, ...] = ()
     """kinds of faults; empty: all"""
+    opponents: int = 0
+    """how many versions of the policy are opponents, the newest ones; 0: the policy plays all seats"""
 
     @property
     def few_losses(self) -> bool:
@@ -41,7 +52,16 @@ class Settings:
     def run(self) -> RunSpec:
         return run_spec(self.lanes, heartbeat_s=TICK_S, learner_timeout_s=TIMEOUT_S)
 
+    def pool(self, newest: int) -> DrawnOpponents | None:
+        """The opponents when this is the newest version; -1: there is none."""
+        if not self.opponents:
+            return None
+        pool = DrawnOpponents(PoolSettings(SEED, self.opponents, save_steps=1, latest=0.0, max_lag=self.max_lag))
+        for version in range(newest + 1):
+            pool.made(version, version)
+        return pool
+
     def __str__(self) -> str:
         size = f"{self.workers} workers, {self.lanes} lanes, {self.updates} updates, {self.faults} faults"
-        size += f", max_lag {self.max_lag}"
+        size += f", max_lag {self.max_lag}" + (f", {self.opponents} opponents" if self.opponents else "")
         return ", ".join([size, *[f"only {each}" for each in self.only]])

@@ -1,10 +1,10 @@
 """Every interleaving of messages, faults and time in small runs: of training, of evaluations, and of vector environments.
 
 Rule: the program itself is explored, not a description of it. In training every rule of tickets, lanes and weights holds,
-and the run reaches its target; each evaluation is of one version, its episodes count once, and no ticket for a rollout is
-dealt meanwhile, unless workers that have no lanes play it; each order of a vector environment is executed once, a lost lane
-is reported once and reset before it steps, and every call returns, or is made again. Mistakes that are made on purpose are
-found.
+those of opponents among them, and the run reaches its target; each evaluation is of one version, its episodes count once,
+and no ticket for a rollout is dealt meanwhile, unless workers that have no lanes play it; each order of a vector environment
+is executed once, a lost lane is reported once and reset before it steps, and every call returns, or is made again. Mistakes
+that are made on purpose are found.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from tests.model.vector_env.stepping import Stepping
 
 LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_evaluation, of_vector_env)}
 SMALL: list[Conversation] = [
+    Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
     Evaluating(workers=1, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1), evaluators=0),
@@ -41,6 +42,9 @@ LARGE: list[Conversation] = [
     Training(workers=1, lanes=1, updates=3, faults=2, max_lag=1),
     Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
     Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("drop up", "drop down")),
+    Training(workers=1, lanes=1, updates=3, faults=2, opponents=3),
+    Training(workers=2, lanes=1, updates=3, faults=1, max_lag=1, opponents=2),
+    Training(workers=1, lanes=2, updates=4, faults=1, max_lag=1, opponents=2),
     Evaluating(workers=2, lanes=1, updates=1, faults=1),
     Evaluating(workers=2, lanes=1, updates=1, faults=1, evaluated=(1,)),
     Evaluating(workers=2, lanes=1, updates=1, faults=1, episodes=1, rows=True),
@@ -78,7 +82,7 @@ def test_larger_runs(run: Conversation) -> None:
 def test_a_mistake_is_found_and_told_as_a_story() -> None:
     """One mistake that only liveness shows, in every `make test`, so that it is known that the checker can fail."""
     story = find("a lost Collect is not sent again")
-    assert "Collect(session 0, 0, ((ticket 0, 0, incarnation 0:0, 0),)," in story
+    assert "Collect(session 0, 0, ((ticket 0, 0, incarnation 0:0, 0, None),)," in story
     assert " to worker 0 is lost." in story
     assert story.endswith("Then: and so on: the run never reaches its target")
 

@@ -84,8 +84,13 @@ class Sent:
         named, sent_at = (self._named, self._sent_at) if after is self._learner else (set(), {})
         for peer, message in out:
             if isinstance(message, Collect | Evaluate):
-                named.add((message.session, message.version))
-                assert message.version in after.coordinator.members[peer].versions, "an order is sent without its weights"
+                versions = {message.version}
+                for each in message.permits if isinstance(message, Collect) else ():
+                    opponent = after.coordinator.rollouts.held[each.ticket].opponent
+                    assert each.opponent == opponent, "an order names another opponent than its ticket"
+                    versions |= set() if opponent is None else {opponent}
+                named |= {(message.session, version) for version in versions}
+                assert versions <= after.coordinator.members[peer].versions.keys(), "an order is sent without its weights"
             if isinstance(message, Weights):
                 member = after.coordinator.members[peer]
                 which = member.session, message.version

@@ -88,11 +88,12 @@ class Worker(Process):
                 assert each.sequence == lane.sequence, "rollouts of a lane are not collected in their order"
                 expected = (each.sequence, version, each.opponent)
                 assert lane.asked[each.ticket] == expected, "other weights act than the order names"
+                assert held.weights.keys() >= _versions(lane.asked[each.ticket]), "a rollout starts without its weights"
             startable = [
                 asked.version
                 for lane in lanes.values()
                 for asked in lane.asked.values()
-                if asked.sequence == lane.sequence and asked.versions <= held.weights.keys()
+                if asked.sequence == lane.sequence and _versions(asked) <= held.weights.keys()
             ]
             lowest = [each for each in startable if each == min(startable)]
             assert [version] * len(work.assignments) == lowest, "others are collected than all of the lowest version"
@@ -114,7 +115,12 @@ class Worker(Process):
         most, held = self.settings.lanes * rounds, held_count(current)
         assert held <= most, f"a worker holds {held} rollouts, of at most {most}"
         versions = len(current._current.weights)
-        most = rounds + 1 + len({order.version for order in current._current.evaluations.asked.values()})
+        most = (
+            rounds
+            + 1
+            + bool(self.settings.opponents) * most
+            + len({order.version for order in current._current.evaluations.asked.values()})
+        )
         assert versions <= most, f"a worker holds {versions} versions, of at most {most}"
         sent: list[ToLearner] = []
         for effect in effects:
@@ -148,9 +154,15 @@ def only_evaluates(content: Content) -> bool:
 
 def _needed(held: _SessionState, before: set[int]) -> set[int]:
     """The versions that a worker needs: the newest that has come, and those that unfinished tickets name."""
-    rollouts = {asked.version for lane in held.rollouts._lanes.values() for asked in lane.asked.values()}
+    asked = [each for lane in held.rollouts._lanes.values() for each in lane.asked.values()]
+    rollouts = {version for each in asked for version in _versions(each)}
     evaluations = {order.version for order in held.evaluations.asked.values()}
     return rollouts | evaluations | {max({*before, *held.weights}, default=-1)}
+
+
+def _versions(asked: Permitted) -> set[int]:
+    """The versions that a rollout needs."""
+    return {asked.version} if asked.opponent is None else {asked.version, asked.opponent}
 
 
 def _lane(number: int, lane: RolloutLane) -> Content:
@@ -161,7 +173,7 @@ def _lane(number: int, lane: RolloutLane) -> Content:
 
 def _work(assignment: Assignment) -> Content:
     number = incarnation(assignment.lane, assignment.incarnation)
-    return ticket(assignment.ticket), assignment.lane, number, assignment.sequence
+    return ticket(assignment.ticket), assignment.lane, number, assignment.sequence, assignment.opponent
 
 
 W = TypeVar("W", bound=Worker)
@@ -180,6 +192,6 @@ def loaded(content: Content, number: int, settings: Settings, kind: type[W]) -> 
         here.asked = {each.value: Permitted(*permitted) for each, *permitted in tickets}
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
     if work is not None:
-        assignments = tuple(Assignment(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in work[2])
+        assignments = tuple(Assignment(each.value, lane, inc.value, *more) for each, lane, inc, *more in work[2])
         worker.task = RolloutTask(work[0].value, weights(work[1]), assignments, {})
     return worker

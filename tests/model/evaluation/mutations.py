@@ -51,7 +51,7 @@ MUTATIONS = {
     ),
     "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
-    "an evaluation under any weights": Mutation(HELD, "if order.version in versions]", "if True]"),
+    "an evaluation under any weights": Mutation(HELD, "if order.versions.issubset(versions)]", "if True]"),
     "an executed order to evaluate stays": Mutation(
         HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
     ),
