@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -75,6 +78,73 @@ def test_nothing_of_an_evaluation_counts_in_the_next() -> None:
     assert evaluation.episodes_played == 0
     learner.says(A, answer(order))
     assert [one.episode.length for one in evaluation.end()] == [3, 4]
+
+
+TEAMS: dict[str, Any] = {
+    "seats": ("red", "blue"),
+    "teams": ((0,), (1,)),
+    "scripted": ("module:program",),
+    "facts": ("score",),
+}
+PLAN = EvaluationPlan((5, 6, 7, 8, 9, 1), copies=6, most_steps=9, opponents=(0, -1))
+
+
+def asked(learner: Learner) -> Evaluate:
+    """The order of the only ticket of this plan."""
+    learner.joins(A)
+    (order,) = orders(learner.coordinator.begin_evaluation(PLAN))
+    return order
+
+
+def against(order: Evaluate, opponents: Sequence[int | None], score: float = 0.5) -> Evaluated:
+    played = zip(order.seeds, opponents, strict=True)
+    episodes = tuple(Episode(0.0, seed, 0.0, (score,), opponent) for seed, opponent in played if seed is not None)
+    return Evaluated(order.session, order.ticket, episodes, (False,) * len(episodes))
+
+
+def test_opponents_take_turns_and_each_meets_all_teams() -> None:
+    learner = Learner(lanes=1, **TEAMS)
+    order = asked(learner)
+    assert order.opponents == (0, 0, -1, -1, 0, 0)
+    assert order.teams == (0, 1, 0, 1, 0, 1)
+    learner.says(A, against(order, order.opponents))
+    assert learner.coordinator.evaluation.done
+    assert learner.coordinator.members[A].strikes == 0
+
+
+@pytest.mark.parametrize(
+    ("opponents", "score", "says"),
+    [
+        ((0, 0, -1, -1, 0, -1), 0.5, r"expected the opponents \(0, 0, -1, -1, 0, 0\), got \[0, 0, -1, -1, 0, -1\]"),
+        ((0, 0, -1, -1, 0, 3), 0.5, r"expected the opponents \(.*\), got \[0, 0, -1, -1, 0, 3\]"),
+        ((0, 0, -1, -1, 0, None), 0.5, "episode: expected an opponent, got None"),
+        ((0, 0, -1, -1, 0, -2), 0.5, "episode: expected an opponent from -1, got -2"),
+        ((0, 0, -1, -1, 0, 0), 0.6, r"episode: expected the score 0, 0\.5 or 1, got 0\.6"),
+        ((0, 0, -1, -1, 0, 0), math.nan, r"episode: expected the score 0, 0\.5 or 1, got nan"),
+    ],
+)
+def test_an_answer_of_other_matches_is_refused_and_its_ticket_is_dealt_again(
+    opponents: Sequence[int | None], score: float, says: str
+) -> None:
+    learner = Learner(lanes=1, **TEAMS)
+    order, evaluation = asked(learner), learner.coordinator.evaluation
+    wrong = against(order, opponents, score)
+    why = evaluation.take_in(learner.coordinator.members[A], wrong)
+    assert re.fullmatch(f"evaluation of ticket {order.ticket}: {says}", why), why
+    (again,) = orders(evaluation.deal(learner.coordinator.membership.active()))
+    assert again == order
+    learner.says(A, wrong)
+    assert learner.coordinator.members[A].strikes == 1
+    learner.says(A, against(order, order.opponents))
+    assert evaluation.done
+
+
+def test_without_teams_an_answer_names_no_opponents() -> None:
+    learner = Learner(lanes=1, facts=("score",))
+    order = asked(learner)
+    assert order.opponents == order.teams == ()
+    why = learner.coordinator.evaluation.take_in(learner.coordinator.members[A], against(order, (0, 0, -1, -1, 0, 0)))
+    assert why == f"evaluation of ticket {order.ticket}: episode: expected no opponent, got 0"
 
 
 def test_while_it_is_pending_no_rollout_is_dealt() -> None:

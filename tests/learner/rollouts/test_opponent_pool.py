@@ -164,15 +164,14 @@ def test_a_rating_changes_by_the_score_that_was_not_expected(
     policy: float, opponent: float, expected_score: float, score: float, program: bool
 ) -> None:
     pool = OpponentPool(
-        PoolSettings(1, 3, 1, 0.0, 0, scripted=1),
-        PoolState(rating=policy, snapshots=[Snapshot(0, 0, opponent)], scripted=[opponent]),
+        PoolSettings(1, 3, 1, 0.0, 0, scripted=2),
+        PoolState(rating=policy, snapshots=[Snapshot(0, 0, 900.0), Snapshot(4, 9, opponent)], scripted=[900.0, opponent]),
     )
-    pool.played([met(-1 if program else 0, score)])
-    (of_program,), of_snapshot = pool.state.scripted, pool.state.snapshots[0].rating
+    pool.played([met(-2 if program else 4, score)])
     change = 8 * (score - expected_score)
-    assert pool.state.rating == pytest.approx(policy + change)
-    assert (of_program if program else of_snapshot) == pytest.approx(opponent - change)
-    assert (of_snapshot if program else of_program) == opponent
+    changes = [change, 0.0, 0.0 if program else -change, 0.0, -change if program else 0.0]
+    before = [policy, 900.0, opponent, 900.0, opponent]
+    assert ratings(pool) == pytest.approx([rating + by for rating, by in zip(before, changes, strict=True)])
 
 
 RESULTS = st.lists(st.tuples(st.integers(-2, 4), st.sampled_from([0.0, 0.5, 1.0])), max_size=60)
@@ -231,6 +230,13 @@ def test_a_run_that_goes_on_has_the_same_opponents_and_ratings(
         each.played(met(*result) for result in later)
     assert (again.versions, again.yardsticks, ratings(again)) == (pool.versions, pool.yardsticks, ratings(pool))
     assert drawn(again, 5, 50) == drawn(pool, 5, 50)
+
+
+def test_programs_that_a_state_does_not_know_begin_with_the_first_rating() -> None:
+    assert OpponentPool(PoolSettings(1, 2, 1, 0.0, 0, 2), PoolState(scripted=[900.0])).state.scripted == [
+        900.0,
+        FIRST_RATING,
+    ]
 
 
 def test_the_metrics_are_the_rating_and_the_number_of_snapshots() -> None:

@@ -62,9 +62,11 @@ class Learner:
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
         publish: bool = True,
+        **run: object,
     ) -> None:
+        """`run`: what differs from the smallest run."""
         self.coordinator = TicketCoordinator(
-            run_spec(lanes),
+            run_spec(lanes, **run),
             max_lag=max_lag,
             worker_timeout_s=TIMEOUT_S,
             first_session=100,
