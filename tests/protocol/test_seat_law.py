@@ -19,10 +19,13 @@ from protocol.arrays import Array
 from protocol.bounds import MAX_NAME
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadRollout
+from protocol.messages import Weights
 from protocol.rollout import Episode, Rollout
 from protocol.rows.rollout_checks import LARGEST_REWARD, validate
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec, seat_returns
+from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
+from tests.support.in_process.collectors import SESSION, VERSION, no_pulse, random_collector, random_weights
 from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
+from workers.conversation.held import Assignment
 
 LAW = {
     form: re.compile(rf"({closed}R)?((?!R){closed}R)*{running}")
@@ -53,6 +56,8 @@ def with_as_many_episodes(rollout: Rollout, run: RunSpec) -> Rollout:
     """The rollout, with an episode for each reset that follows one of its steps."""
     assert rollout.resets is not None
     episode = Episode(0.0, 1, 0.0, (math.nan,) * len(run.facts))
+    if run.teams:
+        episode = Episode(0.0, 1, 0.0, (*episode.facts[1:], 0.5), 0)
     return msgspec.structs.replace(rollout, episodes=(episode,) * np.count_nonzero(rollout.resets[1:]))
 
 
@@ -75,17 +80,33 @@ def refusal(rollout: Rollout, run: RunSpec) -> str:
     return ""
 
 
+def against_opponents(run: RunSpec, number: int) -> list[Rollout]:
+    """Rollouts of a lane whose copies the policy shares with opponents."""
+    collector, held = random_collector(run), {VERSION: Weights(VERSION, *random_weights(run.policy))}
+    asked = ([Assignment(100, 0, 0, k, opponent=VERSION)] for k in range(number))
+    return [collector.collect(each, VERSION, SESSION, no_pulse, held)[0] for each in asked]
+
+
+@pytest.mark.parametrize("teams", [(), ((0,), (1,), (2,))], ids=["all seats", "teams"])
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("T", [1, 2, 11, pytest.param(30, marks=pytest.mark.soak)])
-def test_a_flag_that_is_not_the_environments_is_refused_or_could_be(form: str, T: int) -> None:
+def test_a_flag_that_is_not_the_environments_is_refused_or_could_be(
+    form: str, T: int, teams: tuple[tuple[int, ...], ...]
+) -> None:
     run, refused, lawful = seated_run(form, T, N=3), 0, 0
-    for rollout in collected(run, max(2, 40 // T))[1]:
-        assert all(map(LAW[form].fullmatch, letters(rollout, len(run.seats))))
+    if teams:
+        run = msgspec.structs.replace(run, teams=teams, facts=("score",))
+    rollouts = against_opponents(run, max(6, 120 // T)) if teams else collected(run, max(2, 40 // T))[1]
+    place = "column [0-2]" if teams else "copy [0-2], [abc]"
+    for rollout in rollouts:
+        assert rollout.valid.shape == (T, run.copies * run.sent_seats)
+        assert refusal(rollout, run) == ""
+        assert all(map(LAW[form].fullmatch, letters(rollout, run.sent_seats)))
         for other in flipped(rollout):
             says = refusal(with_as_many_episodes(other, run), run)
-            assert (says == "") == all(map(LAW[form].fullmatch, letters(other, len(run.seats)))), says
+            assert (says == "") == all(map(LAW[form].fullmatch, letters(other, run.sent_seats))), says
             if says:
-                assert re.fullmatch(r"(valid|resets): expected no\S* .*, got one at step \d+, copy [0-2], [abc]", says)
+                assert re.fullmatch(rf"(valid|resets): expected no\S* .*, got one at step \d+, {place}", says)
             refused, lawful = refused + bool(says), lawful + (not says)
     assert min(refused, lawful) > 50
 
@@ -101,9 +122,12 @@ def run_of(form: str, T: int, copies: int, **changes: Any) -> RunSpec:
 
 
 def rollout_of(form: str, columns: Sequence[str], **changes: Any) -> tuple[Rollout, RunSpec]:
-    """A rollout with these letters, two columns a copy; the last letter says only whether the next step resets."""
-    T, C = len(columns[0]) - 1, len(columns)
-    run = run_of(form, T, C // 2, **changes)
+    """A rollout with these letters, two columns a copy; the last letter says only whether the next step resets.
+
+    With teams, one of the seats is a copy's only column.
+    """
+    T, C, seats = len(columns[0]) - 1, len(columns), 1 if changes.get("teams") else 2
+    run = run_of(form, T, C // seats, **changes)
 
     def flags(of: str) -> Array:
         return np.array([[letter in of for letter in column] for column in columns]).T
@@ -118,7 +142,7 @@ def rollout_of(form: str, columns: Sequence[str], **changes: Any) -> tuple[Rollo
         truncated=np.zeros((T, C), bool),
         valid=flags(VALID)[:-1],
         state=np.zeros((C, 0), np.float32),
-        resets=flags(RESETS)[:, ::2],
+        resets=flags(RESETS)[:, ::seats],
     )  # fmt: skip
     return with_as_many_episodes(rollout, run), run
 
@@ -188,6 +212,62 @@ def test_an_episode_has_one_reset_the_returns_of_all_seats_and_each_fact() -> No
     ):
         assert refusal(msgspec.structs.replace(rollout, episodes=episodes), run).startswith(says)
     validate(msgspec.structs.replace(rollout, episodes=(Episode(most, 4, 0.0, episode.facts),)), run)
+
+
+TEAMS: dict[str, Any] = {"teams": ((0,), (1,)), "scripted": ("module:program",), "facts": ("a", "score")}
+
+
+def of_one_team(**changes: Any) -> tuple[Rollout, RunSpec]:
+    return rollout_of("turns", ("eRv.", "v...", "v.eR"), **(TEAMS | changes))
+
+
+def test_with_teams_a_rollout_has_the_columns_of_one_team() -> None:
+    rollout, run = of_one_team(masked=True, extras=(ExtraArray("logits", (2,), "float32"),))
+    mask, logits = np.ones((4, 3, 2), bool), np.zeros((3, 3, 2), np.float32)
+    rollout = msgspec.structs.replace(rollout, mask=mask, extras=(logits,))
+    assert refusal(rollout, run) == ""
+    flat = {"action": "int64", **dict.fromkeys(("log_prob", "reward"), "float32")}
+    flat |= dict.fromkeys(("terminated", "truncated", "valid"), "bool")
+    for columns in ([0, 1], [0, 0, 1, 1, 2, 2]):  # a copy is missing; all seats are there
+        for name, dtype in flat.items():
+            other = msgspec.structs.replace(rollout, **{name: getattr(rollout, name)[:, columns]})
+            assert refusal(other, run).startswith(f"{name}: expected {dtype}[3, 3], got {dtype}[3, {len(columns)}]")
+        for changes, says in (
+            ({"obs": (rollout.obs[0][:, columns],)}, f"float32[4, 3, 1], got float32[4, {len(columns)}, 1]"),
+            ({"state": rollout.state[columns]}, f"float32[1, 3, 0], got float32[1, {len(columns)}, 0]"),
+            ({"mask": mask[:, columns]}, f"bool[4, 3, 2], got bool[4, {len(columns)}, 2]"),
+            ({"extras": (logits[:, columns],)}, f"float32[3, 3, 2], got float32[3, {len(columns)}, 2]"),
+        ):
+            changed: dict[str, Any] = changes
+            assert f": expected {says}" in refusal(msgspec.structs.replace(rollout, **changed), run)
+
+
+@pytest.mark.parametrize(
+    ("opponent", "score", "says"),
+    [
+        (None, 0.5, "expected an opponent, got None"),
+        (-2, 0.5, "expected an opponent from -1, got -2"),
+        (-(2**52), 0.5, f"expected an opponent from -1, got {-(2**52)}"),
+        *((0, score, f"expected the score 0, 0.5 or 1, got {score}") for score in (0.25, -1.0, 1.5, math.nan)),
+        (0, math.inf, "expected finite facts, got (nan, inf)"),
+        *((opponent, score, "") for opponent in (-1, 0, 7) for score in (0.0, 0.5, 1.0)),
+    ],
+)
+def test_with_teams_an_episode_has_an_opponent_and_a_score(opponent: int | None, score: float, says: str) -> None:
+    rollout, run = of_one_team()
+    first, second = rollout.episodes
+    other = msgspec.structs.replace(first, opponent=opponent, facts=(math.nan, score))
+    for episodes in ((other, second), (first, other)):
+        assert refusal(msgspec.structs.replace(rollout, episodes=episodes), run) == (says and f"episode: {says}")
+
+
+def test_without_teams_an_episode_has_no_opponent() -> None:
+    rollout, run = good()
+    (episode,) = rollout.episodes
+    for opponent in (0, -1):
+        other = msgspec.structs.replace(episode, opponent=opponent)
+        says = refusal(msgspec.structs.replace(rollout, episodes=(other,)), run)
+        assert says == f"episode: expected no opponent, got {opponent}"
 
 
 def test_a_wrong_value_is_named_by_the_seat_that_it_is_of() -> None:
