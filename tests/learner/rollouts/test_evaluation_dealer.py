@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -103,11 +104,14 @@ def against(order: Evaluate, opponents: Sequence[int | None], score: float = 0.5
 
 
 def test_opponents_take_turns_and_each_meets_all_teams() -> None:
+    """Wherever the plan is cut into tickets."""
     learner = Learner(lanes=1, **TEAMS)
-    order = asked(learner)
-    assert order.opponents == (0, 0, -1, -1, 0, 0)
-    assert order.teams == (0, 1, 0, 1, 0, 1)
-    learner.says(A, against(order, order.opponents))
+    learner.joins(A)
+    found = orders(learner.coordinator.begin_evaluation(replace(PLAN, copies=3)))
+    found += orders(learner.says(A, against(found[0], found[0].opponents)))
+    learner.says(A, against(found[1], found[1].opponents))
+    assert [order.opponents for order in found] == [(0, 0, -1), (-1, 0, 0)]
+    assert [order.teams for order in found] == [(0, 1, 0), (1, 0, 1)]
     assert learner.coordinator.evaluation.done
     assert learner.coordinator.members[A].strikes == 0
 
