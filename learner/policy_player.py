@@ -161,9 +161,8 @@ class PolicyPlayer:
             facts = counted_facts(keys, policy.seats, opponents=True)
             run = msgspec.structs.replace(run, teams=teams, facts=facts, opponent=against.spec)
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
-            pool.made(RIVAL, 0)
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt, opponents=pool)
-            hub.publish(RIVAL, against.parameters, against.buffers, deal=False)
+            hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)
         hub.publish(POLICY, policy.parameters, policy.buffers, deal=False)
         return hub
 

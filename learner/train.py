@@ -51,9 +51,8 @@ def train(
         check_time()
 
     def publish(weights: tuple[Floats, Floats]) -> None:
-        attributes = audience.env_attributes()
-        tally.made_weights()
-        hub.publish(tally.state.version, *weights, deal=tally.training_goes_on(), env_attributes=attributes)
+        deal, state, attributes = tally.training_goes_on(), tally.state, audience.env_attributes()
+        hub.publish(state.version, *weights, deal=deal, env_attributes=attributes, env_steps=state.env_steps)
 
     def tell(metrics: Row | None) -> None:
         """Tell the metrics of an evaluation, if one has ended, and save its result."""

@@ -60,11 +60,6 @@ class Tally:
             self.pool.played(batch.episodes)
         self.new_episodes = batch.episodes
 
-    def made_weights(self) -> None:
-        """The weights of this version are to be published: opponents may be among them."""
-        if self.pool is not None:
-            self.pool.made(self.state.version, self.state.env_steps)
-
     def ratings(self) -> dict[str, float]:
         """What a row of the metrics has of self-play."""
         return {} if self.pool is None else self.pool.metrics()

@@ -140,17 +140,25 @@ class Hub:
         self._server.wait_for(workers, self.settings.no_workers_timeout_s, lambda: self._turn(POLL_S))
 
     def publish(
-        self, version: int, parameters: Array, buffers: Array, *, deal: bool = True, env_attributes: Array | None = None
+        self,
+        version: int,
+        parameters: Array,
+        buffers: Array,
+        *,
+        deal: bool = True,
+        env_attributes: Array | None = None,
+        env_steps: int | None = None,
     ) -> None:
         """Set the newest weights. The arrays must not change afterwards.
 
         `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first.
+        `env_steps`: of training, after which they were made; None: they never become an opponent.
         Raises `RunError` if a parameter is too large for `acting_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.acting_dtype)
         self._time.learned(self._clock())
         self.weight_age.published(version, self._clock())
-        self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes)
+        self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes, env_steps=env_steps)
         if deal:
             self._server.send(self.coordinator.begin_update())
 

@@ -38,10 +38,12 @@ class SentWeights:
         self.kept[weights.version] = weights
 
     def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember], named: Named) -> list[Outgoing]:
-        """These messages; after each order that names a version that its worker does not hold, these weights."""
-        out: list[Outgoing] = []
+        """These messages; after all of them, the weights of the versions that they name and their workers do not hold.
+
+        When weights come, a worker drops those that no order names: so the orders come first.
+        """
+        orders, out = list(orders), list[Outgoing]()
         for peer, message in orders:
-            out.append((peer, message))
             member = members[peer]
             asked = message.versions if isinstance(message, Collect | Evaluate) else set[int]()
             for version in sorted(asked - member.versions.keys()):
@@ -54,7 +56,7 @@ class SentWeights:
                     supervisor.versions = {**dict(last), version: supervisor.replies}
                 member.versions[version] = member.replies if supervisor is None else TO_SUPERVISOR
                 drop_versions(member, named)
-        return out
+        return orders + out
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
         """Those of the `named` versions that were lost on the way to this worker, as its heartbeat shows."""

@@ -95,8 +95,21 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     # ---------------------------------------------------------------- the learner's side
 
-    def publish(self, version: int, parameters: Array, buffers: Array, *, env_attributes: Array | None = None) -> None:
-        """Set the newest weights. Orders name them from now on: call `begin_update`, or `begin_evaluation`."""
+    def publish(
+        self,
+        version: int,
+        parameters: Array,
+        buffers: Array,
+        *,
+        env_attributes: Array | None = None,
+        env_steps: int | None = None,
+    ) -> None:
+        """Set the newest weights. Orders name them from now on: call `begin_update`, or `begin_evaluation`.
+
+        `env_steps`: of training, after which they were made; None: they never become an opponent.
+        """
+        if self.rollouts.opponents is not None and env_steps is not None:
+            self.rollouts.opponents.made(version, env_steps)
         self.version = version
         self.weights.publish(Weights(version, parameters, buffers, env_attributes), self._is_needed)
 

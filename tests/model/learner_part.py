@@ -162,9 +162,7 @@ class Learner:
         return self.coordinator.begin_update()
 
     def _set_weights(self, version: int) -> None:
-        if (pool := self.coordinator.rollouts.opponents) is not None:
-            pool.made(version, version)
-        self.coordinator.publish(version, PARAMETERS, BUFFERS)
+        self.coordinator.publish(version, PARAMETERS, BUFFERS, env_steps=version)
         assert self._needed().issuperset(self.coordinator.weights.kept), "the learner keeps weights that nobody needs"
 
     def _needed(self) -> set[int]:
