@@ -78,7 +78,7 @@ def record_videos(
         raise
     except OSError as error:
         raise RunError(f"videos of run {run} were not written: {error.strerror or error}") from error
-    return evaluation_of(results, player.policy.facts), videos
+    return evaluation_of(results, player.facts), videos
 
 
 def _write(path: Path, frames: list[Any], frames_per_s: float) -> None:
