@@ -67,7 +67,9 @@ def result(summary: Summary) -> list[str]:
 def next_commands(run: Path, summary: Summary | None, command: str) -> list[str]:
     """Commands for a shell: look at the run, play its policy, and train it about twice as long if it made all its steps."""
     where = shlex.quote(str(run))
-    commands = [f"dashboard {where}", f"evaluate {where}"]
+    evaluated = None if summary is None else summary.evaluation
+    against = " --against ANOTHER_RUN" if evaluated is not None and evaluated.score_interval is not None else ""
+    commands = [f"dashboard {where}", f"evaluate {where}{against}"]
     if summary is not None and summary.stop_reason == ALL_STEPS_DONE:
         commands.append(f"{command} --resume {where} --steps {float(f'{2 * summary.env_steps:.2g}'):.0f}")
     return ["next:", *(f"  millrace {line}" for line in commands)]
