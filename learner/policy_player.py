@@ -23,11 +23,12 @@ from learner.rollouts.hub import Hub
 from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
+from protocol.bounds import MAX_FACTS
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
-from protocol.specs import DescribeSpec, PolicySpec, RunSpec, counted_facts, teams_of
+from protocol.specs import SCORE, DescribeSpec, PolicySpec, RunSpec, counted_facts, teams_of
 from protocol.wire.learner_link import LearnerLink
 
 RIVAL, POLICY = 0, 1
@@ -157,7 +158,8 @@ class PolicyPlayer:
         if (against := policy.against) is None:
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
         else:
-            teams, keys = policy.teams or teams_of(policy.seats), run.info_keys
+            teams = policy.teams or against.teams or teams_of(policy.seats)
+            keys = tuple(key for key in run.info_keys if key != SCORE)[: MAX_FACTS - 1]
             facts = counted_facts(keys, policy.seats, opponents=True)
             run = msgspec.structs.replace(run, teams=teams, facts=facts, opponent=against.spec)
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
@@ -176,6 +178,7 @@ def _check_rival(policy: SavedPolicy, rival: SavedPolicy) -> None:
         ("observations", policy.spec.observation, rival.spec.observation),
         ("actions", policy.spec.action, rival.spec.action),
         ("action masks", policy.masked, rival.masked),
+        ("teams", policy.teams or rival.teams, rival.teams or policy.teams),
     ):
         if expected != got:
             raise UsageError(f"against: expected a policy for the same {what}, {expected}; got {got}")

@@ -149,6 +149,7 @@ def open_run(
     hub = open_hub(config, spec, link, processes, setup.check_running, observer, past, pool)
     if state.opponent_policies is not None:
         hub.keep_opponents(*state.opponent_policies)
+        state.opponent_policies = None
     dataset = _training_recorder(config, folder, setup.known, spec)
     setup.check_interrupt()
     folder.remove_temporary()
@@ -172,7 +173,13 @@ def opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentPo
         return None
     window, scripted = config.self_play, len(spec.scripted)
     settings = PoolSettings(
-        config.seed, window, config.self_play_save_steps, config.self_play_latest, config.max_lag, scripted
+        config.seed,
+        window,
+        config.self_play_save_steps,
+        config.self_play_latest,
+        config.max_lag,
+        scripted,
+        len(spec.teams),
     )
     return OpponentPool(settings, state)
 

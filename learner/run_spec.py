@@ -8,6 +8,7 @@ from learner.algorithms import algorithm_class
 from learner.config.config import Config
 from learner.conversations import rollout_spec
 from learner.env_spaces import EnvSpaces
+from protocol.bounds import MAX_FACTS
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
@@ -42,6 +43,8 @@ def _with_opponents(config: Config, spec: RunSpec) -> RunSpec:
     what = "self_play" if config.self_play else "opponents"
     if len(spec.seats) < 2:
         raise UsageError(f"{what}: expected an environment of several agents, got {config.env}")
+    if len(config.info_keys) >= MAX_FACTS:
+        raise UsageError(f"info_keys: expected fewer than {MAX_FACTS} in a run with opponents, got {len(config.info_keys)}")
     if SCORE in config.info_keys:
         raise UsageError(f"info_keys: expected another name than {SCORE}, which is counted in a run with opponents")
     teams = teams_of(spec.seats, config.teams)

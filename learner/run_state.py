@@ -88,7 +88,7 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
         state = msgspec.convert(found.state["past"], RunState)
         EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for what no run has
         for name in POLICIES:
-            if (policy := found.state[name]) is not None:
+            if (policy := found.state.get(name)) is not None:
                 setattr(state, name, tuple(array.numpy() for array in policy))
         algorithm.load_state_dict(found.state["algorithm"])
     except MISFITS as error:

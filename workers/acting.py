@@ -130,7 +130,7 @@ class _OwnActing:
         return _OwnActions(self, generators)
 
     def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
-        leaves, mask = _split([leaf[0] for leaf in obs], self.run.masked)
+        leaves, mask = _split([leaf[0] for leaf in obs], self.run)
         acted = self.policy.act(leaves, state[0], generator, mask=mask, greedy=greedy)
         state[0] = acted.state
         return acted.action
@@ -139,7 +139,7 @@ class _OwnActing:
 class _OwnActions:
     def __init__(self, acting: _OwnActing, generators: Sequence[np.random.Generator]) -> None:
         run, self._policy, self._generators = acting.run, acting.policy, generators
-        self._masked = run.masked
+        self._run = run
         lead, action = (len(generators), run.rollout_steps, run.columns), run.policy.action
         self._action = np.empty((*lead, *action.shape), action.stored_dtype)
         self._extras = [np.empty((*lead, *extra.shape), extra.dtype) for extra in run.extras]
@@ -148,7 +148,7 @@ class _OwnActions:
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
         for i, generator in enumerate(self._generators):
-            leaves, mask = _split([leaf[i] for leaf in obs], self._masked)
+            leaves, mask = _split([leaf[i] for leaf in obs], self._run)
             acted = self._policy.act(leaves, state[i], generator, mask=mask)
             self._action[i, t], state[i] = acted.action, acted.state
             for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
@@ -162,6 +162,6 @@ class _OwnActions:
         return [self._action[i], *(array[i] for array in self._written)]
 
 
-def _split(obs: list[Array], masked: bool) -> tuple[list[Array], Bools | None]:
-    """The arrays of an observation, and its mask."""
-    return (obs[:-1], obs[-1]) if masked else (obs, None)
+def _split(obs: list[Array], run: RunSpec) -> tuple[list[Array], Bools | None]:
+    """The arrays of an observation that the actor sees, and its mask."""
+    return obs[: len(run.policy.observation)], obs[-1] if run.masked else None

@@ -49,11 +49,12 @@ Opponents = Callable[[int], Opponent]
 
 
 class KnownOpponents:
-    """The opponents of one session, which exist while an episode is played against them."""
+    """The opponents of one session. Weights are kept while an episode is played against them."""
 
     def __init__(self, run: RunSpec) -> None:
         self._run = run
         self._known = WeakValueDictionary[int, Opponent]()
+        self._programs: list[Opponent] = []  # they stay, for making one may take long
 
     def among(self, weights: Mapping[int, Weights]) -> Opponents:
         """How to find an opponent. `weights`: by version, of those that may be new."""
@@ -61,6 +62,8 @@ class KnownOpponents:
         def find(number: int) -> Opponent:
             if (found := self._known.get(number)) is None:
                 found = self._known[number] = Opponent(self._run, number, weights[number] if number >= 0 else None)
+                if number < 0:
+                    self._programs.append(found)
             return found
 
         return find

@@ -96,7 +96,9 @@ def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) ->
     evaluation = Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
     if not facts:
         return evaluation
-    return msgspec.structs.replace(evaluation, facts=fact_means(facts, [episode.facts for episode in episodes]))
+    matches = sum(episode.opponent is not None for episode in episodes)
+    means = fact_means(facts, [episode.facts for episode in episodes])
+    return msgspec.structs.replace(evaluation, facts=means, matches=matches)
 
 
 class EvaluationDealer:

@@ -5,7 +5,7 @@ pool as it was when the weights that act were made. So it depends on nobody's sp
 are snapshots of the policy, of which the newest play, and programs of the user's.
 
 Rule: ratings follow from the episodes that updates used, in their order (Elo 1978; ML-Agents' self-play). An opponent's
-rating changes as the policy's does, by the opposite amount. Episodes against the policy itself change none.
+rating changes as the policy's does, by the opposite amount. Episodes against a version that is no snapshot change none.
 """
 
 from __future__ import annotations
@@ -59,6 +59,8 @@ class PoolSettings(NamedTuple):
     max_lag: int
     scripted: int = 0
     """How many programs there are."""
+    teams: int = 2
+    """How many teams there are, of which the policy plays one."""
 
 
 class OpponentPool:
@@ -115,16 +117,16 @@ class OpponentPool:
             if number is None:
                 continue
             if number < 0:
-                change = _change(state.rating, state.scripted[-1 - number], episode.facts[-1])
+                change = self._change(state.scripted[-1 - number], episode.facts[-1])
                 state.scripted[-1 - number] -= change
             elif (snapshot := by_version.get(number)) is not None:
-                change = _change(state.rating, snapshot.rating, episode.facts[-1])
+                change = self._change(snapshot.rating, episode.facts[-1])
                 snapshot.rating -= change
             else:
                 continue
             state.rating += change
 
-
-def _change(rating: float, of_opponent: float, score: float) -> float:
-    """How the rating changes by this score."""
-    return K * (score - 1 / (1 + 10 ** ((of_opponent - rating) / SCALE)))
+    def _change(self, of_opponent: float, score: float) -> float:
+        """How the rating changes by this score. Teams of equal strength win equally often."""
+        others = self._settings.teams - 1
+        return K * (score - 1 / (1 + others * 10 ** ((of_opponent - self.state.rating) / SCALE)))

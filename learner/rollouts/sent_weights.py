@@ -45,9 +45,12 @@ class SentWeights:
         orders, out = list(orders), list[Outgoing]()
         for peer, message in orders:
             member = members[peer]
-            asked = message.versions if isinstance(message, Collect | Evaluate) else set[int]()
-            for version in sorted(asked - member.versions.keys()):
-                supervisor = member.shared_by
+            if not isinstance(message, Collect | Evaluate):
+                continue
+            acting = message.version
+            for version in sorted(message.versions - member.versions.keys()):
+                # Opponents differ from worker to worker, so their weights are not shared.
+                supervisor = member.shared_by if version == acting else None
                 if supervisor is None:
                     out.append((peer, self.kept[version]))
                 elif version not in supervisor.versions:

@@ -78,7 +78,10 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     cut: Natural = 0
     """episodes that were stopped because they were too long; they count with the return they had by then"""
     facts: dict[str, FactMean] = {}
-    """of each name in `info_keys`: what the environment reported at the ends of the episodes"""
+    """of each name in `info_keys`: what the environment reported at the ends of the episodes; and the score, if there were
+    opponents"""
+    matches: Natural = 0
+    """how many of the episodes were played against opponents"""
 
     @staticmethod
     def of(returns: Sequence[float], lengths: Sequence[int], cut: int) -> Evaluation:
@@ -101,9 +104,10 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def score_interval(self) -> tuple[float, float] | None:
         """Between which scores the true one lies with 95 % confidence (Wilson 1927), if there were opponents."""
-        if (score := self.facts.get(SCORE)) is None or score.mean is None:
+        score = self.facts.get(SCORE)
+        if not self.matches or score is None or score.mean is None:
             return None
-        n, z2 = self.episodes, Z_95**2
+        n, z2 = self.matches, Z_95**2
         middle, half = score.mean + z2 / (2 * n), math.sqrt(z2 * score.mean * (1 - score.mean) / n + (z2 / (2 * n)) ** 2)
         return max(0.0, (middle - half) / (1 + z2 / n)), min(1.0, (middle + half) / (1 + z2 / n))
 

@@ -14,7 +14,7 @@ from learner.between_updates.evaluations import Evaluations
 from learner.between_updates.run_parts import RunParts
 from learner.between_updates.tally import Tally
 from learner.config.config import Config
-from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
+from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode, evaluation_of
 from learner.rollouts.hub import Hub
 from learner.run_folder.atomic_write import Writes
 from learner.run_folder.results import EvaluatedPolicy
@@ -182,3 +182,18 @@ def test_no_policy_is_chosen_by_the_episodes_that_evaluate_plays(seed: int) -> N
 
 def test_a_share_of_steps_fits_the_message() -> None:
     assert [EvaluationPlan.of(2, 1, 4, steps).most_steps for steps in (1, 7, 10**20)] == [1, 3, LARGEST]
+
+
+def test_a_number_of_the_environment_may_be_called_score() -> None:
+    played = [PlayedEpisode(Episode(1.0, 1, 0.0, (300.0 + n,)), cut=False) for n in range(3)]
+    found = evaluation_of(played, ("score",))
+    assert found.score_interval is None
+    assert str(found).endswith("over 3 episodes, score 301")
+
+
+def test_the_interval_of_a_score_is_wilsons() -> None:
+    """Of none of one, the upper limit is z² / (1 + z²)."""
+    played = [PlayedEpisode(Episode(1.0, 1, 0.0, (float(n < 8),), opponent=3), cut=False) for n in range(10)]
+    assert evaluation_of(played, ("score",)).score_interval == pytest.approx((0.4901625, 0.9433178), abs=1e-6)
+    none = [PlayedEpisode(Episode(1.0, 1, 0.0, (0.0,), opponent=3), cut=False)]
+    assert evaluation_of(none, ("score",)).score_interval == pytest.approx((0.0, 0.7934506), abs=1e-6)

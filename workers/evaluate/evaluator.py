@@ -147,7 +147,7 @@ class Evaluator:
             with np.errstate(all="ignore"):
                 before = state.copy()
                 chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
-                taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=False)
+                taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=others is not None)
                 if acts is not None:
                     state[0][~acts] = before[0][~acts]
                     if others is not None:

@@ -174,6 +174,12 @@ def test_a_rating_changes_by_the_score_that_was_not_expected(
     assert ratings(pool) == pytest.approx([rating + by for rating, by in zip(before, changes, strict=True)])
 
 
+def test_of_three_equal_teams_each_wins_a_third() -> None:
+    pool = OpponentPool(PoolSettings(1, 3, 1, 0.0, 0, scripted=1, teams=3))
+    pool.played([met(-1, 1.0)])
+    assert ratings(pool) == pytest.approx([FIRST_RATING + 8 * 2 / 3, FIRST_RATING - 8 * 2 / 3])
+
+
 RESULTS = st.lists(st.tuples(st.integers(-2, 4), st.sampled_from([0.0, 0.5, 1.0])), max_size=60)
 
 

@@ -8,6 +8,7 @@ import weakref
 import pytest
 
 from learner.members.membership import SUPERVISOR_WORD_S, Outgoing
+from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
 from protocol.alive import SHARED_VERSIONS, Alive, WorkerActivity
 from protocol.messages import PROTOCOL_VERSION, Collect, HeartbeatReply, Hello, Weights
 from tests.learner.rollouts.test_ticket_coordinator import Learner
@@ -54,6 +55,17 @@ def test_a_worker_that_needs_later_what_its_supervisor_got_finds_it_there() -> N
     outs = learner.balanced(process_ends(learner.coordinator, holder.decode()))
     assert [type(message) for _, message in outs] == [Collect]
     assert 1 in learner.coordinator.members[spare].versions
+
+
+def test_the_weights_of_an_opponent_are_not_shared() -> None:
+    learner = shared(b"ab", lanes=1)
+    pool = learner.coordinator.rollouts.opponents = OpponentPool(PoolSettings(1, 1, 1, 0.0, 0))
+    pool.made(0, 0)
+    holder, spare = (A, B) if learner.coordinator.members[A].lanes else (B, A)
+    assert receivers(learner.publish(1)) == [SUPERVISOR]
+    outs = learner.balanced(process_ends(learner.coordinator, holder.decode()))
+    assert [(peer, message.versions) for peer, message in outs if isinstance(message, Collect)] == [(spare, {0, 1})]
+    assert [(peer, message.version) for peer, message in outs if isinstance(message, Weights)] == [(spare, 0)]
 
 
 def test_a_worker_of_which_its_supervisor_has_not_spoken_yet_gets_weights_directly() -> None:

@@ -25,7 +25,7 @@ SELF_PLAY: dict[str, Any] = {"self_play": 3, "self_play_save_steps": 150, "rollo
 
 def _program(action: int) -> Any:
     def act(obs: Array, state: Floats, rng: np.random.Generator) -> Any:
-        return np.full(len(obs), action), state, {}
+        return np.full(len(state), action), state, {}
 
     return SimpleNamespace(act=act)
 
@@ -56,6 +56,7 @@ def pool_of(run: Path) -> Any:
         ("RandomCrowd", {"algo": "impala", "max_lag": 2, "opponents": (ROCK,)}),
         ("RandomCrowd", {"algo": "dqn", "n_step": 3, "learning_starts": 200}),
         ("RandomCrowd", {"algo": "reinforce", "rollout_steps": 32}),
+        ("ChainCrowd", {"opponents": (ROCK,), "critic_keys": ("state",), "seat_id": True}),
     ],
 )
 def test_weights_pool_and_ratings_do_not_depend_on_the_number_of_workers(
@@ -128,6 +129,11 @@ def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path) -
         ("RockPaperScissors", {"teams": ("left", "right")}, "^teams: expected none without opponents"),
         ("RockPaperScissors", {"self_play": 1, "teams": ("l*",)}, "^teams: expected patterns that put each of left, right"),
         ("RockPaperScissors", {"self_play": 1, "info_keys": ("score",)}, "^info_keys: expected another name than score"),
+        (
+            "RockPaperScissors",
+            {"self_play": 1, "info_keys": tuple(map(str, range(32)))},
+            "^info_keys: expected fewer than 32",
+        ),
         ("RockPaperScissors", {"self_play": 1, "envs": 1, "lanes": 1}, "^self_play: expected envs 2 or more"),
         ("RockPaperScissors", {"opponents": (f"{__name__}:broken",)}, "policy .*:broken: act raised ZeroDivisionError"),
     ],
