@@ -41,7 +41,9 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "self_play/elo": Meaning("Elo", "Rating of the policy, which begins with 1200, by its episodes against opponents."),
         "self_play/snapshots": Meaning("versions", "Earlier versions of the policy that are kept.", "snapshots"),
         "rollout/score": Meaning(NONE, "Share of the last 100 training episodes that were won; a tie is half of one."),
-        "eval/score": Meaning(NONE, "Share of the evaluation's episodes that were won; a tie is half of one."),
+        "eval/score": Meaning(
+            NONE, "Share of the evaluation's episodes that were won; a tie is half of one.", "score of evaluations"
+        ),
     },
     "Progress and speed": {
         "time/total_timesteps": Meaning(STEPS, "Env steps that updates have used: the x axis of the curves.", "env steps"),

@@ -71,7 +71,12 @@ class VectorEnvSettings:
         """The environment of each copy: `num_envs` times the same one, or the given list."""
         if isinstance(self.env, Sequence) and not isinstance(self.env, str):
             return list(self.env)
-        return [self.env] * (1 if self.num_envs is None else self.num_envs)
+        try:
+            return [self.env] * (1 if self.num_envs is None else self.num_envs)
+        except (MemoryError, OverflowError) as error:
+            raise UsageError(
+                f"num_envs: expected a number of env copies that fit into memory, got {self.num_envs}"
+            ) from error
 
     @property
     def local_workers(self) -> int:

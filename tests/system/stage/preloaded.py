@@ -38,8 +38,8 @@ PER_COMMAND = {
 }  # fmt: skip
 """Variables that a child may have otherwise than its parent: nobody reads them before the command runs, or `become` does."""
 BY_IMPORTS = {
-    "KMP_DUPLICATE_LIB_OK", "LD_LIBRARY_PATH", "OMP_WAIT_POLICY", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_VIDEODRIVER",
-    "TORCHINDUCTOR_CACHE_DIR",
+    "KMP_DUPLICATE_LIB_OK", "LD_LIBRARY_PATH", "OMP_WAIT_POLICY", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_AUDIODRIVER",
+    "SDL_VIDEODRIVER", "TORCHINDUCTOR_CACHE_DIR",
 }  # fmt: skip
 """Set by packages, and by `known_environment`, that a test has used in its own process. No test is about them."""
 
