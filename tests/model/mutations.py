@@ -109,13 +109,11 @@ MUTATIONS = {
     "a Collect is sent again without the weights that it names": Mutation(
         COORDINATOR, "out + self.weights.after(orders, self.members, self._named)", "out + orders"
     ),
-    "weights are never sent": Mutation(WEIGHTS, "in sorted(asked - member.versions.keys()):", "in ():"),
-    "weights are sent with every order": Mutation(WEIGHTS, "sorted(asked - member.versions.keys())", "sorted(asked)"),
-    "weights are sent before the order that names them": Mutation(
-        WEIGHTS,
-        "out.append((peer, self.kept[version]))",
-        "out.insert(-1, (peer, self.kept[version]))",
+    "weights are never sent": Mutation(WEIGHTS, "in sorted(message.versions - member.versions.keys()):", "in ():"),
+    "weights are sent with every order": Mutation(
+        WEIGHTS, "sorted(message.versions - member.versions.keys())", "sorted(message.versions)"
     ),
+    "weights are sent before the order that names them": Mutation(WEIGHTS, "return orders + out", "return out + orders"),
     "the newest weights are sent to whoever holds a ticket": Mutation(
         WEIGHTS,
         "out.append((peer, self.kept[version]))",
@@ -188,7 +186,7 @@ MUTATIONS = {
         "return {asked.version for lane in self._lanes.values() for asked in lane.asked.values()}",
     ),
     "only the weights that act are sent after an order": Mutation(
-        WEIGHTS, "asked = message.versions if", "asked = {message.version} if"
+        WEIGHTS, "sorted(message.versions -", "sorted({message.version} -"
     ),
     "the weights of opponents do not count as named": Mutation(
         ROLLOUTS, "for version in versions_of(ticket.version, [ticket.opponent])}", "for version in [ticket.version]}"
