@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -101,10 +101,18 @@ def parts(folder: Path) -> dict[str, Part]:
     return {
         "policy": {file.stem: load_file(file) for file in sorted(run.glob("*.safetensors"))},
         "metrics": columns,
-        "evaluation": {name: summary[name] for name in EVALUATED if name in summary},
+        "evaluation": _flat({name: summary[name] for name in EVALUATED if name in summary}),
         "dataset": {file.parents[1].name: _arrays(file) for file in sorted((folder / "datasets").rglob("*.hdf5"))},
         "checkpoint": torch.load(newest, map_location="cpu", weights_only=True)["state"]["algorithm"],
     }
+
+
+def _flat(found: Mapping[str, Any], before: str = "") -> Part:
+    """The values of records in records, each with a name of its own."""
+    values: Part = {}
+    for name, value in found.items():
+        values |= _flat(value, f"{before}{name} ") if isinstance(value, dict) else {before + name: value}
+    return values
 
 
 def _arrays(path: Path) -> Part:

@@ -44,7 +44,7 @@ def test_runs_that_differ_in_times_only_are_the_same(tmp_path: Path) -> None:
     [
         ("policy", "['policy']['actor']"),
         ("metrics", "['train/loss']['row 1']"),
-        ("evaluation", "['evaluation']['return_mean']"),
+        ("evaluation", "['evaluation return_mean']"),
         ("dataset", "['training-v0']['episode_0/rewards']"),
         ("checkpoint", "['optimizer'][0]"),
     ],
