@@ -47,7 +47,7 @@ class Rules:
         """`used`: tickets whose rollouts were used before the checkpoint from which it started."""
         self.used = used
         self._coordinator = coordinator
-        settings: Any = SimpleNamespace(lanes=coordinator.run.lanes, max_lag=max_lag)
+        settings: Any = SimpleNamespace(lanes=coordinator.run.lanes, max_lag=max_lag, opponents=0)
         self._learner = ReplayedLearner(settings, coordinator)
 
     def begun(self) -> None:
