@@ -21,7 +21,7 @@ from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import ExtraArray, PolicySpec, RunSpec, counted_facts
+from protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import has_zstd
 from protocol.wire.learner_link import LearnerLink
@@ -36,11 +36,13 @@ def rollout_spec(
     extras: tuple[ExtraArray, ...] = (),
     *,
     spaces: EnvSpaces,
+    teams: tuple[tuple[int, ...], ...] = (),
+    scripted: tuple[str, ...] = (),
 ) -> RunSpec:
     """The specification that `Welcome` carries. Raises `UsageError` if it cannot be sent, or settings and policy do not fit.
 
     `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
-    `spaces`: those of the environment.
+    `spaces`: those of the environment. `teams`, `scripted`: of a run with opponents.
     """
     masked, seats = spaces.masked, spaces.seats
     if masked and config.vector == "envpool":
@@ -61,9 +63,11 @@ def rollout_spec(
         images_dtype=config.acting_dtype if policy.convolves else "float32",
         masked=masked,
         extras=extras,
-        facts=counted_facts(config.info_keys, seats, opponents=False),
+        facts=(*config.info_keys, SCORE) if teams else facts_of_all_seats(config.info_keys, seats),
         seats=seats,
         takes_turns=spaces.takes_turns,
+        teams=teams,
+        scripted=scripted,
         heartbeat_s=config.heartbeat_s(),
     )
     _check_weights_can_be_sent(env.id, policy, config)

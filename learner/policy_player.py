@@ -20,7 +20,7 @@ from learner.members.describe import described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.hub import Hub
-from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
+from learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
 from protocol.bounds import MAX_FACTS
@@ -28,7 +28,7 @@ from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
-from protocol.specs import SCORE, DescribeSpec, PolicySpec, RunSpec, counted_facts, teams_of
+from protocol.specs import SCORE, DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
 RIVAL, POLICY = 0, 1
@@ -160,8 +160,7 @@ class PolicyPlayer:
         else:
             teams = policy.teams or against.teams or teams_of(policy.seats)
             keys = tuple(key for key in run.info_keys if key != SCORE)[: MAX_FACTS - 1]
-            facts = counted_facts(keys, policy.seats, opponents=True)
-            run = msgspec.structs.replace(run, teams=teams, facts=facts, opponent=against.spec)
+            run = msgspec.structs.replace(run, teams=teams, facts=(*keys, SCORE), opponent=against.spec)
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt, opponents=pool)
             hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)

@@ -145,7 +145,7 @@ def open_run(
     # The last save gets half of what is left of the grace time, and the workers need time to leave.
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
     past = (state.ledger, state.incarnations)
-    pool = opponent_pool(config, spec, state.opponents)
+    pool = _opponent_pool(config, spec, state.opponents)
     hub = open_hub(config, spec, link, processes, setup.check_running, observer, past, pool)
     if state.opponent_policies is not None:
         hub.keep_opponents(*state.opponent_policies)
@@ -167,19 +167,18 @@ def open_run(
     return run
 
 
-def opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentPool | None:
+def _opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentPool | None:
     """The opponents of the run, if the policy does not play all teams."""
     if not spec.teams:
         return None
-    window, scripted = config.self_play, len(spec.scripted)
     settings = PoolSettings(
-        config.seed,
-        window,
-        config.self_play_save_steps,
-        config.self_play_latest,
-        config.max_lag,
-        scripted,
-        len(spec.teams),
+        seed=config.seed,
+        window=config.self_play,
+        save_steps=config.self_play_save_steps,
+        latest=config.self_play_latest,
+        max_lag=config.max_lag,
+        scripted=len(spec.scripted),
+        teams=len(spec.teams),
     )
     return OpponentPool(settings, state)
 

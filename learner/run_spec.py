@@ -8,12 +8,12 @@ from learner.algorithms import algorithm_class
 from learner.config.config import Config
 from learner.conversations import rollout_spec
 from learner.env_spaces import EnvSpaces
+from learner.rollouts.opponent_pool import teams_of
 from protocol.bounds import MAX_FACTS
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
-from protocol.specs import SCORE, PolicySpec, RunSpec, counted_facts, teams_of
-from protocol.wire.codec import check_can_be_sent
+from protocol.specs import SCORE, PolicySpec, RunSpec
 
 
 def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
@@ -30,30 +30,28 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
                 raise UsageError(f"{setting}: expected none, because {why}, which a dataset has not")
         if given and config.inference == "learner":
             raise UsageError(f"inference learner: {why}, and workers must act; use --inference workers")
-    spec = rollout_spec(config, env, policy, config.algorithm.rollout_steps, spaces=spaces)
-    return _with_opponents(config, spec)
+    teams = _teams(config, spaces.seats)
+    steps, programs = config.algorithm.rollout_steps, config.opponents
+    return rollout_spec(config, env, policy, steps, spaces=spaces, teams=teams, scripted=programs)
 
 
-def _with_opponents(config: Config, spec: RunSpec) -> RunSpec:
-    """The specification with teams and opponents, if the run has any. Raises `UsageError`."""
+def _teams(config: Config, seats: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
+    """The seats of each team, if the run has opponents. Raises `UsageError`."""
     if not (config.self_play or config.opponents):
         if config.teams:
             raise UsageError("teams: expected none without opponents; give self_play, or opponents")
-        return spec
+        return ()
     what = "self_play" if config.self_play else "opponents"
-    if len(spec.seats) < 2:
+    if len(seats) < 2:
         raise UsageError(f"{what}: expected an environment of several agents, got {config.env}")
     if len(config.info_keys) >= MAX_FACTS:
         raise UsageError(f"info_keys: expected fewer than {MAX_FACTS} in a run with opponents, got {len(config.info_keys)}")
     if SCORE in config.info_keys:
         raise UsageError(f"info_keys: expected another name than {SCORE}, which is counted in a run with opponents")
-    teams = teams_of(spec.seats, config.teams)
+    teams = teams_of(seats, config.teams)
     if config.envs < len(teams):
         raise UsageError(f"{what}: expected envs {len(teams)} or more, so that each team is played, got {config.envs}")
-    facts = counted_facts(config.info_keys, spec.seats, opponents=True)
-    spec = msgspec.structs.replace(spec, teams=teams, scripted=config.opponents, facts=facts)
-    check_can_be_sent(config.env, spec)
-    return spec
+    return teams
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:

@@ -82,7 +82,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     """one array [T, N, *shape] for each of `RunSpec.extras`"""
     resets: Array | None = None
     """[T+1, N] bool, with seats: whether step t only resets this copy; the last row is of the next rollout's first step. The
-    N of all other arrays is then `RunSpec.copies` · `RunSpec.sent_seats`. None without seats: it is ~valid"""
+    N of all other arrays is then `RunSpec.sent_columns`. None without seats: it is ~valid"""
 
     @property
     def env_steps(self) -> int:
@@ -98,7 +98,7 @@ def _env_steps(valid: Array, resets: Array | None) -> int:
 
 def rollout_bytes(run: RunSpec) -> int:
     """Number of bytes of all arrays of a rollout of this run."""
-    T, N = run.rollout_steps, run.copies * run.sent_seats
+    T, N = run.rollout_steps, run.sent_columns
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
     if run.masked:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from typing import Literal
 
 import msgspec
 
 from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
-from protocol.errors import UsageError
 from protocol.space_spec import Shape
 from protocol.wire.weight_dtypes import ActingDtype
 
@@ -251,6 +248,11 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         """How many seats of each copy a rollout has the rows of."""
         return len(self.teams[0]) if self.teams else self.seats_of_copy
 
+    @property
+    def sent_columns(self) -> int:
+        """The columns of a rollout: those of a lane, or of the policy's team alone."""
+        return self.copies * self.sent_seats
+
     def team_of(self, lane: int, copy: int) -> int:
         """The team that the policy plays in this copy of a lane, for all episodes."""
         return (lane * self.copies + copy) % len(self.teams)
@@ -297,23 +299,9 @@ SCORE = "score"
 """Name of the last fact of an episode with opponents: 1 if the policy's team had the highest return, 1/2 in a tie, or 0."""
 
 
-def counted_facts(info_keys: tuple[str, ...], seats: tuple[str, ...], *, opponents: bool) -> tuple[str, ...]:
-    """The names of the facts of an episode: what the environment reports, then what is counted."""
-    if opponents:
-        return (*info_keys, SCORE)
+def facts_of_all_seats(info_keys: tuple[str, ...], seats: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the facts of an episode without opponents: what the environment reports, then the returns of the seats."""
     return info_keys + (seat_returns(seats) if len(seats) + len(info_keys) <= MAX_FACTS else ())
-
-
-def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tuple[int, ...], ...]:
-    """The seats of each team, by these patterns of their names; without any, each seat is a team. Raises `UsageError`."""
-    if not patterns:
-        return tuple((seat,) for seat in range(len(seats)))
-    found = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
-    if len(found) < 2 or sorted(n for team in found for n in team) != list(range(len(seats))):
-        raise UsageError(f"teams: expected patterns that put each of {', '.join(seats)} into one team, got {list(patterns)}")
-    if len({len(team) for team in found}) > 1:
-        raise UsageError(f"teams: expected as many agents in each, got {[len(team) for team in found]}")
-    return tuple(found)
 
 
 def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:

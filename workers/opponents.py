@@ -18,12 +18,12 @@ from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_converter_of
 from protocol.messages import Weights
 from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.policy import make_policy
+from protocol.policy.policy import Policy, make_policy
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode
 from protocol.specs import OwnPolicySpec, RunSpec
 from protocol.wire.weight_dtypes import to_float32
-from workers.acting import Acting, acting_of
+from workers.acting import acting_of
 
 
 class Opponent:
@@ -32,14 +32,14 @@ class Opponent:
     def __init__(self, run: RunSpec, number: int, weights: Weights | None) -> None:
         """`weights`: those of this version; none for a program of the user's."""
         self.number = number
-        spec = run.opponent or run.policy
         if weights is None:
-            own = OwnPolicySpec(run.scripted[-1 - number], ())
-            spec = msgspec.structs.replace(run.policy, own=own, core=None)
-            self.acting: Acting = acting_of(msgspec.structs.replace(run, policy=spec), CalledPolicy(spec, ()))
+            spec = msgspec.structs.replace(run.policy, own=OwnPolicySpec(run.scripted[-1 - number], ()))
+            policy: Policy | CalledPolicy = CalledPolicy(spec, ())
         else:
-            self.acting = acting_of(msgspec.structs.replace(run, policy=spec), make_policy(spec, run.images_dtype))
-            self.acting.load(to_float32(weights.parameters), weights.buffers)
+            spec = run.opponent or run.policy
+            policy = make_policy(spec, run.images_dtype)
+            policy.load(to_float32(weights.parameters), weights.buffers)
+        self.acting = acting_of(msgspec.structs.replace(run, policy=spec), policy)
         self.to_env_action = action_converter_of(spec)
         self.state_size = spec.state_size
 

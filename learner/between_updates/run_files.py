@@ -177,7 +177,7 @@ class RunFiles:
             env_attributes=self._attributes.state(self._state.version),
         ).checkpoint_content(self._algorithm)
         try:
-            self._folder.write_policy(self._spec, *self.weights())
+            self._folder.write_policy(spec, *self.weights())
             self._policy_env_steps = env_steps
         finally:
             path = checkpoint.save(self._folder.path, state, env_steps, self._config.keep_checkpoints)

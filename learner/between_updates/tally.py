@@ -32,7 +32,8 @@ class Tally:
         pool: OpponentPool | None = None,
     ) -> None:
         """`state`: where the run stands. `ended_by`: why a callback has ended the run, or None. `pool`: of self-play."""
-        self.pool, self.state = pool, state
+        self.pool = pool
+        self.state = state
         """Also the evaluations change it. A checkpoint adds what others hold."""
         self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self.new_episodes: tuple[Episode, ...] = ()

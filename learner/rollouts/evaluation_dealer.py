@@ -288,15 +288,14 @@ class EvaluationDealer:
         for episode in answer.episodes:
             if why := wrong_facts(episode, self._run):
                 return f"episode: {why}"
-        opponents, _ = self._matches(answer.ticket)
-        if self._run.teams and tuple(episode.opponent for episode in answer.episodes) != opponents:
-            return f"expected the opponents {opponents}, got {[episode.opponent for episode in answer.episodes]}"
-        for episode in answer.episodes:
             if episode.length > most:
                 return f"expected episodes of at most {most} steps, got {episode.length}"
             rewards = episode.length * self._run.seats_of_copy
             if not abs(episode.reward) <= rewards * LARGEST_REWARD:  # false for NaN too
                 return f"expected a return that {rewards} rewards can give, got {episode.reward}"
+        opponents, _ = self._matches(answer.ticket)
+        if self._run.teams and tuple(episode.opponent for episode in answer.episodes) != opponents:
+            return f"expected the opponents {opponents}, got {[episode.opponent for episode in answer.episodes]}"
         return ""
 
 

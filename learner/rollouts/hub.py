@@ -166,9 +166,9 @@ class Hub:
         """Keep the weights [n, P] and buffers [n, B] of the snapshots of a run that goes on."""
         pool = self.coordinator.rollouts.opponents
         versions = [] if pool is None else pool.versions
-        for version, *arrays in zip(versions, parameters, buffers, strict=True):
-            sent = to_wire_dtype(arrays[0], self.settings.acting_dtype)
-            self.coordinator.weights.kept[version] = Weights(version, sent, arrays[1])
+        for version, of_version, its_buffers in zip(versions, parameters, buffers, strict=True):
+            sent = to_wire_dtype(of_version, self.settings.acting_dtype)
+            self.coordinator.weights.kept[version] = Weights(version, sent, its_buffers)
 
     def opponent_policies(self) -> tuple[Floats, Floats] | None:
         """Those of all snapshots, float32, if there are any."""

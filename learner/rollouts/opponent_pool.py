@@ -10,12 +10,14 @@ rating changes as the policy's does, by the opposite amount. Episodes against a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 import msgspec
 
 from protocol.bounds import Count, Natural, Real
+from protocol.errors import UsageError
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 
@@ -44,6 +46,18 @@ class PoolState(msgspec.Struct, kw_only=True):
     """The first one, and the newest, in order."""
     scripted: list[Real] = []
     """ratings of the programs"""
+
+
+def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tuple[int, ...], ...]:
+    """The seats of each team, by these patterns of their names; without any, each seat is a team. Raises `UsageError`."""
+    if not patterns:
+        return tuple((seat,) for seat in range(len(seats)))
+    found = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
+    if len(found) < 2 or sorted(n for team in found for n in team) != list(range(len(seats))):
+        raise UsageError(f"teams: expected patterns that put each of {', '.join(seats)} into one team, got {list(patterns)}")
+    if len({len(team) for team in found}) > 1:
+        raise UsageError(f"teams: expected as many agents in each, got {[len(team) for team in found]}")
+    return tuple(found)
 
 
 class PoolSettings(NamedTuple):

@@ -61,7 +61,7 @@ from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from protocol.policy.possible import why_impossible
 from protocol.space_spec import MAX_SEATS
-from protocol.specs import PolicySpec, RunSpec, counted_facts
+from protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
 
 POLICY_FORMAT = 1
 Which = Literal["final", "best"]
@@ -275,7 +275,7 @@ class RunFolder:
             arrays=_array_positions(acting),
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
             wrappers=env.wrappers,
-            facts=counted_facts(run.info_keys, run.seats, opponents=False),
+            facts=facts_of_all_seats(run.info_keys, run.seats),
             masked=run.masked,
             eval_env_kwargs=env.eval_kwargs,
             seats=run.seats,

@@ -10,6 +10,8 @@ from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
 
+from protocol.envs.seats import columns_of
+
 
 class BatchLayout:
     """The rows of each lane."""
@@ -36,7 +38,7 @@ class BatchLayout:
 
     def rows_of(self, copies: Sequence[int]) -> Sequence[int]:
         """The rows of these env copies."""
-        return copies if self._seats == 1 else [n * self._seats + seat for n in copies for seat in range(self._seats)]
+        return columns_of(copies, self._seats)
 
     def size(self, lane: int) -> int:
         """Number of env copies of a lane."""

@@ -51,6 +51,11 @@ def side_by_side(copies: Iterable[SeatStep]) -> SeatStep:
     return SeatStep(*([seat for of_copy in of_copies for seat in of_copy] for of_copies in zip(*copies, strict=True)))
 
 
+def columns_of(copies: Sequence[int], seats: int) -> Sequence[int]:
+    """The columns of these env copies, of which each has so many seats, side by side."""
+    return copies if seats == 1 else [n * seats + seat for n in copies for seat in range(seats)]
+
+
 class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     """One env copy with A seats. `reset` and `step` return a `SeatStep` in place of the observation.
 

@@ -18,7 +18,7 @@ LARGEST_REWARD = float(np.finfo(np.float32).max)
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
-    T, N = run.rollout_steps, run.copies * run.sent_seats
+    T, N = run.rollout_steps, run.sent_columns
     action, axes = run.policy.action, run.sent_axes
     expected = [
         Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),

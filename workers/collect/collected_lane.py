@@ -38,12 +38,11 @@ class CollectedLane:
         self.incarnation = incarnation
         self.copies = copies
         self.generator = generator(run.seed, Purpose.ACTIONS, number, incarnation)
-        self._opponents_draw = generator(run.seed, Purpose.OPPONENTS, number, incarnation)
         self.obs = tuple(np.empty((run.columns, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))  # [N, *leaf] each
         self.state = zero_state(run.policy, run.columns)  # [N, S] recurrent state of the policy
         self.state_before = self.state  # of this rollout
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
-        self.seats = SeatRows(run) if run.seats else None
+        self.seats = SeatRows(run, number, incarnation) if run.seats else None
         self._run = run
         self._seeds = copy_seeds(run.seed, number, incarnation, run.copies)
         self._return = [0.0] * run.copies  # of the running episodes, as are the next two
@@ -83,10 +82,7 @@ class CollectedLane:
 
     def begin(self, opponent: Opponent | None) -> None:
         """A rollout begins. `opponent`: of the episodes that begin in it, if the policy plays one team alone."""
-        if self.seats is None:
-            self.state_before = self.state
-        else:
-            self.state_before = self.seats.begin(self.state, self.number, opponent, self._opponents_draw)
+        self.state_before = self.state if self.seats is None else self.seats.begin(self.state, opponent)
 
     @property
     def sent(self) -> slice | npt.NDArray[np.intp]:

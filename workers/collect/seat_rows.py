@@ -13,6 +13,7 @@ import numpy as np
 
 from protocol.arrays import Array, Bools, Floats
 from protocol.policy.recurrent import zero_state
+from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from workers.copies.env_copies import SeatColumns, StepResult
@@ -23,8 +24,9 @@ from workers.opponents import Match, Opponent, OtherTeams, whole_episode
 class SeatRows:
     """What a lane of N copies with A seats each keeps from step to step, and the rows of the present rollout."""
 
-    def __init__(self, run: RunSpec) -> None:
+    def __init__(self, run: RunSpec, lane: int, incarnation: int) -> None:
         self._run, self._seats = run, run.seats_of_copy
+        self._lane, self._incarnation = lane, incarnation
         self.others: OtherTeams | None = None
         """those of other teams, once the first episodes have begun, if the policy plays one team alone"""
         self._opponent: Opponent | None = None  # in the episodes that begin in this rollout
@@ -45,15 +47,16 @@ class SeatRows:
         self._return += first.outside.reshape(self._return.shape)
         self._start_s[:] = now_s
 
-    def begin(self, state: Floats, lane: int, opponent: Opponent | None, drawn: np.random.Generator) -> Floats:
-        """A rollout of this lane begins, with the policy in this state [N · A, S]. Returns the state before the first rows.
+    def begin(self, state: Floats, opponent: Opponent | None) -> Floats:
+        """A rollout begins, with the policy in this state [N · A, S]. Returns the state before the first rows.
 
-        `opponent`: in the episodes that begin in it. `drawn`: where opponents draw their actions.
+        `opponent`: in the episodes that begin in it.
         """
         T, run = self._run.rollout_steps, self._run
         self._opponent = opponent
         if opponent is not None and self.others is None:
-            matches = [Match(run.team_of(lane, n), opponent) for n in range(run.copies)]
+            matches = [Match(run.team_of(self._lane, n), opponent) for n in range(run.copies)]
+            drawn = generator(run.seed, Purpose.OPPONENTS, self._lane, self._incarnation)
             self.others = OtherTeams(run, matches, drawn)
         self.valid = np.zeros((T, run.columns), bool)
         self.resets = np.zeros((T + 1, run.copies), bool)

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from protocol.arrays import Array
+from protocol.envs.seats import columns_of
 from protocol.envs.spaces import action_converter_of
 from protocol.envs.which_copy import EnvCopy
 from protocol.errors import UsageError
@@ -145,7 +146,7 @@ class Evaluator:
             pulse()
             acts = copies.columns.acts[: k * A] if isinstance(copies, SeatedCopies) else None
             with np.errstate(all="ignore"):
-                before = state.copy()
+                before = state if acts is None else state.copy()
                 chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
                 taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=others is not None)
                 if acts is not None:
@@ -212,8 +213,7 @@ class Evaluator:
 
     def _columns(self, copies: Sequence[int]) -> Sequence[int]:
         """The columns of the seats of these copies."""
-        A = self._run.seats_of_copy
-        return copies if A == 1 else [column for n in copies for column in range(n * A, (n + 1) * A)]
+        return columns_of(copies, self._run.seats_of_copy)
 
     def _write(self, obs: tuple[Array, ...], copies: Sequence[int], leaves: Leaves, t: int, doing: str) -> None:
         """Write the observations of these copies to their places in the batch: number `t` of their episodes."""

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from protocol.arrays import Array
-from protocol.envs.seats import SeatStep, side_by_side
+from protocol.envs.seats import SeatStep, columns_of, side_by_side
 from workers.copies.env_loop import CopyInfos
 from workers.copies.row_writers import read_leaves, write_numbers
 from workers.vector_env.stepped_lane import SteppedLane
@@ -35,7 +35,7 @@ class SeatedLane(SteppedLane):
 
     def _write_some(self, copies: Sequence[int], infos: CopyInfos) -> CopyInfos:
         found, leaves = self._found(copies, infos)
-        numbers = [n * len(self._seats) + seat for n in copies for seat in range(len(self._seats))]
+        numbers = list(columns_of(copies, len(self._seats)))
         self._writer.write_some(self.rows.obs, numbers, [dict(zip(numbers, values, strict=True)) for values in leaves])
         for array in (self.rows.reward, self.rows.terminated, self.rows.truncated):
             array[numbers] = 0

@@ -13,6 +13,7 @@ import pytest
 from learner.algorithms.minibatches import log_probs
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
+from learner.rollouts.opponent_pool import teams_of
 from protocol.arrays import Array, Floats
 from protocol.errors import PolicyFailed, UsageError
 from protocol.messages import Evaluate, Weights
@@ -20,7 +21,7 @@ from protocol.policy.layout import acting_size
 from protocol.policy.policy import make_policy
 from protocol.rollout import Rollout, stack_rollouts
 from protocol.rows.rollout_checks import validate
-from protocol.specs import PolicySpec, RunSpec, counted_facts, teams_of
+from protocol.specs import SCORE, PolicySpec, RunSpec
 from tests.support.in_process.collectors import no_pulse, random_policy
 from tests.support.users_code.seat_envs import AGENTS
 from tests.workers.collect.test_seat_rows import FORMS, seated_run
@@ -34,8 +35,7 @@ SCRIPTED = f"{__name__}:always_two"
 
 
 def with_teams(run: RunSpec, patterns: Sequence[str] = (), **changes: Any) -> RunSpec:
-    facts = counted_facts((), run.seats, opponents=True)
-    return msgspec.structs.replace(run, teams=teams_of(run.seats, patterns), facts=facts, **changes)
+    return msgspec.structs.replace(run, teams=teams_of(run.seats, patterns), facts=(SCORE,), **changes)
 
 
 def always(action: int, version: int, spec: PolicySpec) -> Weights:
