@@ -2,8 +2,9 @@
 
 Each copy has 16 agents that all act in an episode of 100 steps, which costs little or sleeps 1 ms a step. A row is a step of
 an agent. The contenders are PufferLib's vector environment and supersuit's, where they are installed, and millrace's, with
-equally many processes, and a plain loop over the copies in this process, which stores nothing. In each round all contenders
-run once, in an order that changes from round to round. Rates are medians over rounds; ratios are taken within a round.
+equally many processes, and a plain loop over the copies in this process, which stores nothing. In each round each contender
+is made, run and closed once, in an order that changes from round to round. Rates are medians over rounds; ratios are taken
+within a round.
 """
 
 from __future__ import annotations
@@ -139,30 +140,30 @@ def rate(step: Callable[[Any], object], actions: Any, seconds: float) -> float:
 
 def measure(task: Task, rounds: int, seconds: float, table: Table) -> None:
     """A row of the table for each contender."""
-    made, missing = {}, []
-    for name in NAMES:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                made[name] = step_function(name, task)
-        except ImportError:
-            missing.append(name)
     actions = np.random.default_rng(1).integers(4, size=(100, task.copies * len(AGENTS)))
-    for step, _ in made.values():
-        rate(step, actions, 0.3)
-    found = []
+    present = [*NAMES]
+    found: list[dict[str, float]] = []
     for number in range(rounds):
-        order = [*made][number % len(made) :] + [*made][: number % len(made)]
-        found.append({name: rate(made[name][0], actions, seconds) for name in order})
-    for _, close in made.values():
-        close()
+        found.append({})
+        for name in present[number % len(present) :] + present[: number % len(present)]:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    step, close = step_function(name, task)
+            except ImportError:
+                present.remove(name)
+                continue
+            rate(step, actions, 0.3)
+            found[-1][name] = rate(step, actions, seconds)
+            close()  # because idle processes of PufferLib poll, and would slow down the next contender
     about = task.title, f"{task.copies} × {len(AGENTS)}", str(task.workers)
-    for name in made:
+    for name in NAMES:
+        if name not in present:
+            table.add_row(*about, name, "not installed", "")
+            continue
         rows = statistics.median(each[name] for each in found)
         ratio = statistics.median(each["millrace"] / each[name] for each in found)
         table.add_row(*about, name, f"{rows:,.0f}", f"{ratio:.2f}")
-    for name in missing:
-        table.add_row(*about, name, "not installed", "")
 
 
 def main() -> None:
