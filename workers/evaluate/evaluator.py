@@ -28,6 +28,7 @@ from protocol.policy.masks import stored_leaves
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
+from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from workers.acting import acting_of
 from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
@@ -76,6 +77,32 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
         copies.close()
         raise UsageError(f"environment {run.env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")
     return copies
+
+
+class EpisodesSoFar:
+    """What the episodes of an order have come to so far."""
+
+    def __init__(self, run: RunSpec, order: Evaluate) -> None:
+        k = len(order.seeds)
+        self.returns = np.zeros((k, run.seats_of_copy))
+        self.cut = [False] * k  # whether they were cut at the most steps that the order allows
+        self._run, self._most_steps, self._began_s = run, order.most_steps, perf_counter()
+        self._lengths, self._seconds, self._facts = [0] * k, [0.0] * k, [(math.nan,) * len(run.info_keys)] * k
+
+    def add(self, n: int, rewards: Array, over: bool, facts: tuple[float, ...] | None) -> bool:
+        """A step of episode n. Returns whether it was the last one, to be followed by no other."""
+        self.returns[n] += rewards
+        self._lengths[n] += 1
+        self.cut[n] = not over and self._lengths[n] >= self._most_steps
+        if ended := over or self.cut[n]:
+            self._seconds[n] = perf_counter() - self._began_s
+            self._facts[n] = self._facts[n] if facts is None else facts
+        return ended
+
+    def episodes(self, others: OtherTeams | None) -> tuple[Episode, ...]:
+        """All episodes, which have ended."""
+        figures = zip(self.returns.tolist(), self._lengths, self._seconds, self._facts, strict=True)
+        return tuple(whole_episode(self._run, others, n, *of_episode) for n, of_episode in enumerate(figures))
 
 
 class Evaluator:
@@ -129,17 +156,12 @@ class Evaluator:
         k, A, policy = len(order.seeds), self._run.seats_of_copy, self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         obs = tuple(np.empty((1, k * A, *leaf.shape), leaf.dtype) for leaf in self._stored)
-        numbers = np.zeros(k * A), np.zeros(k * A, bool), np.zeros(k * A, bool)
         state, drawn = zero_state(policy, 1, k * A), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
-        returns, lengths, cut, seconds = np.zeros((k, A)), [0] * k, [False] * k, [0.0] * k
-        no_facts = (math.nan,) * len(self._run.info_keys)
-        facts = [no_facts] * k
         senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
-        running, t = list(range(k)), 0
-        began_s = perf_counter()
+        played, running, t = EpisodesSoFar(self._run, order), list(range(k)), 0
         self._write(obs, running, copies.reset(order.seeds, pulse), 0, "first reset")
         if isinstance(copies, SeatedCopies):
-            returns += copies.columns.outside[: k * A].reshape(k, A)
+            played.returns += copies.columns.outside[: k * A].reshape(k, A)
         for n, sender in enumerate(senders):
             self._observe(sender, obs, n, copies)
         while running:
@@ -154,45 +176,42 @@ class Evaluator:
                     if others is not None:
                         others.act([leaf[0] for leaf in obs], acts, taken)
             self._check_acted(chosen, running, obs, t)
-            # The actions are a new array at each step, because an environment may keep its action.
-            try:
-                step = copies.step(taken[self._columns(running)], pulse, running)
-                if step.lost is not None and step.lost[running].any():
-                    return None
-                write_numbers(
-                    numbers, slice(None), (step.reward[: k * A], step.terminated[: k * A], step.truncated[: k * A])
-                )
-            except CopyFailed as error:
-                raise environment_failed(None, error, f"step {t}") from error
-            check_rewards(None, numbers[0][None], self._run.row_axes, t)
-            rewards, ends, cuts = (array.reshape(k, A) for array in numbers)
-            if (columns := step.columns) is not None:
-                rewards, ends = rewards + columns.outside[: k * A].reshape(k, A), columns.over[:k, None]
-                cuts = np.zeros_like(ends)
+            if (made := self._step(copies, taken, running, t, pulse)) is None:
+                return None
+            step, rewards, terminated, truncated = made
             self._write(obs, running, step.leaves, t + 1, f"step {t}")
-            ended = set[int]()
-            for n in running:
-                returns[n] += rewards[n]
-                lengths[n] += 1
-                terminated, truncated = bool(ends[n, 0]), bool(cuts[n, 0])
-                over = terminated or truncated
-                cut[n] = not over and lengths[n] >= order.most_steps
-                if senders:
-                    self._observe(senders[n], obs, n, copies)
-                    acted = chosen.reshape(k, A, *chosen.shape[1:])[n] if self._run.seats else chosen[n]
-                    senders[n].step(acted, float(rewards[n].sum()), terminated, truncated or cut[n])
-                if over or cut[n]:
-                    ended.add(n)
-                    seconds[n], facts[n] = perf_counter() - began_s, step.facts.get(n, no_facts)
+            ended = {n for n in running if played.add(n, rewards[n], bool(terminated[n] or truncated[n]), step.facts.get(n))}
+            for n in running if senders else ():
+                self._observe(senders[n], obs, n, copies)
+                acted = chosen.reshape(k, A, *chosen.shape[1:])[n] if self._run.seats else chosen[n]
+                senders[n].step(acted, float(rewards[n].sum()), bool(terminated[n]), bool(truncated[n]) or played.cut[n])
             self.steps += len(running)
             t += 1
-            if ended:
-                running = [n for n in running if n not in ended]
-        episodes = tuple(
-            whole_episode(self._run, others, n, *figures)
-            for n, figures in enumerate(zip(returns.tolist(), lengths, seconds, facts, strict=True))
-        )
-        return Evaluated(order.session, order.ticket, episodes, tuple(cut))
+            running = [n for n in running if n not in ended]
+        return Evaluated(order.session, order.ticket, played.episodes(others), tuple(played.cut))
+
+    def _step(
+        self, copies: EvaluationCopies, actions: Array, running: Sequence[int], t: int, pulse: Pulse
+    ) -> tuple[StepResult, Array, Array, Array] | None:
+        """Step the running copies: the result, rewards [k, A], terminated and truncated [k]. None if one of them was lost.
+
+        The environments may keep their actions, so `actions` must be a new array at each step.
+        """
+        rows, A = len(actions), self._run.seats_of_copy
+        numbers = np.zeros(rows), np.zeros(rows, bool), np.zeros(rows, bool)
+        try:
+            step = copies.step(actions[self._columns(running)], pulse, running)
+            if step.lost is not None and step.lost[running].any():
+                return None
+            write_numbers(numbers, slice(None), (step.reward[:rows], step.terminated[:rows], step.truncated[:rows]))
+        except CopyFailed as error:
+            raise environment_failed(None, error, f"step {t}") from error
+        check_rewards(None, numbers[0][None], self._run.row_axes, t)
+        rewards, terminated, truncated = (array.reshape(-1, A) for array in numbers)
+        if (columns := step.columns) is None:
+            return step, rewards, terminated[:, 0], truncated[:, 0]
+        over = columns.over[: rows // A]
+        return step, rewards + columns.outside[:rows].reshape(-1, A), over, np.zeros_like(over)
 
     def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
         """The other teams, if the order says who plays them."""
