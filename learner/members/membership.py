@@ -104,9 +104,10 @@ class Member:
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
     """Seconds in each stage of the worker's process before this session."""
-    steps_per_s: float = 0.0
     measured: tuple[int, float] = (0, 0.0)
     """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
+    gained: tuple[int, float] = (0, 1.0)
+    """By how many env steps these were more than when it was measured before, and the seconds between the two."""
 
     stepped: bool = False
     """Whether its process is known to have made an env step: it has reported one, or sent a rollout."""
@@ -161,11 +162,21 @@ class Member:
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
         self.stepped |= heartbeat.steps > 0
         steps, since_s = self.measured
-        if self.heard_s - since_s >= MEASURE_S:  # several may be read at once
-            self.steps_per_s = (heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
+        if not since_s:
+            self.measured = heartbeat.steps, self.heard_s
+        elif heartbeat.steps != steps and self.heard_s - since_s >= MEASURE_S:  # several may be read at once
+            self.gained = heartbeat.steps - steps, self.heard_s - since_s
             self.measured = heartbeat.steps, self.heard_s
         held = set(heartbeat.tickets)
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
+
+    def steps_per_s(self, now: float) -> float:
+        """Env steps per second. A worker counts those of a rollout when it is complete, which may take minutes.
+
+        So it is the speed between the last two heartbeats with more steps, until the next one is overdue.
+        """
+        steps, seconds = self.gained
+        return steps / max(seconds, now - self.measured[1])
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
         """The late actions since the last heartbeat. Those before this session belong to an earlier one.
@@ -204,7 +215,7 @@ class Member:
             lanes=tuple(sorted(self.lanes)),
             tickets=len(self.tickets),
             steps=heartbeat.steps if heartbeat else 0,
-            steps_per_s=self.steps_per_s,
+            steps_per_s=self.steps_per_s(now),
             version=-1,
             silent_s=max(0.0, now - self.heard_s),
             resident_bytes=heartbeat.resident_bytes if heartbeat else 0,

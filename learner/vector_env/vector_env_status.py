@@ -23,5 +23,5 @@ def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], 
         workers,
         len(coordinator.lanes),
         env_steps=sum(member.heartbeat.steps for member in members if member.heartbeat is not None),
-        steps_per_s=sum(member.steps_per_s for member in members),
+        steps_per_s=sum(row.steps_per_s for row in workers),
     )

@@ -61,7 +61,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "state",
         "heartbeat",
         "stages_before",
-        "steps_per_s",
+        "gained",
         "measured",
         "activity",
         "activity_s",

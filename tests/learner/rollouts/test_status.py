@@ -122,6 +122,21 @@ def test_speed_is_measured_between_two_accounts_that_are_apart() -> None:
     assert (worker.steps_per_s, worker.steps, worker.resident_bytes) == (200.0, 1_400, 6)
 
 
+def test_speed_is_that_of_the_last_rollout_until_the_next_one_is_overdue() -> None:
+    learner = Learner()
+    learner.now = 10.0
+    learner.joins(b"a")
+    counts(learner, b"a", steps=1_000)
+    learner.now += 20.0
+    counts(learner, b"a", steps=2_000)
+    speeds = []
+    for seconds in (1.0, 19.0, 5.0, 75.0):
+        learner.now += seconds
+        counts(learner, b"a", steps=2_000)
+        speeds.append(told(learner).workers[0].steps_per_s)
+    assert speeds == [50.0, 50.0, 40.0, 10.0]
+
+
 def test_weights_count_as_held_when_the_worker_says_so() -> None:
     learner = Learner()
     learner.joins(b"a")
