@@ -1,8 +1,9 @@
 """The weights that orders name, and which workers hold them. Pure.
 
 Rule: weights are kept while they are the newest, act in a round that is open, or are evaluated. They are sent to a worker
-after the first order that names them, and again if its Heartbeat shows that they were lost on the way. Of those that were
-sent, a worker keeps the newest and those that its tickets name.
+after the first order that names them, and again if its Heartbeat shows that they were lost on the way. When weights come to
+a worker, it keeps the newest and those that its tickets name. It drops none when a ticket ends, because an order that is on
+its way may name the same weights, and would have to wait for a Heartbeat.
 
 Where a supervisor shares weights among its workers, it gets them once, in place of the first of its workers that needs
 them. For all of these they are on the way until the supervisor's word shows that they have reached it, or are lost. From
@@ -58,7 +59,7 @@ class SentWeights:
                     last = list(supervisor.versions.items())[1 - SHARED_VERSIONS :]
                     supervisor.versions = {**dict(last), version: supervisor.replies}
                 member.versions[version] = member.replies if supervisor is None else TO_SUPERVISOR
-                drop_versions(member, named)
+                member.versions = _kept(member.versions, named(member.tickets))
         return orders + out
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
@@ -72,11 +73,11 @@ class SentWeights:
         # What it does not list was dropped or lost, unless it may still be on its way.
         held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}
         lost = sorted(set(named) - held.keys())
-        member.versions = held | dict.fromkeys(lost, member.replies)
+        member.versions = _kept(held | dict.fromkeys(lost, member.replies), named) if lost else held
         return [(member.peer, self.kept[version]) for version in lost]
 
 
-def drop_versions(member: CollectingMember, named: Named) -> None:
-    """The worker got new weights, or a piece of its work has ended: it keeps the newest, and what its tickets name."""
-    kept = {*named(member.tickets), max(member.versions, default=-1)}
-    member.versions = {version: sent_at for version, sent_at in member.versions.items() if version in kept}
+def _kept(versions: Mapping[int, int], named: Collection[int]) -> dict[int, int]:
+    """Of these versions, those that a worker keeps when one of them comes."""
+    kept = {*named, max(versions)}
+    return {version: sent_at for version, sent_at in versions.items() if version in kept}

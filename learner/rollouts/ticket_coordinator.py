@@ -24,7 +24,7 @@ from learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan,
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.opponent_pool import OpponentPool
 from learner.rollouts.rollout_dealer import RolloutDealer
-from learner.rollouts.sent_weights import SentWeights, drop_versions
+from learner.rollouts.sent_weights import SentWeights
 from protocol.messages import (
     Array,
     EpisodeRows,
@@ -162,11 +162,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 if why := self.rollouts.take_in(member, message):
                     return self.reject_rollout(member.peer, message, why, member.heard_s)
                 self._placement.ticket_ended(member)
-                drop_versions(member, self._named)
                 return self._deal()
             case Evaluated():
                 why = self.evaluation.take_in(member, message)
-                drop_versions(member, self._named)
             case EpisodeRows():
                 why = self.evaluation.take_rows(member, message)
             case _:

@@ -340,9 +340,9 @@ VERSION = Rule(
 HOLDS_WEIGHTS = Rule(
     "The worker's half",
     "The worker holds the newest weights that have come, and those that an unfinished ticket names, also as an opponent's, "
-    "whether of a rollout or of an evaluation. It drops all others when a piece of work ends",
-    "keep weights in a map by version; after each rollout or evaluation drop those that are neither the newest nor "
-    "named by a ticket that is left",
+    "whether of a rollout or of an evaluation. It drops all others when weights come",
+    "keep weights in a map by version; when weights come, drop those that are neither the newest nor named by a ticket "
+    "that is left",
 )
 ROWS = Rule(
     "Collector profile",

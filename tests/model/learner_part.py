@@ -227,7 +227,6 @@ class Learner:
         """The rules that hold in every state."""
         check_tickets(self.coordinator, self.settings.max_lag)
         self._check_rounds()
-        self._check_versions()
 
     def _check_rounds(self) -> None:
         """Each lane has every open round once: due, with a worker, or waiting. Round u acts under what `rounds.py` says."""
@@ -262,14 +261,6 @@ class Learner:
         for each in self.coordinator.rollouts.held.values():
             met = range(max(0, each.version - play + 1), each.version + 1) if play else [None]
             assert each.opponent in met, "a ticket names an opponent that does not play"
-
-    def _check_versions(self) -> None:
-        """Of the weights that were sent to a worker, it keeps the newest and those that its tickets name. So count these."""
-        for member in self.coordinator.members.values():
-            named = {version for each, version in self.named() if each is member}
-            assert set(member.versions) <= {*named, max(member.versions, default=-1)}, (
-                "weights that a worker drops count as held"
-            )
 
 
 # -------------------------------------------------------------------- to tuples and back

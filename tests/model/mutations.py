@@ -101,10 +101,10 @@ MUTATIONS = {
         WEIGHTS, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
     ),
     "weights that are sent again are not noted": Mutation(
-        WEIGHTS, "member.versions = held | dict.fromkeys(lost, member.replies)", "member.versions = held"
+        WEIGHTS, "_kept(held | dict.fromkeys(lost, member.replies), named) if lost else held", "held"
     ),
     "weights that a heartbeat does not list count as held": Mutation(
-        WEIGHTS, "member.versions = held | dict", "member.versions |= dict"
+        WEIGHTS, "_kept(held | dict", "_kept(member.versions | dict"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
         COORDINATOR, "out + self.weights.after(orders, self.members, self._named)", "out + orders"
@@ -150,6 +150,11 @@ MUTATIONS = {
         "RolloutTask(session, self.weights[max(self.weights)], assignments, ",
     ),
     "a worker drops weights that a ticket names": Mutation(SESSION, "asked = {*self.rollouts.versions(), ", "asked = {"),
+    "a worker drops weights when a ticket ends": Mutation(
+        SESSION,
+        "        current.in_progress = False\n        return [*map",
+        "        current.drop_weights()\n        current.in_progress = False\n        return [*map",
+    ),
     "a worker drops the newest weights": Mutation(SESSION, ", max(self.weights, default=-1)}", "}"),
     "a worker keeps all weights": Mutation(
         SESSION,

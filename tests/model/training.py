@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from learner.members.membership import Outgoing
-from protocol.messages import Collect, Evaluate, Evaluated, Heartbeat, Rollout, Weights
+from protocol.messages import Collect, Evaluate, Heartbeat, Weights
 from tests.model import learner_part, process_part, worker_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner, first_learner
@@ -66,7 +66,7 @@ def learner_event(learner: L, event: Event, message: Content | None, now: float)
 class Sent:
     """Rule: weights are sent after an order that names them, and again only if a Heartbeat shows that they were lost.
 
-    After an answer a worker drops those that are neither the newest nor named by its tickets (`Learner._check_versions`).
+    When weights come, a worker drops those that are neither the newest nor named by its tickets. So count these.
     """
 
     def __init__(self, learner: Learner, heard: Any) -> None:
@@ -82,6 +82,7 @@ class Sent:
     def check(self, after: Learner, out: Iterable[Outgoing]) -> None:
         """After it, with what the learner sends."""
         named, sent_at = (self._named, self._sent_at) if after is self._learner else (set(), {})
+        out = list(out)
         for peer, message in out:
             if isinstance(message, Collect | Evaluate):
                 versions = {message.version}
@@ -95,7 +96,7 @@ class Sent:
                 member = after.coordinator.members[peer]
                 which = member.session, message.version
                 assert which in named, "weights are sent that no order has named"
-                if which in sent_at and not isinstance(self._heard, Rollout | Evaluated):
+                if which in sent_at:
                     shown = isinstance(self._heard, Heartbeat) and message.version not in self._heard.versions
                     assert shown, "weights are sent again although they were not lost"
                     assert sent_at[which] < self._heard.replies, "weights are sent again although they may be under way"
@@ -103,6 +104,9 @@ class Sent:
                 assert sent_at[which] >= member.replies - isinstance(self._heard, Heartbeat), (
                     "weights are sent and not noted"
                 )
+        for member in [after.coordinator.members[peer] for peer, message in out if isinstance(message, Weights)]:
+            kept = {*(version for each, version in after.named() if each is member), max(member.versions)}
+            assert kept.issuperset(member.versions), "weights that a worker drops count as held"
         heard = self._heard
         for member in after.coordinator.members.values():
             if isinstance(heard, Heartbeat) and member.session == heard.session:

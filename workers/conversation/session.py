@@ -2,7 +2,7 @@
 
 Rule: a rollout and an evaluation start only under the weights that they name. A message that is lost does no harm, because
 the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends again what is missing. What a
-worker holds is in `held.py`; of weights, it holds the newest and those that unfinished tickets name.
+worker holds is in `held.py`. When weights come, it keeps the newest and those that unfinished tickets name, and no others.
 """
 
 from __future__ import annotations
@@ -378,7 +378,6 @@ class Session:
         current = self._current
         # The session may have ended, or the lane may have been released, in the meantime.
         kept = [each for each in answers if each.session == self.session and current.keep(each)]
-        current.drop_weights()
         current.in_progress = False
         return [*map(SendMessage, kept), *self._leave_if_drained()]
 

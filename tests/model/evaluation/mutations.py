@@ -81,17 +81,10 @@ MUTATIONS = {
     ),
     "what a worker has dropped counts as held": Mutation(
         WEIGHTS,
-        "for version, sent_at in member.versions.items() if version in kept}",
-        "for version, sent_at in member.versions.items()}",
+        "for version, sent_at in versions.items() if version in kept}",
+        "for version, sent_at in versions.items()}",
     ),
-    "after an evaluation, what a worker has dropped counts as held": Mutation(
-        COORDINATOR,
-        "why = self.evaluation.take_in(member, message)\n                drop_versions(member, self._named)",
-        "why = self.evaluation.take_in(member, message)",
-    ),
-    "weights that a ticket names count as dropped": Mutation(
-        WEIGHTS, "kept = {*named(member.tickets), max(", "kept = {max("
-    ),
+    "weights that a ticket names count as dropped": Mutation(WEIGHTS, "kept = {*named, max(", "kept = {max("),
     "a worker drops weights that an evaluation names": Mutation(SESSION, "*self.evaluations.versions(), ", ""),
     "an evaluation that is over goes on when the next one begins": Mutation(
         HELD, "if order.version == self.asked[newest].version}", "if True}"

@@ -96,7 +96,7 @@ def test_so_does_dqn(tmp_path: Path, env: str, n_step: int) -> None:
     ],
 )
 def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
-    settings |= {"steps": 1_500, "rollout_steps": 16}
+    settings |= {"steps": 800, "rollout_steps": 16}
     policies = [policy_of(trained(tmp_path / str(n), env, workers=n, **settings)) for n in (1, 3)]
     assert policies[0] == policies[1]
 

@@ -20,7 +20,7 @@ from tests.system.stage.run_folders import folder_of, policy_of
 from tests.system.whole_runs.test_seats import trained
 
 ROCK, PAPER = f"{__name__}:rock", f"{__name__}:paper"
-SELF_PLAY: dict[str, Any] = {"self_play": 3, "self_play_save_steps": 150, "rollout_steps": 16, "steps": 1_500}
+SELF_PLAY: dict[str, Any] = {"self_play": 3, "self_play_save_steps": 100, "rollout_steps": 16, "steps": 800}
 
 
 def _program(action: int) -> Any:
@@ -92,26 +92,32 @@ def test_a_resumed_run_has_its_pool_and_goes_on_alike_with_any_number_of_workers
     assert len(versions[0]) > 2
 
 
-def test_a_program_is_beaten_and_the_score_says_so(tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"opponents": (ROCK,), "rollout_steps": 32, "learning_rate": 0.02, "normalize_rewards": False}
-    run = trained(tmp_path, "RockPaperScissors", steps=4_000, eval_episodes=20, **settings)
-    summary = json.loads((run / "summary.json").read_text())
+AGAINST_ONE: dict[str, Any] = {"rollout_steps": 32, "learning_rate": 0.02, "steps": 4_000, "normalize_rewards": False}
+
+
+@pytest.fixture(scope="module")
+def plays_paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper")
+    return trained(folder, "RockPaperScissors", opponents=(ROCK,), eval_episodes=20, **AGAINST_ONE)
+
+
+def test_a_program_is_beaten_and_the_score_says_so(plays_paper: Path) -> None:
+    summary = json.loads((plays_paper / "summary.json").read_text())
     assert summary["evaluation"]["facts"]["score"]["mean"] == summary["evaluation"]["return_mean"] == 1
     assert summary["facts_100"]["score"]["mean"] > 0.9
-    past, arrays = pool_of(run)
+    past, arrays = pool_of(plays_paper)
     assert past["rating"] - 1200 == pytest.approx(1200 - past["scripted"][0])
     assert past["rating"] > 1500
     assert arrays is None
 
 
-def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"rollout_steps": 32, "learning_rate": 0.02, "steps": 4_000, "normalize_rewards": False}
-    plays_paper = trained(tmp_path / "a", "RockPaperScissors", opponents=(ROCK,), **settings)
-    plays_scissors = trained(tmp_path / "b", "RockPaperScissors", opponents=(PAPER,), net=(5,), **settings)
-    for run, against, low, high in ((plays_scissors, plays_paper, 0.9, 1.0), (plays_paper, plays_scissors, 0.0, 0.1)):
-        found = [millrace.evaluate(run, 60, against=against, workers=n, transport="inproc") for n in (1, 2)]
-        assert found[0] == found[1]
-        score, interval = found[0].facts["score"].mean, found[0].score_interval
+def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path, plays_paper: Path) -> None:
+    plays_scissors = trained(tmp_path / "b", "RockPaperScissors", opponents=(PAPER,), net=(5,), **AGAINST_ONE)
+    found = [millrace.evaluate(plays_scissors, 60, against=plays_paper, workers=n, transport="inproc") for n in (1, 2)]
+    assert found[0] == found[1]
+    of_loser = millrace.evaluate(plays_paper, 60, against=plays_scissors, workers=1, transport="inproc")
+    for evaluation, low, high in ((found[0], 0.9, 1.0), (of_loser, 0.0, 0.1)):
+        score, interval = evaluation.facts["score"].mean, evaluation.score_interval
         assert score is not None
         assert interval is not None
         assert low <= score <= high

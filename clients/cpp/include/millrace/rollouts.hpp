@@ -2,7 +2,7 @@
 //
 // Rule: a ticket is collected once, under the version that it names, and after those before it of its lane. Its rollout is
 // kept until the learner has received it, and sent again when the learner asks for it again. The memory of a rollout that has
-// arrived is used for the next one. Of weights, we hold the newest and those that unfinished tickets name.
+// arrived is used for the next one. When weights come, we keep the newest and those that unfinished tickets name.
 #pragma once
 #include <deque>
 
@@ -176,7 +176,6 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     held.tickets.erase(rollout->ticket), ++held.sequence;
     send_rollout(*rollout);
     held.kept.push_back(std::move(rollout));
-    drop_weights();
   }
   const Evaluation* next_evaluation() {  // the oldest order whose weights are held
     for (const Evaluation& order : orders_)
@@ -191,7 +190,6 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     answers_.push_back(evaluation);
     if (answers_.size() > 8) answers_.pop_front();
     send_evaluation(evaluation);
-    drop_weights();
   }
 
   Policy policy_;
@@ -200,6 +198,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   void take_weights(const Message& m) {
     if (m.arrays.size() > 2) return decline("the C++ client has no attributes that the learner could set in its environments");
     if (!weights_.count(m.version)) weights_.emplace(m.version, policy_.weights(m));  // a rollout in progress goes on under its own
+    drop_weights();
   }
   void load(std::uint64_t version) {  // let the policy act under these weights, which are held
     if (loaded_ != version) policy_.load(weights_.at(version)), loaded_ = version;
