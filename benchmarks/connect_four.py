@@ -1,0 +1,88 @@
+"""Connect Four against two programs: opponents to train against, and the score of greedy policies in 200 games with each.
+
+The opponents are `benchmarks.connect_four:LookAhead` and `benchmarks.connect_four:AtRandom`. Scores:
+`python -m benchmarks.connect_four RUN ...`
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pettingzoo.classic import connect_four_v3
+
+import millrace
+
+ROWS, COLUMNS = 6, 7
+GAMES = 200  # with each program; the policy begins in every other one
+
+Array = np.ndarray[Any, Any]
+
+
+def lines_of_four() -> Array:
+    """The cells of each line of four [69, 4], as numbers row · COLUMNS + column."""
+    starts = [
+        (r, c, down, right) for r in range(ROWS) for c in range(COLUMNS) for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
+    ]
+    lines = [[(r + k * down, c + k * right) for k in range(4)] for r, c, down, right in starts]
+    return np.array(
+        [[r * COLUMNS + c for r, c in line] for line in lines if all(r < ROWS and 0 <= c < COLUMNS for r, c in line)]
+    )
+
+
+LINES = lines_of_four()
+
+
+class AtRandom:
+    """Any column that is not full."""
+
+    def act(
+        self, obs: dict[str, Array], state: Array, rng: np.random.Generator, mask: Array
+    ) -> tuple[Array, Array, dict[str, Any]]:
+        boards = zip(obs["observation"], mask, strict=True)
+        return np.array([self.column(board, np.flatnonzero(allowed), rng) for board, allowed in boards]), state, {}
+
+    def column(self, board: Array, columns: Array, rng: np.random.Generator) -> int:
+        """One of these columns, for a board [ROWS, COLUMNS, 2] with the pieces of the player and those of the other one."""
+        return int(rng.choice(columns))
+
+
+class LookAhead(AtRandom):
+    """A column that wins at once; else one that would let the other player win at once; else any."""
+
+    def column(self, board: Array, columns: Array, rng: np.random.Generator) -> int:
+        for pieces in np.moveaxis(board.astype(bool), -1, 0):
+            for column in columns:
+                after = pieces.copy()
+                after[ROWS - 1 - int(board[:, column].sum()), column] = True
+                if after.ravel()[LINES].all(1).any():
+                    return int(column)
+        return super().column(board, columns, rng)
+
+
+def score(policy: Any, program: AtRandom) -> float:
+    """The share of games that the policy wins, acting greedily; a tie is half a win."""
+    env, rng, total = connect_four_v3.env(), np.random.default_rng(1), 0.0
+    for game in range(GAMES):
+        env.reset(seed=game)
+        mine = env.agents[game % 2]
+        for agent in env.agent_iter():
+            observation, reward, terminated, truncated, _ = env.last()
+            if terminated or truncated:
+                total += (reward + 1) / 2 * (agent == mine)
+                env.step(None)
+            elif agent == mine:
+                env.step(policy(observation))
+            else:
+                allowed = np.flatnonzero(observation["action_mask"])
+                env.step(program.column(observation["observation"], allowed, rng))
+    return total / GAMES
+
+
+if __name__ == "__main__":
+    for run in sys.argv[1:]:
+        saved = millrace.load(run)
+        found = {type(program).__name__: score(saved, program) for program in (AtRandom(), LookAhead())}
+        print(Path(run).name, *(f"{name} {value:.3f}" for name, value in found.items()))
