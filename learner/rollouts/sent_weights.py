@@ -62,8 +62,8 @@ class SentWeights:
                 member.versions = _kept(member.versions, named(member.tickets))
         return orders + out
 
-    def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
-        """Those of the `named` versions that were lost on the way to this worker, as its heartbeat shows."""
+    def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Named) -> list[Outgoing]:
+        """Those that the worker's unfinished tickets name and that were lost on the way to it, as its heartbeat shows."""
         supervisor = member.shared_by
         for version, sent_at in member.versions.items():
             on_its_way = supervisor is not None and supervisor.versions.get(version, -1) >= supervisor.received
@@ -72,8 +72,8 @@ class SentWeights:
         sent = member.versions.items()
         # What it does not list was dropped or lost, unless it may still be on its way.
         held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}
-        lost = sorted(set(named) - held.keys())
-        member.versions = _kept(held | dict.fromkeys(lost, member.replies), named) if lost else held
+        lost = sorted(named(heartbeat.tickets) - held.keys())
+        member.versions = _kept(held | dict.fromkeys(lost, member.replies), named(member.tickets)) if lost else held
         return [(member.peer, self.kept[version]) for version in lost]
 
 

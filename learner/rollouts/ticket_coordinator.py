@@ -180,7 +180,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        out = self.weights.again(member, heartbeat, self._named(heartbeat.tickets))
+        out = self.weights.again(member, heartbeat, self._named)
         orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
         return out + self.weights.after(orders, self.members, self._named)
 

@@ -101,7 +101,7 @@ MUTATIONS = {
         WEIGHTS, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
     ),
     "weights that are sent again are not noted": Mutation(
-        WEIGHTS, "_kept(held | dict.fromkeys(lost, member.replies), named) if lost else held", "held"
+        WEIGHTS, "_kept(held | dict.fromkeys(lost, member.replies), named(member.tickets)) if lost else held", "held"
     ),
     "weights that a heartbeat does not list count as held": Mutation(
         WEIGHTS, "_kept(held | dict", "_kept(member.versions | dict"
