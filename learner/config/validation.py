@@ -43,7 +43,7 @@ def _converted(values: Any, kind: type[RecordT], settings: dict[str, Any], where
     for table in TABLES:
         if not isinstance(settings.get(table, {}), Mapping):
             raise UsageError(f"{where}: {table}: expected table, got {settings[table]!r:.60}".removeprefix(": "))
-        check_arguments(settings.get(table, {}), table)
+        check_arguments(settings.get(table, {}), f"{where}: {table}".removeprefix(": "))
     try:
         return msgspec.convert(values, kind)
     except (msgspec.ValidationError, UnicodeEncodeError) as error:  # the latter for a path that is no text

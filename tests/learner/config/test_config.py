@@ -191,6 +191,10 @@ def test_bad_values_are_refused_in_one_line(keywords: dict[str, Any], says: str)
         ("ppo = 3", "ppo: expected a table, [ppo], got 3"),
         ("seed = -1", "seed: expected int >= 0, got -1"),
         ("env_kwargs = 3", "env_kwargs: expected table, got 3"),
+        (
+            "[env_kwargs]\nx = [1]",
+            "env_kwargs: argument x: expected a number of at most 64 bits, text, True or False, got list [1]",
+        ),
         ("algorithm = 3", "unknown setting algorithm; did you mean algo?"),
         ("[algorithm]\ngamma = 0.9", "unknown setting algorithm; did you mean algo?"),
         ("a =", "is not TOML"),
