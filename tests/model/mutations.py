@@ -104,7 +104,7 @@ MUTATIONS = {
         WEIGHTS, "_kept(held | dict.fromkeys(lost, member.replies), named(member.tickets)) if lost else held", "held"
     ),
     "weights that a heartbeat does not list count as held": Mutation(
-        WEIGHTS, "_kept(held | dict", "_kept(member.versions | dict"
+        WEIGHTS, " if version in heartbeat.versions or at >= heartbeat.replies}", "}"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
         COORDINATOR, "out + self.weights.after(orders, self.members, self._named)", "out + orders"
