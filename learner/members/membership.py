@@ -52,7 +52,7 @@ from protocol.messages import (
 )
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
-MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
+MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by: several may be read at once
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
 MAX_MEMBERS = 4_096
 MOST_TAKEOVERS = 3  # of one name, by one live process from another
@@ -76,6 +76,31 @@ class SharingSupervisor:
     """Number of the last one that it has received: what was sent before it has arrived, or is lost."""
     versions: dict[int, int] = field(default_factory=dict)
     """Versions of the weights that were sent to it; for each, `replies` when it was sent."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast a worker steps. It counts the env steps of a rollout when that is complete, which may take minutes.
+
+    So the speed is that between the last two heartbeats with more steps, until the next one is overdue.
+    """
+
+    steps: int
+    """Env steps in the heartbeat by which it was last measured."""
+    at_s: float
+    """Time when that arrived."""
+    gained: int = 0
+    """By how many env steps these were more than when it was measured before."""
+    seconds: float = 1.0
+    """Between the two."""
+
+    def after(self, steps: int, now: float) -> Speed:
+        """As measured by a later heartbeat."""
+        return Speed(steps, now, steps - self.steps, now - self.at_s)
+
+    def steps_per_s(self, now: float) -> float:
+        """Env steps per second."""
+        return self.gained / max(self.seconds, now - self.at_s)
 
 
 @dataclass
@@ -104,11 +129,8 @@ class Member:
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
     """Seconds in each stage of the worker's process before this session."""
-    measured: tuple[int, float] = (0, 0.0)
-    """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
-    gained: tuple[int, float] = (0, 1.0)
-    """By how many env steps these were more than when it was measured before, and the seconds between the two."""
-
+    speed: Speed | None = None
+    """Measured by its heartbeats; None: there was none."""
     stepped: bool = False
     """Whether its process is known to have made an env step: it has reported one, or sent a rollout."""
     activity: WorkerActivity | None = None
@@ -161,22 +183,12 @@ class Member:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
         self.stepped |= heartbeat.steps > 0
-        steps, since_s = self.measured
-        if not since_s:
-            self.measured = heartbeat.steps, self.heard_s
-        elif heartbeat.steps != steps and self.heard_s - since_s >= MEASURE_S:  # several may be read at once
-            self.gained = heartbeat.steps - steps, self.heard_s - since_s
-            self.measured = heartbeat.steps, self.heard_s
+        if self.speed is None:
+            self.speed = Speed(heartbeat.steps, self.heard_s)
+        elif heartbeat.steps != self.speed.steps and self.heard_s - self.speed.at_s >= MEASURE_S:
+            self.speed = self.speed.after(heartbeat.steps, self.heard_s)
         held = set(heartbeat.tickets)
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
-
-    def steps_per_s(self, now: float) -> float:
-        """Env steps per second. A worker counts those of a rollout when it is complete, which may take minutes.
-
-        So it is the speed between the last two heartbeats with more steps, until the next one is overdue.
-        """
-        steps, seconds = self.gained
-        return steps / max(seconds, now - self.measured[1])
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
         """The late actions since the last heartbeat. Those before this session belong to an earlier one.
@@ -215,7 +227,7 @@ class Member:
             lanes=tuple(sorted(self.lanes)),
             tickets=len(self.tickets),
             steps=heartbeat.steps if heartbeat else 0,
-            steps_per_s=self.steps_per_s(now),
+            steps_per_s=0.0 if self.speed is None else self.speed.steps_per_s(now),
             version=-1,
             silent_s=max(0.0, now - self.heard_s),
             resident_bytes=heartbeat.resident_bytes if heartbeat else 0,

@@ -61,12 +61,10 @@ NOT_SAVED: dict[type, set[str]] = {
         "state",
         "heartbeat",
         "stages_before",
-        "gained",
-        "measured",
         "activity",
         "activity_s",
     }
-    | {"in_env_code_s", "stepped", "supervisor"},
+    | {"in_env_code_s", "speed", "stepped", "supervisor"},
     TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},

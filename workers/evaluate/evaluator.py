@@ -89,15 +89,16 @@ class EpisodesSoFar:
         self._run, self._most_steps, self._began_s = run, order.most_steps, perf_counter()
         self._lengths, self._seconds, self._facts = [0] * k, [0.0] * k, [(math.nan,) * len(run.info_keys)] * k
 
-    def add(self, n: int, rewards: Array, over: bool, facts: tuple[float, ...] | None) -> bool:
-        """A step of episode n. Returns whether it was the last one, to be followed by no other."""
-        self.returns[n] += rewards
-        self._lengths[n] += 1
-        self.cut[n] = not over and self._lengths[n] >= self._most_steps
-        if ended := over or self.cut[n]:
-            self._seconds[n] = perf_counter() - self._began_s
-            self._facts[n] = self._facts[n] if facts is None else facts
-        return ended
+    def add(self, running: Sequence[int], rewards: Array, over: Array, facts: Mapping[int, tuple[float, ...]]) -> list[int]:
+        """A step of these episodes; rewards [k, A], over [k]. Returns those of them that go on."""
+        self.returns[running] += rewards[running]
+        for n in running:
+            self._lengths[n] += 1
+            self.cut[n] = not over[n] and self._lengths[n] >= self._most_steps
+            if over[n] or self.cut[n]:
+                self._seconds[n] = perf_counter() - self._began_s
+                self._facts[n] = facts.get(n, self._facts[n])
+        return [n for n in running if not (over[n] or self.cut[n])]
 
     def episodes(self, others: OtherTeams | None) -> tuple[Episode, ...]:
         """All episodes, which have ended."""
@@ -180,14 +181,13 @@ class Evaluator:
                 return None
             step, rewards, terminated, truncated = made
             self._write(obs, running, step.leaves, t + 1, f"step {t}")
-            ended = {n for n in running if played.add(n, rewards[n], bool(terminated[n] or truncated[n]), step.facts.get(n))}
+            going_on = played.add(running, rewards, terminated | truncated, step.facts)
             for n in running if senders else ():
                 self._observe(senders[n], obs, n, copies)
                 acted = chosen.reshape(k, A, *chosen.shape[1:])[n] if self._run.seats else chosen[n]
                 senders[n].step(acted, float(rewards[n].sum()), bool(terminated[n]), bool(truncated[n]) or played.cut[n])
             self.steps += len(running)
-            t += 1
-            running = [n for n in running if n not in ended]
+            running, t = going_on, t + 1
         return Evaluated(order.session, order.ticket, played.episodes(others), tuple(played.cut))
 
     def _step(
