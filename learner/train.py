@@ -83,13 +83,13 @@ def train(
             tally.count(batch)
             files.write_images(batch)
             publish(weights)
-            with tally.after_update(time.monotonic() - began_s):
-                audience.updated(metrics | tally.ratings())
-                if tally.evaluation_is_due():
-                    files.save()  # an evaluation may take long
-                    tell(evaluations.evaluate_when_due(audience.show_now))
-                else:
-                    files.save_if_due()
+            tally.updated(time.monotonic() - began_s)
+            audience.updated(metrics | tally.ratings())
+            if tally.evaluation_is_due():
+                files.save()  # an evaluation may take long
+                tell(evaluations.evaluate_when_due(audience.show_now))
+            else:
+                files.save_if_due()
         files.save()
         tell(evaluations.end_pending(audience.show_now))
         if evaluations.conclude(audience.show_now):

@@ -11,7 +11,6 @@ does. The policy that was evaluated is kept until then.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -145,9 +144,7 @@ class Evaluations:
 
     def _end(self, watch: Callable[[], None]) -> Evaluation:
         """Wait for the evaluation that was begun."""
-        began_s = time.monotonic()
         played = self._run.hub.end_evaluation(lambda played, env_steps: watch())
-        self._tally.evaluate_s += time.monotonic() - began_s
         return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, found: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:

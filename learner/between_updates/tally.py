@@ -7,8 +7,7 @@ only a checkpoint is due by time. The seconds of evaluations are a stage of thei
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 from learner.between_updates.stop_rules import reason_to_stop
 from learner.config.config import Config
@@ -44,11 +43,9 @@ class Tally:
         """The newest evaluation as one line of text for the user."""
         self.gathered_s = 0.0
         """Seconds that callbacks and the dataset took for the rollouts of the next update."""
-        self.evaluate_s = 0.0
-        """Seconds of the evaluations that this process has made."""
         self._ended_by = ended_by
         self._config, self._steps_per_update = config, spec.rollout_steps * config.envs
-        self._stages_s = {"update": 0.0, "other": 0.0}
+        self._update_s = 0.0
         self.wall_before_s, self.steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
 
@@ -102,24 +99,20 @@ class Tally:
 
     # ---------------------------------------------------------------- seconds
 
-    @contextmanager
-    def after_update(self, update_s: float) -> Iterator[None]:
-        """Count the seconds of an update and of the body, which follows it. `update_s`: seconds since its rollouts had come.
+    def updated(self, seconds: float) -> None:
+        """An update is published, so many seconds after its rollouts came.
 
         Those that callbacks and the dataset took for the rollouts are among them, and do not count as the update's own.
         """
-        self._stages_s["update"] += update_s - self.gathered_s
-        self._stages_s["other"] += self.gathered_s
-        began_s, evaluate_s = time.monotonic(), self.evaluate_s
-        yield
-        self._stages_s["other"] += time.monotonic() - began_s - (self.evaluate_s - evaluate_s)
+        self._update_s += seconds - self.gathered_s
 
     def stages(self, snapshot: HubSnapshot) -> dict[str, float]:
         """Seconds in each stage: of the learner, and of all workers together, from their last heartbeats."""
-        stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self._stages_s.items()}
+        other_s = snapshot.learn_s - self._update_s
+        stages = {"learner_wait": snapshot.wait_s, "learner_update": self._update_s, "learner_other": other_s}
         stages |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}
         return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
     def wall_s(self, snapshot: HubSnapshot) -> float:
         """Seconds of training."""
-        return self.wall_before_s + time.monotonic() - self._started_s - snapshot.evaluate_s
+        return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s

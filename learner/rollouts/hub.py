@@ -67,6 +67,8 @@ class HubSettings:
 class HubSnapshot(NamedTuple):
     """State of the hub at one moment, for metrics, checkpoints and status. Cheap to make."""
 
+    taken_s: float
+    """That moment, by the hub's clock."""
     progress: Progress
     """Progress as of the last update."""
     version: int
@@ -83,6 +85,8 @@ class HubSnapshot(NamedTuple):
     """Seconds spent waiting for rollouts since this learner started."""
     evaluate_s: float
     """Seconds spent in evaluations since this learner started."""
+    learn_s: float
+    """Seconds in which it did neither, since it first waited for rollouts."""
     waiting: str
     """Who waits for whom, in one line for people; empty if nobody waits long."""
     members: tuple[CollectingMember, ...]
@@ -286,6 +290,7 @@ class Hub:
         link, coordinator, now = self.link, self.coordinator, self._clock()
         spent_s = self._time.until(now)
         return HubSnapshot(
+            taken_s=now,
             progress=self._progress,
             version=coordinator.version,
             ledger=coordinator.rollouts.ledger.copy(),
@@ -294,6 +299,7 @@ class Hub:
             lag_counts=dict(self.weight_age.lags),
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],
+            learn_s=spent_s["learning"],
             waiting=self.waiting(now),
             members=tuple(coordinator.members.values()),
             worker_stages=coordinator.membership.stages(),
