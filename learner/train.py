@@ -64,7 +64,7 @@ def train(
     try:
         hub.wait_for(workers)
         audience.start()
-        tell(evaluations.begin_again(audience.show_now))
+        tell(evaluations.begin_again(audience.env_attributes(), audience.show_now))
         publish(files.weights())
         if tally.evaluation_is_due():  # the run was interrupted before it
             tell(evaluations.evaluate_when_due(audience.show_now))

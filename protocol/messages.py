@@ -135,6 +135,9 @@ class Collect(Message, frozen=True):
     permits: Annotated[tuple[Permit, ...], Meta(max_length=MAX_TICKETS)]
     received: tuple[Received, ...]
     """one entry for each lane of this worker; a lane that is not listed belongs to another worker"""
+    keep: Versions
+    """the weights that the learner counts as held from now on, ascending: drop all others, except those that unfinished
+    tickets name"""
 
     @property
     def versions(self) -> set[int]:
@@ -164,7 +167,7 @@ class Heartbeat(Message, frozen=True):
     replies: Natural
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost"""
     versions: Versions
-    """of the weights held, ascending: the newest that has come, and those that unfinished tickets name"""
+    """of the weights held, ascending"""
     tickets: Tickets
     """tickets that are held and not finished: those that wait, and those of the work in progress"""
     steps: Natural
@@ -241,6 +244,8 @@ class Evaluate(Message, frozen=True):
     """with `RunSpec.teams`: who plays the other teams, as in a `Permit`, one for each seed"""
     teams: Annotated[tuple[Natural, ...], Meta(max_length=MAX_SEEDS)] = ()
     """the team that the weights play, one for each of `opponents`"""
+    keep: Versions = ()
+    """as in `Collect`"""
 
     @property
     def versions(self) -> set[int]:
@@ -392,7 +397,7 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     steps: int
     """env steps since the worker started"""
     steps_per_s: float
-    """env steps per second between its last two heartbeats"""
+    """env steps per second between its last two heartbeats with more steps, until the next one is overdue"""
     version: int
     """version of the newest weights that it is known to hold; -1 before the first"""
     silent_s: float

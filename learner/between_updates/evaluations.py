@@ -19,7 +19,7 @@ from learner.config.evaluation_size import EvaluationSize, evaluation_size, fina
 from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.progress import Row
 from learner.run_folder.results import EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
-from protocol.arrays import Floats
+from protocol.arrays import Array, Floats
 from protocol.logs.notices import log_notice
 from protocol.random_streams import Purpose
 
@@ -37,14 +37,16 @@ class Evaluations:
         self._tally, self._state = run.tally, run.tally.state
         self.write_best()  # the folder may have that of a later version, which was lost
 
-    def begin_again(self, watch: Callable[[], None]) -> Row | None:
+    def begin_again(self, env_attributes: Array | None, watch: Callable[[], None]) -> Row | None:
         """Begin the evaluation again that was beside training when the run was interrupted: its weights are published.
 
-        Without `eval_workers`, as the run may be resumed, it is also ended here. Returns its metrics then.
+        Without `eval_workers`, as the run may be resumed, it is also ended here. Returns its metrics then. `env_attributes`:
+        those of the newest weights, which may be the same, and are sent once.
         """
         if (pending := self._state.pending) is None:
             return None
-        self._run.hub.publish(pending.version, *self._state.pending_policy, deal=False)
+        attributes = env_attributes if pending.version == self._state.version else None
+        self._run.hub.publish(pending.version, *self._state.pending_policy, deal=False, env_attributes=attributes)
         self._begin_beside()
         return None if self._config.eval_workers else self.end_pending(watch)
 

@@ -113,7 +113,7 @@ class RolloutDealer:
                 for each in chosen
                 if each.version == version
             )
-            out.append((member.peer, Collect(member.session, version, permits, self.received(member))))
+            out.append((member.peer, Collect(member.session, version, permits, self.received(member), keep=())))
         return out
 
     def versions(self, tickets: Iterable[int]) -> set[int]:

@@ -1,9 +1,9 @@
 """The weights that orders name, and which workers hold them. Pure.
 
 Rule: weights are kept while they are the newest, act in a round that is open, or are evaluated. They are sent to a worker
-after the first order that names them, and again if its Heartbeat shows that they were lost on the way. When weights come to
-a worker, it keeps the newest and those that its tickets name. It drops none when a ticket ends, because an order that is on
-its way may name the same weights, and would have to wait for a Heartbeat.
+after the first order that names them, and again if its Heartbeat shows that they were lost on the way. A worker drops none
+by itself: every order lists those that it is to keep, which are those that its outstanding tickets name. So the learner
+knows which the worker holds, whatever is on its way between them.
 
 Where a supervisor shares weights among its workers, it gets them once, in place of the first of its workers that needs
 them. For all of these they are on the way until the supervisor's word shows that they have reached it, or are lost. From
@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
+
+import msgspec
 
 from learner.members.membership import Outgoing
 from learner.rollouts.collecting_member import CollectingMember
@@ -39,28 +41,29 @@ class SentWeights:
         self.kept[weights.version] = weights
 
     def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember], named: Named) -> list[Outgoing]:
-        """These messages; after all of them, the weights of the versions that they name and their workers do not hold.
-
-        When weights come, a worker drops those that no order names: so the orders come first.
-        """
-        orders, out = list(orders), list[Outgoing]()
+        """These messages; after all of them, the weights of the versions that they name and their workers do not hold."""
+        out, weights = list[Outgoing](), list[Outgoing]()
         for peer, message in orders:
-            member = members[peer]
-            if not isinstance(message, Collect | Evaluate):
-                continue
-            acting = message.version
-            for version in sorted(message.versions - member.versions.keys()):
-                # Opponents differ from worker to worker, so their weights are not shared.
-                supervisor = member.shared_by if version == acting else None
-                if supervisor is None:
-                    out.append((peer, self.kept[version]))
-                elif version not in supervisor.versions:
-                    out.append((supervisor.peer, self.kept[version]))
-                    last = list(supervisor.versions.items())[1 - SHARED_VERSIONS :]
-                    supervisor.versions = {**dict(last), version: supervisor.replies}
-                member.versions[version] = member.replies if supervisor is None else TO_SUPERVISOR
-                member.versions = _kept(member.versions, named(member.tickets))
-        return orders + out
+            if isinstance(message, Collect | Evaluate):
+                member, keep = members[peer], named(members[peer].tickets)
+                for version in sorted(message.versions - member.versions.keys()):
+                    weights += self._sent(member, version, acts=version == message.version)
+                member.versions = {version: sent_at for version, sent_at in member.versions.items() if version in keep}
+                message = msgspec.structs.replace(message, keep=tuple(sorted(keep)))
+            out.append((peer, message))
+        return out + weights
+
+    def _sent(self, member: CollectingMember, version: int, *, acts: bool) -> list[Outgoing]:
+        """What gives the worker these weights. Opponents differ from worker to worker, so theirs are not shared."""
+        supervisor = member.shared_by if acts else None
+        member.versions[version] = member.replies if supervisor is None else TO_SUPERVISOR
+        if supervisor is None:
+            return [(member.peer, self.kept[version])]
+        if version in supervisor.versions:
+            return []
+        last = list(supervisor.versions.items())[1 - SHARED_VERSIONS :]
+        supervisor.versions = {**dict(last), version: supervisor.replies}
+        return [(supervisor.peer, self.kept[version])]
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Named) -> list[Outgoing]:
         """Those that the worker's unfinished tickets name and that were lost on the way to it, as its heartbeat shows."""
@@ -73,11 +76,5 @@ class SentWeights:
         # What it does not list was dropped or lost, unless it may still be on its way.
         held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}
         lost = sorted(named(heartbeat.tickets) - held.keys())
-        member.versions = _kept(held | dict.fromkeys(lost, member.replies), named(member.tickets)) if lost else held
+        member.versions = held | dict.fromkeys(lost, member.replies)
         return [(member.peer, self.kept[version]) for version in lost]
-
-
-def _kept(versions: Mapping[int, int], named: Collection[int]) -> dict[int, int]:
-    """Of these versions, those that a worker keeps when one of them comes."""
-    kept = {*named, max(versions)}
-    return {version: sent_at for version, sent_at in versions.items() if version in kept}

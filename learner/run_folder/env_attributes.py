@@ -64,10 +64,11 @@ class EnvAttributes:
         self.changes += 1
 
     def table(self, version: int) -> Array | None:
-        """What the weights of this version carry; None if there are no attributes."""
-        self._sent, self._version = pack(self._next) if self._next else b"", version
-        if self._after is not None:
-            self._next, self._after = self._after, None
+        """What the weights of this version carry, however often it is asked; None if there are no attributes."""
+        if version != self._version:
+            self._sent, self._version = pack(self._next) if self._next else b"", version
+            if self._after is not None:
+                self._next, self._after = self._after, None
         return np.frombuffer(self._sent, np.uint8) if self._sent else None
 
     def state(self, version: int) -> AttributesState:

@@ -6,7 +6,7 @@ Each function is one check (`script.py`). The watch recomputes what it can of ev
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -91,18 +91,20 @@ class Collecting:
         self._sequences[lane, incarnation] += 1
         return Permit(next(self.learner.tickets), lane, incarnation, sequence)
 
-    def order(self, *permits: Permit, version: int = 1) -> None:
-        """Send a Collect, without the weights that it names."""
-        self.learner.send(Collect(self.learner.session, version, permits, self.learner.watch.received()))
+    def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
+        """Send a Collect, without the weights that it names. `keep`: versions to hold although no ticket names them."""
+        watch = self.learner.watch
+        kept = tuple(sorted({version, *keep, *watch.outstanding_versions()}))
+        self.learner.send(Collect(self.learner.session, version, permits, watch.received(), kept))
 
     def give(self, weights: Weights) -> None:
         """Send these weights, unless their version was sent in this session."""
         if weights.version not in self.learner.watch.versions:
             self.learner.send(weights)
 
-    def deal(self, *permits: Permit, version: int = 1) -> None:
+    def deal(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
         """Send a Collect, and then the weights that it names."""
-        self.order(*permits, version=version)
+        self.order(*permits, version=version, keep=keep)
         self.give(self.weights(version))
 
     @property
@@ -124,10 +126,10 @@ class Collecting:
         within_s = 2 * self.learner.settings.patience_s
         return (yield from self.learner.expect(Rollout, rule, text, within_s=within_s, ticket=permit.ticket))
 
-    def collect(self, permit: Permit | None = None, version: int = 1) -> Script[Rollout]:
+    def collect(self, permit: Permit | None = None, version: int = 1, keep: Iterable[int] = ()) -> Script[Rollout]:
         """Deal one permit, or the next of lane 0, and wait for its rollout."""
         permit = permit or self.permit()
-        self.deal(permit, version=version)
+        self.deal(permit, version=version, keep=keep)
         return (yield from self.rollout(permit))
 
     def nothing_of(self, permit: Permit, rule: Rule, whose: str) -> Script[None]:
@@ -383,14 +385,16 @@ def lists_what_it_holds(learner: Learner) -> Script[None]:
     yield from heartbeats(learner, 4)
 
 
-def drops_weights(learner: Learner) -> Script[None]:
-    """Rollouts under one version after the other; at last nothing is asked for."""
+def keeps_listed_weights(learner: Learner) -> Script[None]:
+    """Rollouts under one version after the other. The second order lists the first version too, the third does not."""
     session = yield from collecting(learner)
-    for version in (1, 2, 3):
-        yield from session.collect(version=version)
-    beat = yield from heartbeats(learner, 2)
-    if beat.versions != (3,):
-        raise Broken(rules.HOLDS_WEIGHTS, "version 3 only, the newest: no ticket is left", f"{list(beat.versions)}")
+    yield from session.collect(version=1)
+    for version, kept in ((2, (1, 2)), (3, (3,))):
+        yield from session.collect(version=version, keep=kept)
+        beat = yield from heartbeats(learner, 2)
+        if beat.versions != kept:
+            expected = f"{list(kept)}, which the last order listed: no ticket is left"
+            raise Broken(rules.HOLDS_WEIGHTS, expected, f"{list(beat.versions)}")
 
 
 def keeps_its_weights(learner: Learner) -> Script[None]:
@@ -582,7 +586,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     yield from session.collect()
     permit = session.permit()
-    head = msgpack.unpackb(bytes(encode(Collect(learner.session, 1, (permit,), learner.watch.received()))[0]))
+    head = msgpack.unpackb(bytes(encode(Collect(learner.session, 1, (permit,), learner.watch.received(), (1,)))[0]))
     learner.send_unreadable(
         permit.ticket,
         [msgpack.packb([*head, "one field too many"])],
@@ -590,7 +594,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
         [encode(session.weights(9))[0]],
     )
     of_other = replace(permit, ticket=next(learner.tickets))
-    learner.send(Collect(learner.session + 1000, 1, (of_other,), ()))
+    learner.send(Collect(learner.session + 1000, 1, (of_other,), (), (1,)))
     text = "no rollout for a Collect with a field too many or too few, or of another session"
     yield from learner.quiet(Rollout, rules.IGNORE_UNREADABLE, text)
     yield from session.collect(replace(permit, ticket=next(learner.tickets)))
@@ -696,7 +700,9 @@ def _evaluation(
     send_rows: bool = False,
     seeds: tuple[int, ...] = (1, 2),
 ) -> Evaluate:
-    return Evaluate(learner.session, next(learner.tickets), version, seeds, greedy, most_steps, send_rows, False)
+    kept = tuple(sorted({version, *learner.watch.outstanding_versions()}))
+    ticket = next(learner.tickets)
+    return Evaluate(learner.session, ticket, version, seeds, greedy, most_steps, send_rows, False, keep=kept)
 
 
 def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated]:

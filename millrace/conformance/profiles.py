@@ -67,7 +67,7 @@ COLLECTING = [
     Check("holds two versions at once", collect_checks.holds_two_versions),
     Check("collects the rollouts of a lane in their order", collect_checks.collects_in_order),
     Check("lists the versions and tickets that it holds", collect_checks.lists_what_it_holds),
-    Check("drops weights that no order names any more", collect_checks.drops_weights),
+    Check("keeps the weights that orders list, and no others", collect_checks.keeps_listed_weights),
     Check("takes weights rounded to 16 bits", collect_checks.takes_rounded_weights),
     Check("acts by relu, and by normalized observations, or declines", collect_checks.acts_as_its_policy_says),
     Check("sets attributes of its environments", collect_checks.sets_attributes),

@@ -179,7 +179,7 @@ HEARTBEAT_STEPS = Rule(
 )
 HEARTBEAT_VERSIONS = Rule(
     "Heartbeat",
-    "of the weights held, ascending: the newest that has come, and those that unfinished tickets name",
+    "of the weights held, ascending",
     "list the version of every Weights that is held, and drop all weights when a session ends",
 )
 DESCRIBE = Rule(
@@ -339,10 +339,10 @@ VERSION = Rule(
 )
 HOLDS_WEIGHTS = Rule(
     "The worker's half",
-    "The worker holds the newest weights that have come, and those that an unfinished ticket names, also as an opponent's, "
-    "whether of a rollout or of an evaluation. It drops all others when weights come",
-    "keep weights in a map by version; when weights come, drop those that are neither the newest nor named by a ticket "
-    "that is left",
+    "The worker holds the weights that have come until an order comes. Then it drops those that neither `keep` of this "
+    "order lists nor an unfinished ticket names, also as an opponent's, whether of a rollout or of an evaluation",
+    "keep weights in a map by version; when a Collect or an Evaluate comes, take its tickets, then drop the weights that "
+    "neither its `keep` lists nor a ticket that is left names",
 )
 ROWS = Rule(
     "Collector profile",

@@ -101,6 +101,13 @@ class WatchedSession:
         self.steps = steps
         """the most that a Heartbeat has reported"""
 
+    def outstanding_versions(self) -> set[int]:
+        """The versions that tickets without an answer name."""
+        of_permits = {ticket: dealt.version for ticket, dealt in self.permits.items()}
+        of_orders = {ticket: order.version for ticket, order in self.orders.items() if isinstance(order, Evaluate)}
+        answered = self.answers.keys() | self._results.keys()
+        return {version for ticket, version in (of_permits | of_orders).items() if ticket not in answered}
+
     # ------------------------------------------------------------------------------------------ what the learner says
 
     def sent(self, message: ToWorker) -> None:
@@ -224,9 +231,6 @@ class WatchedSession:
         if list(message.versions) != sorted(self.versions.keys() & message.versions):
             sent = f"those sent: {sorted(self.versions)}" if self.versions else "none: no weights were sent in this session"
             raise Broken(rules.HEARTBEAT_VERSIONS, f"versions in ascending order, of {sent}", f"{list(message.versions)}")
-        if before is not None and before.versions and max(before.versions) > max(message.versions, default=-1):
-            expected = f"version {max(before.versions)}, as before, or a newer one"
-            raise Broken(rules.HOLDS_WEIGHTS, expected, f"{list(message.versions)}")
         self._see_tickets(message.tickets)
         self._see_if_all_are_listed(message)
 

@@ -323,9 +323,15 @@ MUTANTS = [
     ),
     Mutant(
         "keeps all weights", "rollouts.hpp",
-        "return version == weights_.rbegin()->first;",
+        "return std::find(m.keep.begin(), m.keep.end(), version) != m.keep.end();",
         "return version > 0;",
-        "collector", "drops weights", rules.HOLDS_WEIGHTS, "[1, 2, 3]",
+        "collector", "keeps the weights", rules.HOLDS_WEIGHTS, "[1, 2, 3]",
+    ),
+    Mutant(
+        "keeps only what its tickets name", "rollouts.hpp",
+        "return std::find(m.keep.begin(), m.keep.end(), version) != m.keep.end();",
+        "return false;",
+        "collector", "keeps the weights", rules.HOLDS_WEIGHTS, "[2]",
     ),
     Mutant(
         "other weights in the middle of a rollout", "rollouts.hpp",

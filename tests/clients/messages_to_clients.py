@@ -55,7 +55,7 @@ def messages(lanes: int) -> list[ToWorker]:
         HeartbeatReply(SESSION, 1, FEW),
         Rejoin(SESSION),
         Welcome(SESSION, 2, RunSpec(CARTPOLE, POLICY, rollout_steps=64, copies=lanes, lanes=lanes, seed=1)),
-        Collect(SESSION, 3, (Permit(10, 0, 0, 0), Permit(11, 1, 1, 0))[:lanes], FEW[:lanes]),
+        Collect(SESSION, 3, (Permit(10, 0, 0, 0), Permit(11, 1, 1, 0))[:lanes], FEW[:lanes], (3,)),
         Weights(3, weights, np.zeros(0, np.float32)),
         Evaluate(SESSION, 12, 4, (1, 2), True, 30, False, False),
         Weights(4, to_wire_dtype(weights, "bfloat16"), np.zeros(0, np.float32)),

@@ -236,6 +236,8 @@ class Mutant(WorkerLink):
                 return [replace(message, version=each) for each in range(1, 1 + version)]
             case _, Weights(version):
                 self.versions.add(version)
+            case "keeps only what its tickets name", Collect():
+                return [replace(message, keep=())]
             case "order of arrival", Collect():
                 begin, self.arrived = self.arrived, self.arrived + len(message.permits)
                 permits = [replace(each, sequence=n) for n, each in enumerate(message.permits, begin)]

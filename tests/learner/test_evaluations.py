@@ -34,6 +34,8 @@ class Fakes:
         self.evaluated = 0
         self.published: list[int] = []
         """The versions of weights that were published for an evaluation."""
+        self.attributes: list[list[int] | None] = []
+        """The attributes of environments that they had."""
         self.seeds: list[tuple[int, ...]] = []
         """The seeds of each evaluation."""
         self.writes = Writes()
@@ -50,8 +52,9 @@ class Fakes:
     def end_evaluation(self, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
         return [PlayedEpisode(Episode(next(self.returns), 1, 0.0), cut=False)] * len(self.seeds[-1])
 
-    def publish(self, version: int, *weights: Any, deal: bool) -> None:
+    def publish(self, version: int, *weights: Any, deal: bool, env_attributes: Any = None) -> None:
         self.published.append(version)
+        self.attributes.append(None if env_attributes is None else env_attributes.tolist())
 
     def write_policy(self, run: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
@@ -147,13 +150,24 @@ def test_the_last_policy_is_not_evaluated_twice() -> None:
     assert (state.newest_evaluation is not None, fakes.evaluated) == (True, 2), "once, and once as the best"
 
 
+@pytest.mark.parametrize(("pending", "expected"), [(5, [1, 2]), (3, None)])
+def test_weights_that_are_evaluated_again_have_the_attributes_of_their_version(pending: int, expected: Any) -> None:
+    """Workers take weights of one version once: those that training publishes after it are the same."""
+    policy = np.array([7], np.float32), np.zeros(0, np.float32)
+    state = RunState(version=5, env_steps=150, pending=EvaluatedPolicy(pending, 100), pending_policy=policy)
+    fakes = Fakes(3.0)
+    _, evaluations = fakes.evaluations(100, state, eval_workers=1)
+    evaluations.begin_again(np.array([1, 2], np.uint8), lambda: None)
+    assert fakes.attributes == [expected]
+
+
 @pytest.mark.parametrize("eval_workers", [0, 1])
 def test_an_evaluation_begins_again_when_the_run_is_resumed(eval_workers: int) -> None:
     policy = np.array([7], np.float32), np.zeros(0, np.float32)
     state = RunState(version=5, env_steps=150, next_evaluation=200, pending=EvaluatedPolicy(3, 100), pending_policy=policy)
     fakes = Fakes(3.0, 4.0)
     tally, evaluations = fakes.evaluations(100, state, eval_workers=eval_workers)
-    metrics = evaluations.begin_again(lambda: None)
+    metrics = evaluations.begin_again(None, lambda: None)
     assert fakes.published == [3]
     assert (metrics is None) == bool(eval_workers), "without workers that only evaluate, it is awaited at once"
     if metrics is None:

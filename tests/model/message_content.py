@@ -104,17 +104,17 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
             return "Rejoin", session(number)
         case Weights(version):
             return "Weights", version
-        case Collect(number, version, permits, received):
+        case Collect(number, version, permits, received, keep):
             permitted = tuple(
                 (ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation), p.sequence, p.opponent) for p in permits
             )
-            return "Collect", session(number), version, permitted, _received(received)
+            return "Collect", session(number), version, permitted, _received(received), keep
         case Release(number, lanes):
             return "Release", session(number), tuple((each.lane, incarnation(each.lane, each.incarnation)) for each in lanes)
         case HeartbeatReply(number, replies, received):
             return "HeartbeatReply", session(number), name(Kind.REPLIES, replies, number), _received(received)
         case Evaluate(number, each, version, seeds, _, _, with_rows):
-            return "Evaluate", session(number), ticket(each), version, seeds, with_rows
+            return "Evaluate", session(number), ticket(each), version, seeds, with_rows, message.keep
         case EpisodeRows(number, each, episode, step):
             return "EpisodeRows", session(number), ticket(each), episode, step
         case Evaluated(number, each, episodes):
@@ -141,15 +141,15 @@ def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
             return Rejoin(number.value)
         case "Weights", version:
             return weights(version)
-        case "Collect", number, version, permits, received:
+        case "Collect", number, version, permits, received, keep:
             allowed = tuple(Permit(each.value, lane, inc.value, *more) for each, lane, inc, *more in permits)
-            return Collect(number.value, version, allowed, _received_of(received))
+            return Collect(number.value, version, allowed, _received_of(received), keep)
         case "Release", number, lanes:
             return Release(number.value, tuple(LaneIncarnation(lane, inc.value) for lane, inc in lanes))
         case "HeartbeatReply", number, replies, received:
             return HeartbeatReply(number.value, replies.value, _received_of(received))
-        case "Evaluate", number, each, version, seeds, with_rows:
-            return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False)
+        case "Evaluate", number, each, version, seeds, with_rows, keep:
+            return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False, keep=keep)
         case "EpisodeRows", number, each, episode, step:
             return fake_rows(number.value, each.value, episode, step)
         case "Evaluated", number, each, returns:

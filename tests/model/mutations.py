@@ -100,9 +100,7 @@ MUTATIONS = {
     "weights that may be under way are sent again": Mutation(
         WEIGHTS, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
     ),
-    "weights that are sent again are not noted": Mutation(
-        WEIGHTS, "_kept(held | dict.fromkeys(lost, member.replies), named(member.tickets)) if lost else held", "held"
-    ),
+    "weights that are sent again are not noted": Mutation(WEIGHTS, "held | dict.fromkeys(lost, member.replies)", "held"),
     "weights that a heartbeat does not list count as held": Mutation(
         WEIGHTS, " if version in heartbeat.versions or at >= heartbeat.replies}", "}"
     ),
@@ -113,11 +111,11 @@ MUTATIONS = {
     "weights are sent with every order": Mutation(
         WEIGHTS, "sorted(message.versions - member.versions.keys())", "sorted(message.versions)"
     ),
-    "weights are sent before the order that names them": Mutation(WEIGHTS, "return orders + out", "return out + orders"),
+    "weights are sent before the order that names them": Mutation(WEIGHTS, "return out + weights", "return weights + out"),
     "the newest weights are sent to whoever holds a ticket": Mutation(
         WEIGHTS,
-        "out.append((peer, self.kept[version]))",
-        "out.append((peer, self.kept[max(self.kept)]))",
+        "return [(member.peer, self.kept[version])]\n        if",
+        "return [(member.peer, self.kept[max(self.kept)])]\n        if",
     ),
     "the learner keeps only the newest weights": Mutation(WEIGHTS, "if acts(version)}", "if False}"),
     "the learner keeps all weights": Mutation(WEIGHTS, "if acts(version)}", "if True}"),
@@ -149,16 +147,25 @@ MUTATIONS = {
         "RolloutTask(session, self.weights[version], assignments, ",
         "RolloutTask(session, self.weights[max(self.weights)], assignments, ",
     ),
-    "a worker drops weights that a ticket names": Mutation(SESSION, "asked = {*self.rollouts.versions(), ", "asked = {"),
+    "a worker drops weights that a ticket names": Mutation(SESSION, "*self.rollouts.versions(), ", ""),
+    "a worker drops weights when a lane closes": Mutation(
+        SESSION,
+        "return [CloseLanes(released)] if released else []",
+        "self.keep_weights(())\n        return [CloseLanes(released)] if released else []",
+    ),
+    "a worker drops weights when newer ones come": Mutation(
+        SESSION,
+        "current.weights.setdefault(version, message)",
+        "current.weights.setdefault(version, message), current.keep_weights([max(current.weights)])",
+    ),
     "a worker drops weights when a ticket ends": Mutation(
         SESSION,
         "        current.in_progress = False\n        return [*map",
-        "        current.drop_weights()\n        current.in_progress = False\n        return [*map",
+        "        current.keep_weights(())\n        current.in_progress = False\n        return [*map",
     ),
-    "a worker drops the newest weights": Mutation(SESSION, ", max(self.weights, default=-1)}", "}"),
     "a worker keeps all weights": Mutation(
         SESSION,
-        "for version, weights in self.weights.items() if version in asked}",
+        "for version, weights in self.weights.items() if version in kept}",
         "for version, weights in self.weights.items()}",
     ),
     "new weights replace all others": Mutation(
@@ -190,6 +197,7 @@ MUTATIONS = {
         "return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}",
         "return {asked.version for lane in self._lanes.values() for asked in lane.asked.values()}",
     ),
+    "an order does not list the weights that its worker keeps": Mutation(WEIGHTS, "keep=tuple(sorted(keep))", "keep=()"),
     "only the weights that act are sent after an order": Mutation(
         WEIGHTS, "sorted(message.versions -", "sorted({message.version} -"
     ),
@@ -274,6 +282,7 @@ def runs() -> list[Conversation]:
         Training(workers=2, lanes=1, updates=1, faults=1),
         Training(workers=1, lanes=1, updates=2, faults=1, max_lag=1),
         Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
+        Training(workers=2, lanes=2, updates=5, faults=0, max_lag=1, opponents=3),
         Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1),
         Training(workers=2, lanes=2, updates=2, faults=1, max_lag=1, only=("repeat down",)),
         Training(workers=1, lanes=1, updates=2, faults=3, only=("repeat down", "freeze")),

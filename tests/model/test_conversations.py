@@ -25,6 +25,7 @@ from tests.model.vector_env.stepping import Stepping
 
 LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_evaluation, of_vector_env)}
 SMALL: list[Conversation] = [
+    Training(workers=2, lanes=2, updates=5, faults=0, opponents=3),
     Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
     Evaluating(workers=1, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
@@ -42,6 +43,7 @@ LARGE: list[Conversation] = [
     Training(workers=1, lanes=1, updates=3, faults=2, max_lag=1),
     Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
     Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("drop up", "drop down")),
+    Training(workers=2, lanes=2, updates=5, faults=0, max_lag=1, opponents=3),
     Training(workers=1, lanes=1, updates=3, faults=2, opponents=3),
     Training(workers=2, lanes=1, updates=3, faults=1, max_lag=1, opponents=2),
     Training(workers=1, lanes=2, updates=4, faults=1, max_lag=1, opponents=2),
@@ -64,7 +66,7 @@ LARGE: list[Conversation] = [
 
 
 @pytest.mark.parametrize("run", SMALL, ids=str)
-def test_one_worker_one_fault_of_any_kind(run: Conversation) -> None:
+def test_small_runs_with_at_most_one_fault_of_any_kind(run: Conversation) -> None:
     report = explore(run)
     assert report.complete
     assert report.states > 1_000, f"the model has lost most of its states: {report}"

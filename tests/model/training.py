@@ -66,7 +66,7 @@ def learner_event(learner: L, event: Event, message: Content | None, now: float)
 class Sent:
     """Rule: weights are sent after an order that names them, and again only if a Heartbeat shows that they were lost.
 
-    When weights come, a worker drops those that are neither the newest nor named by its tickets. So count these.
+    Nothing is lost without faults. Then no order waits for weights that the learner takes to be held.
     """
 
     def __init__(self, learner: Learner, heard: Any) -> None:
@@ -85,6 +85,9 @@ class Sent:
         out = list(out)
         for peer, message in out:
             if isinstance(message, Collect | Evaluate):
+                assert set(message.keep) == after.coordinator.members[peer].versions.keys(), (
+                    "an order lists other weights than count as held"
+                )
                 versions = {message.version}
                 for each in message.permits if isinstance(message, Collect) else ():
                     opponent = after.coordinator.rollouts.held[each.ticket].opponent
@@ -97,6 +100,7 @@ class Sent:
                 which = member.session, message.version
                 assert which in named, "weights are sent that no order has named"
                 if which in sent_at:
+                    assert after.settings.faults, "an order waits for weights although nothing was lost"
                     shown = isinstance(self._heard, Heartbeat) and message.version not in self._heard.versions
                     assert shown, "weights are sent again although they were not lost"
                     assert sent_at[which] < self._heard.replies, "weights are sent again although they may be under way"
@@ -104,9 +108,6 @@ class Sent:
                 assert sent_at[which] >= member.replies - isinstance(self._heard, Heartbeat), (
                     "weights are sent and not noted"
                 )
-        for member in [after.coordinator.members[peer] for peer, message in out if isinstance(message, Weights)]:
-            kept = {*(version for each, version in after.named() if each is member), max(member.versions)}
-            assert kept.issuperset(member.versions), "weights that a worker drops count as held"
         heard = self._heard
         for member in after.coordinator.members.values():
             if isinstance(heard, Heartbeat) and member.session == heard.session:

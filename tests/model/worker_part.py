@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeVar
 
-from protocol.messages import HeartbeatReply, ToLearner, ToWorker, Weights
+from protocol.messages import Collect, Evaluate, HeartbeatReply, ToLearner, ToWorker
 from tests.model import process_part
 from tests.model.conversation import Content
 from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
@@ -57,11 +57,9 @@ class Worker(Process):
         held = self.session._current
         replies, before = held.replies, set(held.weights)
         effects = self.session.handle(message, now)
-        assert (before & _needed(held, before)).issubset(held.weights), "a worker drops weights that it needs"
-        if isinstance(message, Weights):
-            assert _needed(held, before).issuperset(held.weights), (
-                "a worker keeps other weights than the newest and those named"
-            )
+        assert (before & _asked(held)).issubset(held.weights), "a worker drops weights that its tickets name"
+        if isinstance(message, Collect | Evaluate) and message.session == self.session.session:
+            assert {*message.keep, *_asked(held)}.issuperset(held.weights), "a worker keeps weights that no order lists"
         if isinstance(message, HeartbeatReply) and held.replies > replies:
             listed = {each.lane for each in message.received}
             assert all(lane.lane in listed for lane in held.lanes()), "a worker keeps a lane that is not its own"
@@ -75,7 +73,7 @@ class Worker(Process):
         held = self.session._current
         before = set(held.weights)
         effects = self.session.work_ended(answers)
-        assert set(held.weights) == before, "weights that an order on its way may name are dropped when a ticket ends"
+        assert set(held.weights) == before, "a worker drops weights when a ticket ends"
         return self.turn(effects, now)
 
     def _begin(self, work: RolloutTask | EvaluationTask) -> list[ToLearner]:
@@ -154,12 +152,12 @@ def only_evaluates(content: Content) -> bool:
     return bool(content[1][2])
 
 
-def _needed(held: _SessionState, before: set[int]) -> set[int]:
-    """The versions that a worker needs: the newest that has come, and those that unfinished tickets name."""
+def _asked(held: _SessionState) -> set[int]:
+    """The versions that unfinished tickets name."""
     asked = [each for lane in held.rollouts._lanes.values() for each in lane.asked.values()]
     rollouts = {version for each in asked for version in _versions(each)}
     evaluations = {order.version for order in held.evaluations.asked.values()}
-    return rollouts | evaluations | {max({*before, *held.weights}, default=-1)}
+    return rollouts | evaluations
 
 
 def _versions(asked: Permitted) -> set[int]:

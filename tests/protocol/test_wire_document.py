@@ -58,7 +58,7 @@ RECORDS: tuple[type, ...] = (
 )
 EXAMPLES = (
     Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 78),
-    Collect(1234605616436508, 3, (Permit(40, 0, 1, 11),), (Received(0, 1, 9, (10,)),)),
+    Collect(1234605616436508, 3, (Permit(40, 0, 1, 11),), (Received(0, 1, 9, (10,)),), (2, 3)),
     Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32)),
 )
 # Fields that mean the same wherever they stand, or whose name says it all: used where the code adds nothing to the name.

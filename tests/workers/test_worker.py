@@ -106,7 +106,7 @@ BUFFERS = np.ones(buffer_size(RUN.policy), np.float32)
 def said_to_a_worker(run: RunSpec, parameters: Array = PARAMETERS) -> list[ToWorker]:
     """To join, collect one rollout and leave."""
     permits, received = (Permit(0, 0, 0, 0),), (Received(0, 0, 0),)
-    return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received), Drain("done")]
+    return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received, ()), Drain("done")]
 
 
 class Watching(FakeLink):
@@ -251,7 +251,7 @@ def test_each_rollout_of_a_worker_acts_under_the_weights_that_its_order_names() 
     parameters = PARAMETERS, -PARAMETERS
     link = DrainsAfterTwo([Welcome(1, 1, RUN)])
     for version, each in enumerate(parameters):
-        order = Collect(1, version, (Permit(version, version, 0, 0),), received)
+        order = Collect(1, version, (Permit(version, version, 0, 0),), received, ())
         link.messages += [Weights(version, each, BUFFERS), order]
     assert work(link).exit_code == 0
     rollouts = [message for message in link.heard() if isinstance(message, Rollout)]

@@ -2,7 +2,8 @@
 
 Rule: a rollout and an evaluation start only under the weights that they name. A message that is lost does no harm, because
 the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends again what is missing. What a
-worker holds is in `held.py`. When weights come, it keeps the newest and those that unfinished tickets name, and no others.
+worker holds is in `held.py`. Each order lists the weights to keep: those that it does not list and no ticket names are
+dropped.
 """
 
 from __future__ import annotations
@@ -192,10 +193,10 @@ class _SessionState:
         """Versions that are asked for and not held."""
         return (self.rollouts.versions() | self.evaluations.versions()).difference(self.weights)
 
-    def drop_weights(self) -> None:
-        """Drop the weights that are neither the newest nor asked for."""
-        asked = {*self.rollouts.versions(), *self.evaluations.versions(), max(self.weights, default=-1)}
-        self.weights = {version: weights for version, weights in self.weights.items() if version in asked}
+    def keep_weights(self, listed: Sequence[int]) -> None:
+        """Drop the weights that an order does not list. A late copy of an order drops none that are asked for."""
+        kept = {*listed, *self.rollouts.versions(), *self.evaluations.versions()}
+        self.weights = {version: weights for version, weights in self.weights.items() if version in kept}
 
     def keep(self, answer: Rollout | Evaluated | Answer) -> bool:
         """Keep what work has led to; False if it is no longer wanted, for example because its lane was released."""
@@ -209,10 +210,7 @@ class _SessionState:
     def release(self, lanes: Sequence[LaneIncarnation]) -> list[WorkerEffect]:
         """Drop these lanes."""
         released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
-        if not released:
-            return []
-        self.drop_weights()
-        return [CloseLanes(released)]
+        return [CloseLanes(released)] if released else []
 
     def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:
         """Drop the lanes that the learner does not list: their Release was lost.
@@ -274,12 +272,13 @@ class Session:
         match message:
             case Weights(version):
                 current.weights.setdefault(version, message)
-                current.drop_weights()  # a late copy of old weights, too
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]
+                current.keep_weights(message.keep)
             case Evaluate() if isinstance(self.run, RunSpec):
                 again = [current.evaluations.take(message.ticket, message)]
+                current.keep_weights(message.keep)
             case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
                 again = [current.orders.take(message)]
             case Release(_, lanes):

@@ -1199,5 +1199,5 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
 def test_the_most_tickets_that_a_run_may_have_outstanding_fit_one_message() -> None:
     numbers = range(2**31, 2**31 + MOST_TICKETS)
     received = tuple(Received(n, 200, 10**5) for n in range(MOST_TICKETS))
-    order = Collect(2**48, 10**6, tuple(Permit(number, n, 200, 10**5) for n, number in enumerate(numbers)), received)
+    order = Collect(2**48, 10**6, tuple(Permit(number, n, 200, 10**5) for n, number in enumerate(numbers)), received, ())
     assert decode_to_worker([bytes(frame) for frame in encode(order)]) == order

@@ -231,15 +231,6 @@ def watch_of(*versions: int) -> WatchedSession:
     return watch
 
 
-def test_the_newest_weights_are_held_from_heartbeat_to_heartbeat() -> None:
-    watch = watch_of(5, 3)
-    watch.see(Heartbeat(1, 0, (3, 5), (), 0, {}, 0), 0.1)
-    watch.see(Heartbeat(1, 0, (5,), (), 0, {}, 0), 0.2)
-    with pytest.raises(Broken) as broken:
-        watch.see(Heartbeat(1, 0, (3,), (), 0, {}, 0), 0.3)
-    assert (broken.value.rule, broken.value.got) == (rules.HOLDS_WEIGHTS, "[3]")
-
-
 @pytest.mark.parametrize("versions", [(5, 3), (3, 3), (3, 4)])
 def test_a_heartbeat_lists_versions_that_were_sent_in_ascending_order(versions: tuple[int, ...]) -> None:
     with pytest.raises(Broken) as broken:
@@ -257,7 +248,7 @@ def test_a_heartbeat_lists_versions_that_were_sent_in_ascending_order(versions: 
 )
 def test_a_rollout_is_that_of_its_permit(sent: tuple[int, ...], version: int, sequence: int, rule: Rule) -> None:
     watch = watch_of(*sent)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0),), ()))
+    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0),), (), (3,)))
     with pytest.raises(Broken) as broken:
         watch.see(fake_rollout(1, 0, 7, version, sequence), 0.1)
     assert broken.value.rule is rule
@@ -265,7 +256,7 @@ def test_a_rollout_is_that_of_its_permit(sent: tuple[int, ...], version: int, se
 
 def test_a_rollout_does_not_come_before_an_earlier_one_of_its_lane() -> None:
     watch = watch_of(3)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0), Permit(8, 0, 0, 1)), ()))
+    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0), Permit(8, 0, 0, 1)), (), (3,)))
     with pytest.raises(Broken) as broken:
         watch.see(fake_rollout(1, 0, 8, 3, 1), 0.1)
     assert (broken.value.rule, broken.value.got) == (rules.IN_ORDER, "sequence 1")
@@ -273,7 +264,7 @@ def test_a_rollout_does_not_come_before_an_earlier_one_of_its_lane() -> None:
 
 def test_a_permit_of_a_lower_incarnation_is_not_answered() -> None:
     watch = watch_of(3)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 0, 1, 0)), ()))
+    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 0, 1, 0)), (), (3,)))
     with pytest.raises(Broken) as broken:
         watch.see(fake_rollout(1, 0, 8, 3, 0), 0.1)
     assert broken.value.rule is rules.INCARNATION
@@ -281,7 +272,7 @@ def test_a_permit_of_a_lower_incarnation_is_not_answered() -> None:
 
 def test_a_lane_is_listed_with_what_has_arrived_until_it_is_released() -> None:
     watch = watch_of(3)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 1, 0, 0)), ()))
+    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 1, 0, 0)), (), (3,)))
     watch._next_sequence[0, 2] = 1
     assert watch.received() == (Received(0, 2, 1), Received(1, 0, 0))
     watch.confirms = False
@@ -297,7 +288,7 @@ def test_a_ticket_is_listed_from_the_reply_after_it_until_it_is_answered(kind: s
     watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0) if kind == "order" else watch_of(3)
     sent: dict[str, ToWorker] = {
         "order": Step(1, 7, 0, 0, ()),
-        "permit": Collect(1, 3, (Permit(7, 0, 0, 1),), ()),
+        "permit": Collect(1, 3, (Permit(7, 0, 0, 1),), (), (3,)),
         "evaluation": Evaluate(1, 7, 3, (1,), True, 9, False, False),
     }
     watch.sent(watch.reply(1))

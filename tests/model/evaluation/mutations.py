@@ -81,11 +81,13 @@ MUTATIONS = {
     ),
     "what a worker has dropped counts as held": Mutation(
         WEIGHTS,
-        "for version, sent_at in versions.items() if version in kept}",
-        "for version, sent_at in versions.items()}",
+        "for version, sent_at in member.versions.items() if version in keep}",
+        "for version, sent_at in member.versions.items()}",
     ),
-    "weights that a ticket names count as dropped": Mutation(WEIGHTS, "kept = {*named, max(", "kept = {max("),
-    "a worker drops weights that an evaluation names": Mutation(SESSION, "*self.evaluations.versions(), ", ""),
+    "weights that a ticket names count as dropped": Mutation(
+        WEIGHTS, "if version in keep}", "if version in message.versions}"
+    ),
+    "a worker drops weights that an evaluation names": Mutation(SESSION, ", *self.evaluations.versions()}", "}"),
     "an evaluation that is over goes on when the next one begins": Mutation(
         HELD, "if order.version == self.asked[newest].version}", "if True}"
     ),

@@ -81,7 +81,7 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
     if worker.session is None:
         return content, None, None
     held = worker.session._current.evaluations
-    orders = tuple(content_of(order, worker.number) for _, order in sorted(held.asked.items()))
+    orders = tuple(_order_content(order) for _, order in sorted(held.asked.items()))
     answers = tuple(content_of(answer, worker.number) for answer in held.answered.values())
     played = tuple(
         (session(number), ticket(each)) for number, each in sorted(worker.played) if number == worker.session.session
@@ -89,7 +89,7 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
     task = worker.task
     if not isinstance(task, EvaluationTask):
         return content, (orders, answers, played), None
-    return content, (orders, answers, played), (task.weights.version, content_of(task.order, worker.number))
+    return content, (orders, answers, played), (task.weights.version, _order_content(task.order))
 
 
 def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWorker:
@@ -110,6 +110,11 @@ def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWor
     return worker
 
 
+def _order_content(order: Evaluate) -> Content:
+    """Without the weights that it lists, which matter when it comes."""
+    return session(order.session), ticket(order.ticket), order.version, order.seeds, order.send_rows
+
+
 def _order(content: Content) -> Evaluate:
-    _, number, each, version, seeds, with_rows = content
+    number, each, version, seeds, with_rows = content
     return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False)

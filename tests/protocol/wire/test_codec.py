@@ -205,7 +205,7 @@ def test_a_default_stands_at_the_end_alone() -> None:
     assert defaults == {
         Hello: (False,), Alive: (None,),
         Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
-        Evaluate: ((), ()),
+        Evaluate: ((), (), ()),
     }  # fmt: skip
     assert Rollout.__struct_fields__[-4:] == ("episodes", "mask", "extras", "resets")
 
@@ -239,7 +239,7 @@ def test_what_is_wrong_in_a_record_within_a_message_is_named() -> None:
         ([1, 2, [], 0], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
     ):
         with pytest.raises(BadMessage) as caught:
-            decode_to_worker(head(["Collect", 7, 0, [[1, 0, 0, 0], permit], []]))
+            decode_to_worker(head(["Collect", 7, 0, [[1, 0, 0, 0], permit], [], []]))
         assert says in str(caught.value)
 
 

@@ -73,7 +73,7 @@ def to_worker(session: int, attempt: int = 1) -> list[ToWorker]:
         Refuse("no"),
         Rejoin(session),
         Weights(5, np.arange(5, dtype=np.float32), np.zeros(0, np.float32)),
-        Collect(session, 0, (Permit(50, 0, 0, 0),), (Received(0, 0, 0, (1,)),)),
+        Collect(session, 0, (Permit(50, 0, 0, 0),), (Received(0, 0, 0, (1,)),), (0,)),
         Release(session, (LaneIncarnation(0, 0),)),
         HeartbeatReply(session, 1, (Received(0, 0, 0, ()),)),
         Drain("finished"),

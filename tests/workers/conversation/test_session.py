@@ -94,6 +94,7 @@ def collect(
     incarnation: int = 0,
     first: int = 0,
     received: tuple[Received, ...] | None = None,
+    keep: tuple[int, ...] = (),
 ) -> Collect:
     """Permission for (ticket, lane) pairs, in the order of their sequence, which begins with `first` in each lane.
 
@@ -102,7 +103,7 @@ def collect(
     sequences: defaultdict[int, Iterator[int]] = defaultdict(lambda: itertools.count(first))
     permits = tuple(Permit(ticket, lane, incarnation, next(sequences[lane])) for ticket, lane in tickets)
     theirs = lanes(*sorted(sequences), incarnation=incarnation) if received is None else received
-    return Collect(SESSION, version, permits, theirs)
+    return Collect(SESSION, version, permits, theirs, keep)
 
 
 def joining() -> Session:
@@ -507,7 +508,8 @@ def test_a_permit_does_not_overtake_one_whose_weights_have_not_come() -> None:
 
 
 def test_lanes_of_the_lowest_version_go_first_and_different_versions_are_not_collected_together() -> None:
-    session = ready(collect((0, 0), version=1), collect((1, 1), (2, 2), version=0), weights(1))
+    orders = collect((0, 0), version=1), collect((1, 1), (2, 2), version=0)
+    session = ready(*orders, weights(0), weights(1), version=None)
     collections = [[(rollout.ticket, rollout.version) for rollout in collected(session)] for _ in range(2)]
     assert collections == [[(1, 0), (2, 0)], [(0, 1)]]
 
@@ -517,15 +519,20 @@ def test_a_lane_whose_weights_have_come_does_not_wait_for_one_of_a_lower_version
     assert [(rollout.ticket, rollout.version) for rollout in collected(session)] == [(1, 2)]
 
 
-def test_weights_are_kept_until_newer_ones_come_and_no_unfinished_ticket_names_them() -> None:
-    session = ready(collect((0, 0), (1, 0), version=0), weights(1))
-    held = [versions_held(session)]
-    for version in (2, 3):
-        collected(session)
-        held.append(versions_held(session))  # an order that is on its way may name them
-        session.handle(weights(version), 0.2)
-        held.append(versions_held(session))
-    assert held == [(0, 1), (0, 1), (0, 2), (0, 2), (3,)]
+def test_an_order_lists_the_weights_that_are_kept_besides_those_that_tickets_name() -> None:
+    session = ready(collect((0, 0)), weights(1), weights(2))
+    collected(session)
+    assert versions_held(session) == (0, 1, 2), "an order that is on its way may name them"
+    session.handle(collect((1, 0), version=2, first=1, keep=(1, 2)), 0.2)
+    session.handle(weights(3), 0.2)
+    assert versions_held(session) == (1, 2, 3)
+    session.handle(collect((0, 0), keep=(0,)), 0.3)
+    assert versions_held(session) == (2,), "a late copy drops nothing that is asked for"
+
+
+def test_an_order_to_evaluate_lists_them_too() -> None:
+    session = ready(weights(1), weights(2), msgspec.structs.replace(EVALUATE, keep=(0, 2)))
+    assert versions_held(session) == (0, 2)
 
 
 def test_weights_of_work_that_was_abandoned_are_kept() -> None:
@@ -535,31 +542,14 @@ def test_weights_of_work_that_was_abandoned_are_kept() -> None:
     assert task_of(session).weights.version == 0
 
 
-def test_the_newest_weights_are_kept_though_no_ticket_names_them() -> None:
-    session = ready(collect((0, 0), version=0))
-    collected(session)
-    assert versions_held(session) == (0,)
-
-
 @pytest.mark.parametrize(
     "message", [Release(SESSION, (LaneIncarnation(0, 0),)), HeartbeatReply(SESSION, 1, ())], ids=lambda m: type(m).__name__
 )
-def test_weights_that_only_a_released_lane_names_are_dropped(message: ToWorker) -> None:
-    session = ready(collect((0, 0), version=0), weights(1))
+def test_a_lane_that_closes_drops_no_weights(message: ToWorker) -> None:
+    """The learner takes them to be held until its next order says otherwise."""
+    session = ready(collect((0, 0)), weights(1))
     session.handle(message, 0.1)
-    assert versions_held(session) == (1,)
-
-
-def test_weights_that_no_ticket_names_are_dropped_unless_they_are_the_newest() -> None:
-    """If their order was lost, the learner sends both again."""
-    session = ready(weights(1), weights(0), version=None)
-    assert versions_held(session) == (1,)
-    session.handle(collect((0, 0), version=0), 0.2)
-    session.handle(weights(0), 0.2)
     assert versions_held(session) == (0, 1)
-    collected(session)
-    session.handle(weights(1), 0.2)
-    assert versions_held(session) == (1,)
 
 
 def test_weights_that_come_twice_are_ignored() -> None:
@@ -584,7 +574,7 @@ def test_a_heartbeat_lists_the_versions_of_the_weights_held_in_ascending_order()
 
 
 def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
-    session = ready(collect((7, 0), (8, 1), version=9))
+    session = ready(collect((7, 0), (8, 1), version=9, keep=(0, 9)))
     session.handle(HeartbeatReply(SESSION, 4, lanes(0, 1)), 0.5)
     session.update_statistics(Statistics(120, {"step": 0.5}, 0))
     assert session.tick(0.9) == []

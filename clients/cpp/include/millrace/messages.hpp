@@ -65,7 +65,7 @@ struct Message {
   std::vector<Permit> permits;
   std::vector<Received> received;
   std::vector<LaneIncarnation> lanes;
-  std::vector<std::uint64_t> copies, numbers;
+  std::vector<std::uint64_t> copies, numbers, keep;
   std::vector<std::optional<std::uint64_t>> seeds;
   std::vector<Array> arrays;  // actions; parameters and buffers
   Run run;
@@ -87,7 +87,7 @@ class Decoder {
     Message& m = into;
     m.session.reset();
     m.permits.clear(), m.received.clear(), m.lanes.clear(), m.copies.clear();
-    m.numbers.clear(), m.seeds.clear(), m.arrays.clear();
+    m.numbers.clear(), m.keep.clear(), m.seeds.clear(), m.arrays.clear();
     Reader r(frames[0].data, frames[0].size);
     if (r.is_map()) {
       bool refuse = false, reason = false;
@@ -126,13 +126,13 @@ class Decoder {
       for (std::size_t i = 0; i < m.arrays.size(); ++i) expect(m.arrays[i].dimensions == 1);
       expect(m.arrays[1].dtype == "<f4");
     } else if (name == "Collect") {
-      m.type = Type::Collect, expect(fields == 4), session(), m.version = r.natural();
+      m.type = Type::Collect, expect(fields == 5), session(), m.version = r.natural();
       for (std::size_t n = r.array(); n; --n) {
         expect(r.array() == 5);
         Permit permit{r.natural(), r.natural(), r.natural(), r.natural()};
         m.permits.push_back(permit), r.skip();  // the opponent: a run with teams is declined
       }
-      received(r, m);
+      received(r, m), keep(r, m);
     } else if (name == "Release") {
       m.type = Type::Release, expect(fields == 2), session();
       for (std::size_t n = r.array(); n; --n) {
@@ -141,8 +141,8 @@ class Decoder {
         m.lanes.push_back({lane, r.natural()});
       }
     } else if (name == "Evaluate") {
-      m.type = Type::Evaluate, expect(fields == 10), session(), m.ticket = r.natural(), m.version = r.natural(), seeds(r, m);
-      m.greedy = r.boolean(), m.most_steps = r.natural(), m.send_rows = r.boolean(), m.send_rows |= r.boolean(), r.skip(), r.skip();
+      m.type = Type::Evaluate, expect(fields == 11), session(), m.ticket = r.natural(), m.version = r.natural(), seeds(r, m);
+      m.greedy = r.boolean(), m.most_steps = r.natural(), m.send_rows = r.boolean(), m.send_rows |= r.boolean(), r.skip(), r.skip(), keep(r, m);
       expect(m.seeds.size() >= 1 && m.seeds.size() <= 1024 && m.most_steps >= 1);
       for (auto& seed : m.seeds) expect(seed.has_value());
     } else if (name == "HeartbeatReply") {
@@ -163,6 +163,8 @@ class Decoder {
       throw BadMessage("head: expected a message of the learner");
     }
   }
+
+  void keep(Reader& r, Message& m) { for (std::size_t n = r.array(); n; --n) m.keep.push_back(r.natural()); }
 
   Array array(Reader& r) {
     if (r.array() != 3) throw BadMessage("array: expected [dtype, shape, frame]");

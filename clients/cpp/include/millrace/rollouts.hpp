@@ -2,7 +2,7 @@
 //
 // Rule: a ticket is collected once, under the version that it names, and after those before it of its lane. Its rollout is
 // kept until the learner has received it, and sent again when the learner asks for it again. The memory of a rollout that has
-// arrived is used for the next one. When weights come, we keep the newest and those that unfinished tickets name.
+// arrived is used for the next one. When an order comes, we keep the weights that it lists, and those that unfinished tickets name.
 #pragma once
 #include <deque>
 
@@ -116,9 +116,9 @@ class CollectorSession : public Session {  // a Session that holds the weights a
       case Type::Collect:
         received(m);
         for (const Permit& permit : m.permits) take(permit, m.version);
-        return;
+        return keep_weights(m);
       case Type::HeartbeatReply: return received(m);
-      case Type::Evaluate: return take_evaluation(m);
+      case Type::Evaluate: return take_evaluation(m), keep_weights(m);
       default: return;
     }
   }
@@ -140,7 +140,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   }
   void release(std::uint64_t number, std::uint64_t incarnation) override {
     auto found = held_.find(number);
-    if (found != held_.end() && found->second.incarnation <= incarnation) held_.erase(found), drop_weights();
+    if (found != held_.end() && found->second.incarnation <= incarnation) held_.erase(found);
   }
 
   bool acts() const { return loaded_.has_value(); }  // whether weights have come, under which the policy can act
@@ -198,18 +198,17 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   void take_weights(const Message& m) {
     if (m.arrays.size() > 2) return decline("the C++ client has no attributes that the learner could set in its environments");
     if (!weights_.count(m.version)) weights_.emplace(m.version, policy_.weights(m));  // a rollout in progress goes on under its own
-    drop_weights();
   }
   void load(std::uint64_t version) {  // let the policy act under these weights, which are held
     if (loaded_ != version) policy_.load(weights_.at(version)), loaded_ = version;
   }
-  void drop_weights() {  // that are neither the newest nor asked for
-    auto asked = [&](std::uint64_t version) {
+  void keep_weights(const Message& m) {  // those that this order lists, and those that are asked for
+    auto kept = [&](std::uint64_t version) {
       for (auto& [number, lane] : held_) for (auto& [ticket, permitted] : lane.tickets) if (permitted.version == version) return true;
       for (const Evaluation& order : orders_) if (order.version == version) return true;
-      return version == weights_.rbegin()->first;
+      return std::find(m.keep.begin(), m.keep.end(), version) != m.keep.end();
     };
-    for (auto each = weights_.begin(); each != weights_.end();) each = asked(each->first) ? std::next(each) : weights_.erase(each);
+    for (auto each = weights_.begin(); each != weights_.end();) each = kept(each->first) ? std::next(each) : weights_.erase(each);
   }
   void take(const Permit& permit, std::uint64_t version) {
     auto found = held_.find(permit.lane);
