@@ -329,7 +329,7 @@ def waits_for_weights(learner: Learner) -> Script[None]:
     session = yield from collecting(learner)
     yield from session.collect()
     permit = session.permit()
-    session.order(permit, version=2)
+    session.order(permit, version=2, keep=(1,))
     text = f"no rollout of ticket {permit.ticket} before the Weights of version 2"
     yield from learner.quiet(Rollout, rules.VERSION, text)
     session.give(session.weights(2))
