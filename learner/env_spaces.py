@@ -10,7 +10,7 @@ from gymnasium import spaces
 from protocol.envs.action_masks import has_mask, without_mask
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import action_spec, observation_leaves, with_last
-from protocol.errors import UsageError
+from protocol.errors import UsageError, did_you_mean
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -47,15 +47,16 @@ class EnvSpaces(NamedTuple):
         if masked:
             observation = without_mask(observation, env.action_space)
         keys = observation.spaces.keys() if isinstance(observation, spaces.Dict) else ()
-        if not all(key in keys for key in critic_keys) or (critic_keys and len(keys) == len(critic_keys)):
-            raise UsageError(
-                f"critic_keys {' '.join(critic_keys)}: expected keys of a Dict observation, and one more for the actor, got "
-                f"{env.observation_space}"
-            )
+        given = f"critic_keys {' '.join(critic_keys)}"
+        if unknown := [key for key in critic_keys if key not in keys]:
+            there = f"its keys are {', '.join(keys)}" if keys else f"the observation is no Dict, but {observation}"
+            raise UsageError(f"{given}: no key {unknown[0]}; {there}{did_you_mean(unknown[0], keys)}")
+        if critic_keys and len(keys) == len(critic_keys):
+            raise UsageError(f"{given}: expected one more key of the observation for the actor, got {', '.join(keys)}")
         everything = observation_leaves(with_last(observation, critic_keys))
         critic = tuple(leaf for leaf in everything if leaf.path.partition("/")[0] in critic_keys)
         if any(leaf.is_image for leaf in critic):
-            raise UsageError(f"critic_keys {' '.join(critic_keys)}: expected arrays that are no images, got {observation}")
+            raise UsageError(f"{given}: expected arrays that are no images, got {observation}")
         leaves = everything[: len(everything) - len(critic)]
         paths = [leaf.path for leaf in leaves]
         if not leaves:

@@ -38,7 +38,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "eval/NAME_missing": Meaning(EPISODES, "How many of these episodes did not report the number."),
     },
     "Self-play": {
-        "self_play/elo": Meaning("Elo", "Rating of the policy, which begins with 1200, by its episodes against opponents."),
+        "self_play/elo": Meaning("Elo", "Rating of the policy, 1200 at first, by episodes against snapshots and programs."),
         "self_play/snapshots": Meaning("versions", "Earlier versions of the policy that are kept.", "snapshots"),
         "rollout/score": Meaning(NONE, "Share of the last 100 training episodes that were won; a tie is half of one."),
         "eval/score": Meaning(

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -28,7 +28,7 @@ from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
-from protocol.specs import SCORE, DescribeSpec, PolicySpec, RunSpec
+from protocol.specs import SCORE, ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
 RIVAL, POLICY = 0, 1
@@ -180,7 +180,22 @@ def _check_rival(policy: SavedPolicy, rival: SavedPolicy) -> None:
         ("teams", policy.teams or rival.teams, rival.teams or policy.teams),
     ):
         if expected != got:
-            raise UsageError(f"against: expected a policy for the same {what}, {expected}; got {got}")
+            of = "" if policy.env.id == rival.env.id else f" of {policy.env.id}, got one of {rival.env.id}:"
+            raise UsageError(
+                f"against: expected a policy{of} with the same {what}, {_in_words(expected)}; got {_in_words(got)}"
+            )
+
+
+def _in_words(compared: Any) -> str:
+    """Leaves by path, dtype and shape; all else as it is."""
+    match compared:
+        case tuple((Leaf(), *_)):
+            return ", ".join(f"{leaf.path or 'one array'} {leaf.dtype}{list(leaf.shape)}" for leaf in compared)
+        case ActionSpec():
+            return f"{compared.kind} {list(compared.sizes or compared.shape)}"
+        case tuple(()):
+            return "none"
+    return str(compared)
 
 
 def useful_workers(workers: int, episodes: int, copies: int) -> int:

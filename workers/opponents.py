@@ -34,7 +34,7 @@ class Opponent:
         self.number = number
         if weights is None:
             spec = msgspec.structs.replace(run.policy, own=OwnPolicySpec(run.scripted[-1 - number], ()))
-            policy: Policy | CalledPolicy = CalledPolicy(spec, ())
+            policy: Policy | CalledPolicy = CalledPolicy(spec, (), "opponent")
         else:
             spec = run.opponent or run.policy
             policy = make_policy(spec, run.images_dtype)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 
 from protocol.bounds import Count, Natural, Real
-from protocol.errors import UsageError
+from protocol.errors import UsageError, did_you_mean
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 
@@ -53,10 +53,15 @@ def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tupl
     if not patterns:
         return tuple((seat,) for seat in range(len(seats)))
     found = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
-    if len(found) < 2 or sorted(n for team in found for n in team) != list(range(len(seats))):
-        raise UsageError(f"teams: expected patterns that put each of {', '.join(seats)} into one team, got {list(patterns)}")
-    if len({len(team) for team in found}) > 1:
-        raise UsageError(f"teams: expected as many agents in each, got {[len(team) for team in found]}")
+    for pattern, team in zip(patterns, found, strict=True):
+        if not team:
+            raise UsageError(f"teams: {pattern} matches no agent of {', '.join(seats)}{did_you_mean(f'{pattern}*', seats)}")
+    for n, seat in enumerate(seats):
+        if (count := sum(n in team for team in found)) != 1:
+            raise UsageError(f"teams: expected each agent in one team, got {seat} in {count}: {' '.join(patterns)}")
+    if len({len(team) for team in found}) > 1 or len(found) < 2:
+        sizes = ", ".join(f"{len(team)} in {pattern}" for pattern, team in zip(patterns, found, strict=True))
+        raise UsageError(f"teams: expected two teams or more, with as many agents in each; got {sizes}")
     return tuple(found)
 
 

@@ -96,10 +96,12 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         cut = f", {self.cut} of them cut short" if self.cut else ""
-        facts = "".join(f", {name} {fact}" for name, fact in self.facts.items())
+        facts = {name: str(fact) for name, fact in self.facts.items()}
         if (interval := self.score_interval) is not None:
-            facts += " ({:.3g} to {:.3g} with 95 % confidence)".format(*interval)
-        return f"return {self.return_mean:.1f} ± {self.return_std:.1f} over {self.episodes} episodes{cut}{facts}"
+            facts[SCORE] = "{:.2f} ({:.2f} to {:.2f} with 95% confidence)".format(self.facts[SCORE].mean or 0.0, *interval)
+        said = "".join(f", {name} {fact}" for name, fact in facts.items())
+        episodes = f"{self.episodes} episode{'s' * (self.episodes != 1)}"
+        return f"return {self.return_mean:.1f} ± {self.return_std:.1f} over {episodes}{cut}{said}"
 
     @property
     def score_interval(self) -> tuple[float, float] | None:

@@ -55,7 +55,10 @@ def attribute(module: ModuleType | None, qualname: str) -> object:
     """What a module has under this dotted name; None if nothing."""
     found: object = module
     for part in qualname.split("."):
-        found = getattr(found, part, None)
+        try:
+            found = getattr(found, part, None)
+        except ImportError:  # of a module that imports its names when they are asked for, such as supersuit
+            return None
     return found
 
 

@@ -11,7 +11,7 @@ observation in which it acted. Rewards belong to the row in which they fall; tho
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple
 
@@ -24,6 +24,8 @@ from protocol.errors import UsageError
 SEAT, STATE = "seat", "state"
 """Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""
 _NO_INFO: Mapping[str, Any] = {}
+RETURNED_WRONGLY = AttributeError, KeyError, TypeError
+"""What dicts without an agent, and what are no dicts, raise where they are read."""
 
 
 class SeatStep(NamedTuple):
@@ -118,6 +120,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         self._begin(found, {"seed": seed} if options is None else {"seed": seed, "options": options})
         if True not in found.acts:
             raise RuntimeError("expected an agent that acts after reset, got none")
+        self._check_agents()
         self._last = list(found.observations)
         return found, {}
 
@@ -127,6 +130,10 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         over = self._advance(action, found)
         self._last = list(found.observations)
         return found, 0.0, over, False, {}
+
+    def _check_agents(self) -> None:
+        if unknown := [agent for agent in self.env.agents if agent not in self.seat_of]:
+            raise RuntimeError(f"agents: expected some of possible_agents, got {unknown[0]}")
 
     @abstractmethod
     def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
@@ -175,12 +182,26 @@ class ParallelSeats(SeatedEnv):
     def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
         observations, infos = self.env.reset(**keywords)
         self._present = [agent for agent in self.agents if agent in self.env.agents]
-        for agent in self._present:
-            self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+        try:
+            for agent in self._present:
+                self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+        except RETURNED_WRONGLY as error:
+            self._explain(error, self._present, observations=observations)
+            raise
 
     def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
         given = {agent: actions[self.seat_of[agent]] for agent in self._present}
         observations, rewards, terminated, truncated, infos = self.env.step(given)
+        try:
+            return self._takes(given, found, observations, rewards, terminated, truncated, infos)
+        except RETURNED_WRONGLY as error:
+            self._explain(
+                error, given, rewards=rewards, terminated=terminated, truncated=truncated, observations=observations
+            )
+            raise
+
+    def _takes(self, given: Mapping[Any, Any], found: SeatStep, *returned: Mapping[Any, Any]) -> bool:
+        observations, rewards, terminated, truncated, infos = returned
         seen, told, reward, terminates, truncates, complete, acts, outside = found
         here = set(self.env.agents)
         for agent in given:
@@ -202,6 +223,16 @@ class ParallelSeats(SeatedEnv):
             self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
         self._present = [agent for agent in self.agents if agent in here]
         return not self._present
+
+    def _explain(self, error: Exception, agents: Collection[Any], **returned: Any) -> None:
+        """Raise what is wrong with what the environment returned, if that caused the error."""
+        self._check_agents()
+        for what, by_agent in returned.items():
+            if not isinstance(by_agent, Mapping):
+                raise TypeError(f"{what}: expected a dict by agent, got {type(by_agent).__name__}") from error
+            if missing := [agent for agent in agents if agent not in by_agent]:
+                got = ", ".join(map(str, by_agent)) or "none"
+                raise RuntimeError(f"{what}: expected agent {missing[0]} among them, got {got}") from error
 
     def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Mapping[str, Any]) -> None:
         seat = self.seat_of[agent]
@@ -260,7 +291,8 @@ def seat_id(env: Any) -> Any:
     It must be the outermost wrapper. Raises `UsageError` for an environment without seats.
     """
     if not has_seats(env):
-        raise UsageError(f"seat_id: expected an environment of PettingZoo's, got {type(env).__name__}")
+        name = env.spec.id if getattr(env, "spec", None) is not None else type(env).__name__
+        raise UsageError(f"seat_id: expected an environment of several agents, got {name}; omit seat_id")
     env.tells_seats = True
     return env
 

@@ -172,7 +172,7 @@ def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
     if (similar := most_similar(env_id, examples, why_not)) is not None:
         return similar
     own = "one of your own is given as my_module:MyEnv-v0, one of a client in another language needs the client (--bind)"
-    names = [package.module for package in packages if package.ids]
+    names = list(dict.fromkeys(package.module for package in packages if package.ids))
     if not names:
         return f"is the package that has it installed? {own[0].upper()}{own[1:]}"
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""

@@ -50,18 +50,21 @@ class Acted(NamedTuple):
 class CalledPolicy:
     """The user's policy. Everything that goes wrong in it is raised as `PolicyFailed`."""
 
-    def __init__(self, spec: PolicySpec, extras: tuple[ExtraArray, ...]) -> None:
-        """Make it. `extras` are those of the run."""
+    def __init__(self, spec: PolicySpec, extras: tuple[ExtraArray, ...], called: str = "policy") -> None:
+        """Make it. `extras` are those of the run. `called`: what errors call it."""
         assert spec.own is not None
+        self._called = called
         self._spec, self._own = spec, spec.own
         self._fields, _ = parameter_layout(spec)
         self._paths = [leaf.path for leaf in spec.observation]
         self._extras = (*extras, LOG_PROB) if spec.own.has_log_prob else extras
         self._names = {extra.name for extra in self._extras}
-        self._made: Any = self._guarded("cannot be made: it", lambda: _factory(self._own)(**self._own.kwargs))
-        for name in ("load", "act") if spec.own.arrays else ("act",):
+        self._made: Any = self._guarded("cannot be made: it", lambda: _factory(self._own, called)(**self._own.kwargs))
+        methods = ("load", "act") if spec.own.arrays else ("act",)
+        for name in methods:
             if not callable(getattr(self._made, name, None)):
-                raise self._wrong(f"expected an object with load and act, got {type(self._made).__name__} without {name}")
+                expected = f"expected an object with {' and '.join(methods)}"
+                raise self._wrong(f"{expected}, got {type(self._made).__name__} without {name}")
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Give it these weights, if it has any."""
@@ -86,7 +89,7 @@ class CalledPolicy:
         keywords = {} if mask is None else {"mask": mask.copy()}
         returned = self._guarded(name, lambda: getattr(self._made, name)(obs, state.copy(), rng, **keywords))
         if not (isinstance(returned, tuple) and len(returned) == 3):
-            raise self._wrong(f"{name}: expected action, state, extras, got {_described(returned)}")
+            raise self._wrong(f"{name}: expected it to return action, state, extras; got {_described(returned)}")
         action, after, extras = returned
         copies = len(state)
         stored = self._array(
@@ -133,15 +136,15 @@ class CalledPolicy:
             raise self._wrong(line, traceback.format_exc()) from error
 
     def _wrong(self, line: str, detail: str = "") -> PolicyFailed:
-        return PolicyFailed(f"policy {self._own.factory}: {line}", detail)
+        return PolicyFailed(f"{self._called} {self._own.factory}: {line}", detail)
 
 
-def _factory(own: OwnPolicySpec) -> Callable[..., object]:
+def _factory(own: OwnPolicySpec, called: str) -> Callable[..., object]:
     """The callable that makes the policy."""
     if own.code is not None:
         return own.code.load()
     try:
-        return own_callable(own.factory, f"policy {own.factory}", "my_package.policies:make_policy")
+        return own_callable(own.factory, f"{called} {own.factory}", "my_package.policies:make_policy")
     except UsageError as error:
         raise PolicyFailed(str(error), error.detail) from error
 

@@ -81,8 +81,11 @@ def test_several_agents_have_the_state_of_their_environment(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"critic_keys": ["other"]}, "critic_keys other: expected keys of a Dict observation, and one more for the actor"),
-        ({"critic_keys": ["hidden", "seen"]}, "critic_keys hidden seen: expected keys of a Dict observation, and one more"),
+        ({"critic_keys": ["other"]}, "critic_keys other: no key other; its keys are"),
+        (
+            {"critic_keys": ["hidden", "seen"]},
+            "critic_keys hidden seen: expected one more key of the observation for the actor",
+        ),
         ({"algo": "dqn"}, "critic_keys: expected an algorithm whose critic is a network of its own, got dqn"),
         ({"shared_net": True}, "got ppo with shared_net"),
         ({"inference": "learner"}, "inference learner: the run has critic_keys, and workers must act"),

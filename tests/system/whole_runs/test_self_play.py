@@ -124,7 +124,8 @@ def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path, p
         assert 0 <= interval[0] <= score <= interval[1] <= 1
     game = trained(tmp_path / "c", "ChainGame", rollout_steps=16, steps=100)
     with pytest.raises(
-        UsageError, match=r"^against: expected a policy for the same agents, \('left', 'right'\); got \('sho"
+        UsageError,
+        match=r"^against: expected a policy of .*RockPaper.*, got one of .*ChainGame: with the same agents, \('left'",
     ):
         millrace.evaluate(plays_paper, 2, against=game)
 
@@ -133,7 +134,7 @@ def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path, p
     ("env", "settings", "says"),
     [
         ("RockPaperScissors", {"teams": ("left", "right")}, "^teams: expected none without opponents"),
-        ("RockPaperScissors", {"self_play": 1, "teams": ("l*",)}, "^teams: expected patterns that put each of left, right"),
+        ("RockPaperScissors", {"self_play": 1, "teams": ("l*",)}, "^teams: expected each agent in one team, got right in 0"),
         ("RockPaperScissors", {"self_play": 1, "info_keys": ("score",)}, "^info_keys: expected another name than score"),
         (
             "RockPaperScissors",
@@ -141,7 +142,7 @@ def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path, p
             "^info_keys: expected fewer than 32",
         ),
         ("RockPaperScissors", {"self_play": 1, "envs": 1, "lanes": 1}, "^self_play: expected envs 2 or more"),
-        ("RockPaperScissors", {"opponents": (f"{__name__}:broken",)}, "policy .*:broken: act raised ZeroDivisionError"),
+        ("RockPaperScissors", {"opponents": (f"{__name__}:broken",)}, "opponent .*:broken: act raised ZeroDivisionError"),
     ],
 )
 def test_what_self_play_cannot_have_is_refused_in_a_line(

@@ -110,11 +110,11 @@ def test_teams_are_of_one_size_and_every_agent_is_in_one() -> None:
     assert teams_of(("r1", "b1", "r2", "b2"), ("r*", "b*")) == ((0, 2), (1, 3))
     assert teams_of(AGENTS) == ((0,), (1,), (2,))
     for patterns, says in (
-        (("[ab]", "c"), r"expected as many agents in each, got \[2, 1\]"),
-        (("*",), "expected patterns that put each of a, b, c into one team"),
-        (("a", "b"), "expected patterns that put each"),
-        (("*", "c"), "expected patterns that put each"),
-        (("a", "b", "c", "d"), "expected as many agents in each"),
+        (("[ab]", "c"), r"expected two teams or more, with as many agents in each; got 2 in \[ab\], 1 in c"),
+        (("*",), r"expected two teams or more, with as many agents in each; got 3 in \*"),
+        (("a", "b"), "expected each agent in one team, got c in 0: a b"),
+        (("*", "c"), r"expected each agent in one team, got c in 2: \* c"),
+        (("a", "b", "c", "d"), "d matches no agent of a, b, c"),
     ):
         with pytest.raises(UsageError, match=f"^teams: {says}"):
             teams_of(AGENTS, patterns)
@@ -259,9 +259,9 @@ def fails() -> Any:
 @pytest.mark.parametrize(
     ("factory", "says"),
     [
-        (f"{__name__}:fails", r"^policy .*:fails: act raised ZeroDivisionError: division by zero$"),
-        (f"{__name__}:missing", r"^policy .*:missing: .*"),
-        ("json:dumps", r"^policy json:dumps: cannot be made: it raised TypeError: "),
+        (f"{__name__}:fails", r"^opponent .*:fails: act raised ZeroDivisionError: division by zero$"),
+        (f"{__name__}:missing", r"^opponent .*:missing: .*"),
+        ("json:dumps", r"^opponent json:dumps: cannot be made: it raised TypeError: "),
     ],
 )
 def test_a_program_that_fails_is_named(factory: str, says: str) -> None:

@@ -172,7 +172,7 @@ class Sampling(Linear):
         ("extra unknown", "act: expected the extras log_prob, logits, side, got log_prob, logits, side, more"),
         ("extra shape", "act: extra logits: expected float32[3, 2], got float32[3, 1]"),
         ("extra nan", "act: extra logits: expected finite values, got nan at copy 1"),
-        ("nothing", "act: expected action, state, extras, got NoneType"),
+        ("nothing", "act: expected it to return action, state, extras; got NoneType"),
     ],
 )
 def test_what_goes_wrong_in_it_is_named(wrong: str, message: str) -> None:

@@ -1,0 +1,60 @@
+"""What an environment of several agents returns wrongly is named, by what it is and by agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from protocol.envs.seats import seated
+from tests.support.users_code.seat_envs import RockPaperScissors
+
+
+class Wrong(RockPaperScissors):
+    """Calls its agents otherwise in the part that is called `wrong`, or returns `instead`."""
+
+    def __init__(self, wrong: str, instead: Any = None) -> None:
+        super().__init__()
+        self.wrong, self.instead = wrong, instead
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        observations, infos = super().reset()
+        if self.wrong == "agents":
+            self.agents = [*self.agents, "middle"]
+        return self.other("reset", observations), infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        found = super().step(actions)
+        if self.wrong == "agents later":
+            self.agents = ["middle"]
+        return tuple(map(self.other, ("observations", "rewards", "terminated", "truncated", "infos"), found))
+
+    def other(self, what: str, found: dict[str, Any]) -> Any:
+        renamed = {agent.upper(): each for agent, each in found.items()}
+        return found if what != self.wrong else renamed if self.instead is None else self.instead
+
+
+@pytest.mark.parametrize(
+    ("wrong", "instead", "says"),
+    [
+        ("reset", None, "observations: expected agent left among them, got LEFT, RIGHT"),
+        ("agents", None, "agents: expected some of possible_agents, got middle"),
+        ("agents later", None, "agents: expected some of possible_agents, got middle"),
+        ("rewards", None, "rewards: expected agent left among them, got LEFT, RIGHT"),
+        ("rewards", 1.0, "rewards: expected a dict by agent, got float"),
+        ("terminated", True, "terminated: expected a dict by agent, got bool"),
+        ("truncated", {}, "truncated: expected agent left among them, got none"),
+    ],
+)
+def test_what_is_wrong_is_named(wrong: str, instead: Any, says: str) -> None:
+    env = seated(Wrong(wrong, instead), "game")
+    with pytest.raises((RuntimeError, TypeError)) as caught:
+        env.reset(seed=1)
+        env.step([0, 0])
+    assert str(caught.value) == says
+
+
+def test_the_last_observation_of_a_task_that_has_ended_may_be_missing() -> None:
+    env = seated(Wrong("observations", {}), "game")
+    env.reset(seed=1)
+    assert env.step([0, 0])[2]
