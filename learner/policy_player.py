@@ -94,6 +94,12 @@ class PolicyPlayer:
         self._hub: Hub | None = None
 
     @property
+    def teams(self) -> tuple[tuple[int, ...], ...]:
+        """The seats of each team, if another policy plays the other teams."""
+        against = self.policy.against
+        return () if against is None else self.policy.teams or against.teams or teams_of(self.policy.seats)
+
+    @property
     def facts(self) -> tuple[str, ...]:
         """The names of the facts of the episodes that were played."""
         return self.policy.facts if self._hub is None else self._hub.coordinator.run.facts
@@ -158,9 +164,8 @@ class PolicyPlayer:
         if (against := policy.against) is None:
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
         else:
-            teams = policy.teams or against.teams or teams_of(policy.seats)
             keys = tuple(key for key in run.info_keys if key != SCORE)[: MAX_FACTS - 1]
-            run = msgspec.structs.replace(run, teams=teams, facts=(*keys, SCORE), opponent=against.spec)
+            run = msgspec.structs.replace(run, teams=self.teams, facts=(*keys, SCORE), opponent=against.spec)
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt, opponents=pool)
             hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)

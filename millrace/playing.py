@@ -77,7 +77,8 @@ def evaluate(
         wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
-            evaluation during the run in place of the newest; the number of `workers`, and of the `copies` that each plays
+            evaluation during the run in place of the newest; `against`, a run folder whose policy plays the other teams
+            of a game; the number of `workers`, and of the `copies` that each plays
             side by side; `max_steps` of all episodes together; `transport` or `bind`; `inference`; `max_env_failures`;
             `video`, to film them.
 
@@ -159,7 +160,8 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
         saved = saved._replace(against=_saved(flags, given, flags.against))
     with policy_player(saved, workers, watch) as player:
         if flags.video:
-            return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps)
+            prefix = "" if flags.against is None else f"against-{flags.against.resolve().name}-"
+            return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps, prefix)
         played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps), bound="--max-steps:")
         return evaluation_of(played, player.facts), []
 

@@ -37,9 +37,9 @@ def prepare_rendering() -> None:
 
 
 def record_videos(
-    player: PolicyPlayer, run: Path, episodes: int, seed: int, max_steps: int
+    player: PolicyPlayer, run: Path, episodes: int, seed: int, max_steps: int, prefix: str = ""
 ) -> tuple[Evaluation, list[Path]]:
-    """Have the workers of `player` play greedy episodes, and write a video of each.
+    """Have the workers of `player` play episodes, and write a video of each, whose name begins with `prefix`.
 
     `seed`: of the episodes, as of `EvaluationPlan.of`. `max_steps`: env steps of all episodes together at most; each gets an
     equal share, and at most `LONGEST_EPISODE`.
@@ -63,9 +63,10 @@ def record_videos(
         subfolder(run, FOLDER)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
             while len(results) < episodes:
-                count = min(AT_ONCE, episodes - len(results))
+                at_once = max(AT_ONCE, len(player.teams))  # the episodes of a plan are shared out among the teams
+                count = min(at_once, episodes - len(results))
                 for one in episodes_played.play(count, longest, frames=True):
-                    video = Path(new, f"seed-{seed}-episode-{len(results)}.mp4")
+                    video = Path(new, f"{prefix}seed-{seed}-episode-{len(results)}.mp4")
                     _write(video, one.frames, frames_per_s)
                     videos.append(video)
                     results.append(one.result)
