@@ -77,10 +77,8 @@ Barriers = Callable[[dict[str, Any]], dict[str, Any]]
 @pytest.mark.parametrize(
     ("settings", "workers", "evaluators", "kwargs"),
     [
-        (PPO, 1, 1, SLOW),
+        (PPO, 1, 2, SLOW),
         (PPO, 2, 1, {}),
-        (PPO, 1, 2, {}),
-        (PPO, 2, 2, SLOW),
         (SAC, 1, 1, SLOW),
         (SAC, 2, 2, {}),
     ],

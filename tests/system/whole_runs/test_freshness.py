@@ -12,7 +12,7 @@ from tests.system.stage.processes import TOY, Stage
 @pytest.mark.parametrize("max_lag", [0, 1, pytest.param(3, marks=pytest.mark.soak)])
 def test_the_lag_is_bounded_with_a_slow_worker(stage: Stage, monkeypatch: pytest.MonkeyPatch, max_lag: int) -> None:
     address = f"ipc://{stage.tmp_path}/learner"
-    settings = {"envs": 4, "lanes": 4, "rollout-steps": 8, "batch-size": 32, "steps": 1200, "env-kwargs": "seconds 0.0"}
+    settings = {"envs": 4, "lanes": 4, "rollout-steps": 8, "batch-size": 32, "steps": 600, "env-kwargs": "seconds 0.0"}
     learner = stage.learner(address, {**settings, "min-workers": 2, "max-lag": max_lag}, env=TOY)
     workers = []
     for name, pause_s in (("fast", "0.0005"), ("slow", "0.005")):
