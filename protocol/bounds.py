@@ -58,6 +58,11 @@ def escaped(text: str) -> str:
     return _CONTROL_EXCEPT_NEWLINE.sub(_escape, text)
 
 
+def escaped_json(text: str) -> str:
+    """JSON in which control characters stand as JSON's escapes, safe to show."""
+    return _CONTROL_EXCEPT_NEWLINE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
 def indented(text: str) -> str:
     """A text of several lines, safe to show, each line indented. So none of them looks like a line of a log."""
     return indent(escaped(text).strip("\n"), "    ", lambda line: True)

@@ -26,6 +26,7 @@ from msgspec.structs import replace
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import NOT_SHOWN, Progress
 from learner.run_folder.regular_files import open_regular
+from protocol.bounds import escaped_json
 from protocol.logs.notices import is_notice
 
 RUN_LOG_FILE = "log.jsonl"
@@ -55,7 +56,8 @@ def progress_line(progress: Progress, now: float) -> str:
 
 def _line(time: float, level: str, event: str, message: str, fields: dict[str, Any]) -> str:
     stamp = datetime.fromtimestamp(time, UTC).isoformat(timespec="milliseconds")
-    return msgspec.json.encode({"time": stamp, "level": level, "event": event, "message": message, **fields}).decode()
+    line = {"time": stamp, "level": level, "event": event, "message": message, **fields}
+    return escaped_json(msgspec.json.encode(line).decode())
 
 
 class LoggedLine(msgspec.Struct, frozen=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 from pathlib import Path
@@ -27,6 +28,15 @@ def test_warnings_and_notices_are_kept_and_the_rest_is_not(tmp_path: Path) -> No
         ("info", "the run continues"),
     ]
     assert '"event":"left"' in (tmp_path / RUN_LOG_FILE).read_text()
+
+
+def test_a_name_that_would_change_how_a_line_looks_is_escaped(tmp_path: Path) -> None:
+    name = "\u202e\u2066\x9b31m"
+    with kept_log(tmp_path):
+        log.warning("lost", extra={"event": WorkerLeft(name, "silent", 2, on_purpose=False)})
+    text = (tmp_path / RUN_LOG_FILE).read_text()
+    assert text.rstrip("\n").isprintable()
+    assert json.loads(text)["worker"] == name
 
 
 def test_of_a_long_log_the_newer_half_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
