@@ -78,9 +78,8 @@ def evaluate(
         progress: Show how far it is.
         **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
             evaluation during the run in place of the newest; `against`, a run folder whose policy plays the other teams
-            of a game; the number of `workers`, and of the `copies` that each plays
-            side by side; `max_steps` of all episodes together; `transport` or `bind`; `inference`; `max_env_failures`;
-            `video`, to film them.
+            of a game; the number of `workers`, and of the `copies` that each plays side by side; `max_steps` of all
+            episodes together; `transport` or `bind`; `inference`; `max_env_failures`; `video`, to film them.
 
     Returns the `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. It does not depend on the
     number of workers. Raises `UserFacingError` with a message of one line.

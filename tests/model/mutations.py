@@ -147,7 +147,9 @@ MUTATIONS = {
         "RolloutTask(session, self.weights[version], assignments, ",
         "RolloutTask(session, self.weights[max(self.weights)], assignments, ",
     ),
-    "a worker drops weights that a ticket names": Mutation(SESSION, "*self.rollouts.versions(), ", ""),
+    "a worker drops weights that a ticket names": Mutation(
+        SESSION, "kept = self.asked_versions().union(listed)", "kept = listed"
+    ),
     "a worker drops weights when a lane closes": Mutation(
         SESSION,
         "return [CloseLanes(released)] if released else []",

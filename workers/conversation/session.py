@@ -189,13 +189,17 @@ class _SessionState:
             return self.orders.next()
         return RolloutTask(session, self.weights[version], assignments, self.weights)
 
+    def asked_versions(self) -> set[int]:
+        """Versions that unfinished tickets name."""
+        return self.rollouts.versions() | self.evaluations.versions()
+
     def missing_versions(self) -> set[int]:
         """Versions that are asked for and not held."""
-        return (self.rollouts.versions() | self.evaluations.versions()).difference(self.weights)
+        return self.asked_versions().difference(self.weights)
 
     def keep_weights(self, listed: Sequence[int]) -> None:
         """Drop the weights that an order does not list. A late copy of an order drops none that are asked for."""
-        kept = {*listed, *self.rollouts.versions(), *self.evaluations.versions()}
+        kept = self.asked_versions().union(listed)
         self.weights = {version: weights for version, weights in self.weights.items() if version in kept}
 
     def keep(self, answer: Rollout | Evaluated | Answer) -> bool:

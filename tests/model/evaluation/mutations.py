@@ -87,7 +87,9 @@ MUTATIONS = {
     "weights that a ticket names count as dropped": Mutation(
         WEIGHTS, "if version in keep}", "if version in message.versions}"
     ),
-    "a worker drops weights that an evaluation names": Mutation(SESSION, ", *self.evaluations.versions()}", "}"),
+    "a worker drops weights that an evaluation names": Mutation(
+        SESSION, "self.rollouts.versions() | self.evaluations.versions()", "self.rollouts.versions()"
+    ),
     "an evaluation that is over goes on when the next one begins": Mutation(
         HELD, "if order.version == self.asked[newest].version}", "if True}"
     ),
