@@ -94,8 +94,7 @@ class Collecting:
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
         """Send a Collect, without the weights that it names. `keep`: versions to hold although no ticket names them."""
         watch = self.learner.watch
-        kept = tuple(sorted({version, *keep, *watch.outstanding_versions()}))
-        self.learner.send(Collect(self.learner.session, version, permits, watch.received(), kept))
+        self.learner.send(Collect(self.learner.session, version, permits, watch.received(), watch.to_keep(version, *keep)))
 
     def give(self, weights: Weights) -> None:
         """Send these weights, unless their version was sent in this session."""
@@ -700,8 +699,7 @@ def _evaluation(
     send_rows: bool = False,
     seeds: tuple[int, ...] = (1, 2),
 ) -> Evaluate:
-    kept = tuple(sorted({version, *learner.watch.outstanding_versions()}))
-    ticket = next(learner.tickets)
+    kept, ticket = learner.watch.to_keep(version), next(learner.tickets)
     return Evaluate(learner.session, ticket, version, seeds, greedy, most_steps, send_rows, False, keep=kept)
 
 

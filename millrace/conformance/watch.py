@@ -101,12 +101,13 @@ class WatchedSession:
         self.steps = steps
         """the most that a Heartbeat has reported"""
 
-    def outstanding_versions(self) -> set[int]:
-        """The versions that tickets without an answer name."""
+    def to_keep(self, *named: int) -> tuple[int, ...]:
+        """What an order that names these versions lists: these, and those that tickets without an answer name."""
         of_permits = {ticket: dealt.version for ticket, dealt in self.permits.items()}
         of_orders = {ticket: order.version for ticket, order in self.orders.items() if isinstance(order, Evaluate)}
         answered = self.answers.keys() | self._results.keys()
-        return {version for ticket, version in (of_permits | of_orders).items() if ticket not in answered}
+        outstanding = {version for ticket, version in (of_permits | of_orders).items() if ticket not in answered}
+        return tuple(sorted(outstanding.union(named)))
 
     # ------------------------------------------------------------------------------------------ what the learner says
 
