@@ -97,7 +97,9 @@ class RolloutKeywords(TypedDict, total=False):
     is not silent while its supervisor says that its environment is busy, however long that takes.
     """
     no_workers_timeout_s: float
-    """Write a checkpoint and end the run if there has been no worker for this many seconds."""
+    """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
+    local ends at once when none is left.
+    """
     start_timeout_s: float
     """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
     imports, takes longer than this many seconds. 0: never.

@@ -54,6 +54,19 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     """whether the environment, or the worker, is to blame: it did not leave on purpose"""
 
 
+@dataclass(frozen=True)
+class StartFailed:
+    """A worker's process that ended by itself before it had joined a run. Only its supervisor can say why, and only here:
+    the learner has never heard of it.
+    """
+
+    worker: str
+    reason: str
+    """one line: how it ended, and whether it is started again"""
+    last_lines: str
+    """what it wrote last; empty if it has written nothing, or has no log"""
+
+
 class Alive(Message, frozen=True):
     """A supervisor speaks for its workers. It is believed if it knows a worker's `process_nonce` and uses the same key.
 

@@ -149,8 +149,9 @@ class CheckpointError(RunError):
 class NoWorkers(RunError):
     """No worker is left, or none ever joined, for as long as `no_workers_timeout_s`. The line says how to start one.
 
-    A training run that had begun has then written a checkpoint. A vector environment waits for its own workers for a minute,
-    and for those elsewhere for `timeout`.
+    If this program started the workers and nobody else can join, it is raised at once when none of them is left, with the
+    reason of the last one. A training run that had begun has then written a checkpoint. A vector environment waits for its
+    own workers for a minute, and for those elsewhere for `timeout`.
 
     >>> import millrace
     >>> try:

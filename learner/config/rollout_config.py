@@ -130,7 +130,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     is not silent while its supervisor says that its environment is busy, however long that takes.
     """
     no_workers_timeout_s: Free[Positive] = 600.0
-    """Write a checkpoint and end the run if there has been no worker for this many seconds."""
+    """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
+    local ends at once when none is left.
+    """
     start_timeout_s: Free[NotNegative] = 600.0
     """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
     imports, takes longer than this many seconds. 0: never.

@@ -14,9 +14,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic
 
-from learner.members.events import EnvironmentRaised, Event, Failed
+from learner.members.events import EnvironmentRaised, Event, Failed, WorkerNotStarted
 from learner.members.member_states import MemberState, SentUnusable
 from learner.members.membership import M, Membership, Outgoing
+from protocol.alive import StartFailed
 from protocol.bounds import one_line
 from protocol.messages import (
     Alive,
@@ -90,9 +91,14 @@ class Coordinator(ABC, Generic[M]):
         """A member's key was revoked: send it the reason and remove it at once, whatever it holds."""
         return self.membership.revoke(peer, why) + self._deal()
 
-    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
+    def process_ended(self, ended: WorkerExit | StartFailed) -> list[Outgoing]:
         """A process of this program has ended."""
-        return self._deal() if self.membership.record_exit(worker_exit) else []
+        match ended:
+            case StartFailed(worker, reason, last_lines):
+                self.events.append(WorkerNotStarted(worker, reason, last_lines))
+                return []
+            case WorkerExit():
+                return self._deal() if self.membership.record_exit(ended) else []
 
     def remove_silent(self, now: float) -> list[Outgoing]:
         """Remove workers that were silent for longer than `worker_timeout_s`.

@@ -70,10 +70,9 @@ class DescribeCoordinator(Coordinator[Member]):
             return []
         try:
             described = read_description(message.description)
-        except BadMessage as error:
-            return self._unusable(member, f"its description of the environment: {error}")
-        try:
             self._accept(described)
+        except BadMessage as error:
+            return self._unsuitable(member, Described, f"its description of the environment: {error}")
         except UsageError as error:
             return self._unsuitable(member, Described, str(error))
         self.described = described

@@ -82,6 +82,17 @@ class WorkerProcessFailed(Failed):
 
 
 @dataclass(frozen=True)
+class WorkerNotStarted:
+    """A process that this program started ended by itself before it had joined."""
+
+    json_name: ClassVar[str] = "not_started"
+    worker: str
+    why: str
+    last_lines: str = ""
+    """What it wrote last."""
+
+
+@dataclass(frozen=True)
 class RejoinRequested:
     """A worker was told to join again because its session had ended.
 
@@ -94,17 +105,17 @@ class RejoinRequested:
     late: int
 
 
-Event = WorkerJoined | WorkerLeft | WorkerRefused | Failed | RejoinRequested
+Event = WorkerJoined | WorkerLeft | WorkerRefused | WorkerNotStarted | Failed | RejoinRequested
 
 
 def describe(event: Event) -> str:
-    """Text for the log: one line, and below it the traceback if there is one, indented, so that none of its lines looks
-    like a line of the log. Whatever a peer has named is shown without control characters.
+    """Text for the log: one line, and below it the traceback or the last lines if there are any, indented, so that none of
+    them looks like a line of the log. Whatever a peer has named is shown without control characters.
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:
-        case Failed(traceback=traceback) if traceback:
-            return f"{line}\n{indented(traceback)}"
+        case Failed(traceback=below) | WorkerNotStarted(last_lines=below) if below:
+            return f"{line}\n{indented(below)}"
         case _:
             return line
 
@@ -120,6 +131,8 @@ def _line(event: Event) -> str:
         case Failed(worker, host, error, spare=spare):
             died = isinstance(event, WorkerProcessFailed) and not spare
             return f"worker {worker} ({host}): {error}" + ("; this counts as a failure of the environment" if died else "")
+        case WorkerNotStarted(worker, why):
+            return f"worker {worker} {why}"
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"

@@ -28,6 +28,7 @@ from learner.members.events import (
     RejoinRequested,
     WorkerJoined,
     WorkerLeft,
+    WorkerNotStarted,
     WorkerRefused,
     describe,
 )
@@ -157,13 +158,15 @@ class MemberServer:
             self._log_events(cause)
 
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
-        """Call `turn`, which listens, until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`.
+        """Call `turn`, which listens, until this number of `workers` have joined.
 
-        Workers that only evaluate do not count.
+        Raises `NoWorkers` after `timeout_s`, or at once if so many cannot join any more. Workers that only evaluate do not
+        count.
         """
         deadline_s, wait = self._clock() + timeout_s, LongWait(self._clock())
         while (joined := len(self._membership.collectors())) < workers:
             now = self._clock()
+            self.check_left(workers, collecting=True)
             if now > deadline_s:
                 raise self.no_workers(workers, timeout_s)
             if wait.due(now):
@@ -174,7 +177,8 @@ class MemberServer:
             turn()
 
     def check_members(self, timeout_s: float, *, collecting: bool = False) -> None:
-        """Raise `NoWorkers` if every call for `timeout_s` has found no worker. Call it after each turn of a wait.
+        """Raise `NoWorkers` if every call for `timeout_s` has found no worker, or at once if none can join any more. Call it
+        after each turn of a wait.
 
         `collecting`: workers that only evaluate are no help.
         """
@@ -182,9 +186,20 @@ class MemberServer:
         if any(not (collecting and member.hello.evaluates) for member in self._membership.members.values()):
             self._no_members_since_s = math.inf
             return
+        self.check_left(1, collecting=collecting)
         self._no_members_since_s = min(self._no_members_since_s, now)
         if now - self._no_members_since_s > timeout_s:
             raise self.no_workers(1, timeout_s)
+
+    def check_left(self, workers: int, *, collecting: bool) -> None:
+        """Raise `NoWorkers` if this program has started the workers, nobody else can join, and fewer than these are left."""
+        left = self._processes.left(collecting)
+        if left >= workers:
+            return
+        why = f": the last one {self._last_turned_away}" if self._last_turned_away else ""
+        if workers == 1:
+            raise NoWorkers(f"no worker is left, and none will be started again{why}")
+        raise NoWorkers(f"waited for {workers} workers (--min-workers), and only {left:g} of them can still join{why}")
 
     def wait_until_all_left(self, deadline_s: float, poll_s: float) -> None:
         """Listen until no member is left, at most until the deadline. Silent workers are not removed."""
@@ -294,6 +309,8 @@ class MemberServer:
             match event:
                 case WorkerRefused(_, why):
                     self._last_turned_away = f"was refused: {one_line(why)}"
+                case WorkerNotStarted(_, why):
+                    self._last_turned_away = why
                 case WorkerLeft(worker, why, _, on_purpose):
                     expected = on_purpose and self._membership.draining is not None
                     self._last_turned_away = self._last_turned_away if expected else why

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from learner.members.events import Failed
 from learner.members.membership import Member
-from protocol.alive import WorkerActivity, WorkerExit
+from protocol.alive import StartFailed, WorkerActivity, WorkerExit
 
 
 @dataclass(frozen=True)
 class ProcessCallbacks:
     """The worker processes of this program; by default there are none."""
 
-    ended: Callable[[], Iterable[WorkerExit]] = lambda: ()
+    ended: Callable[[], Iterable[WorkerExit | StartFailed]] = lambda: ()
     """Returns the workers whose processes have ended since the last call. It may raise."""
     running: Callable[[], Iterable[WorkerActivity]] = lambda: ()
     """Returns what the workers do whose processes run. A stopped process is left out."""
     said: Callable[[], Mapping[str, str]] = dict
     """Returns the last line that each of them wrote to its log, by the worker's name; what wrote nothing is left out."""
+    left: Callable[[bool], float] = lambda collecting: math.inf
+    """Returns how many workers run or will be started again; infinity if others may join. True: of those that collect."""
     count: Callable[[], int] | None = None
     """Returns the number of processes that step the environment. None: one per member."""
     lower_priority: Callable[[], None] = lambda: None

@@ -20,7 +20,7 @@ from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.shared_steps import SharedSteps
 from learner.vector_env.vector_env_status import status
 from protocol.errors import NoWorkers
-from protocol.messages import Answer, Order, Status, WorkerActivity, WorkerExit
+from protocol.messages import Answer, Order, Status
 from protocol.specs import StepSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -35,14 +35,6 @@ BUSY_S = 1.0  # how long closing waits for a step under way: the step may hang, 
 
 class LocalWorkers(Protocol):
     """The worker processes that this program started."""
-
-    def poll(self) -> Iterable[WorkerExit]:
-        """Each process that ended since the last call. Restarts the processes whose backoff is over."""
-        ...
-
-    def activities(self) -> Iterable[WorkerActivity]:
-        """What each running worker does."""
-        ...
 
     def kill(self, name: str) -> bool:
         """Kill the process of this name. False if this program did not start it."""
@@ -68,6 +60,7 @@ class StepHub:
         *,
         first_session: int,
         local_workers: LocalWorkers,
+        processes: ProcessCallbacks | None = None,
         shared: SharedSteps | None = None,
         worker_timeout_s: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
@@ -105,8 +98,7 @@ class StepHub:
             self._on_event,
             (lambda peer: None) if shared is None else shared.wake_for_message,
         )
-        processes = ProcessCallbacks(self._local_workers.poll, self._local_workers.activities)
-        self._server = MemberServer(link, self.coordinator, callbacks, processes, settings, clock)
+        self._server = MemberServer(link, self.coordinator, callbacks, processes or ProcessCallbacks(), settings, clock)
 
     @property
     def address(self) -> str:
@@ -249,10 +241,15 @@ class StepHub:
     # ---------------------------------------------------------------- inside
 
     def _turn(self, timeout_s: float) -> None:
-        """Listen, remove the workers that are gone, and send the orders that can be sent."""
+        """Listen, remove the workers that are gone, and send the orders that can be sent.
+
+        Raises `NoWorkers` if an order waits for a worker, and none can join any more.
+        """
         self._listen_due_s = self.now() + LISTEN_EVERY_S
         self.while_waiting()
         self._server.listen(timeout_s)
+        if self._waiting_orders and not self.coordinator.members:
+            self._server.check_left(1, collecting=True)
         self._send_waiting_orders()
 
     def _send_waiting_orders(self) -> None:

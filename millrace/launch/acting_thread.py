@@ -14,7 +14,7 @@ from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
 from millrace.launch.endpoint import Endpoint
-from protocol.alive import WorkerExit
+from protocol.alive import StartFailed, WorkerExit
 from protocol.arrays import Array
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import PolicySpec, RunSpec
@@ -59,7 +59,7 @@ def acting_thread(
 def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEnv, expected: int) -> ProcessCallbacks:
     """The thread, and the workers that step the copies of `env`. `expected`: number of these that the user asked for."""
 
-    def ended() -> list[WorkerExit]:
+    def ended() -> list[WorkerExit | StartFailed]:
         lanes.raise_if_no_workers()
         return thread.poll()
 

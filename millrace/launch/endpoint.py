@@ -5,6 +5,7 @@ Rule: whatever happens, closing `resources` releases all that was acquired, and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -58,12 +59,19 @@ class Endpoint(Bound):
         run are asked to leave, and killed after `stop_within_s`.
         """
 
+        def evaluates(name: str) -> bool:
+            return int(name.removeprefix("w")) >= count - evaluating
+
+        def left(collecting: bool) -> float:
+            if not count:  # they join from elsewhere
+                return math.inf
+            return sum(not (collecting and evaluates(name)) for name in supervisor.names)
+
         def start(name: str) -> Running:
-            evaluates = int(name.removeprefix("w")) >= count - evaluating
             if self.link.address.startswith("inproc://"):
-                return WorkerThread(self.link.address, name, self.context, evaluates=evaluates)
+                return WorkerThread(self.link.address, name, self.context, evaluates=evaluates(name))
             own, log_file = flags(name)
-            own = [*own, "--evaluate"] if evaluates else own
+            own = [*own, "--evaluate"] if evaluates(name) else own
             if (descriptors := handed(name)) is not None:
                 own = [*own, "--handed", ",".join(map(str, descriptors))]
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, own, descriptors or ()))
@@ -76,6 +84,7 @@ class Endpoint(Bound):
             supervisor.poll,
             supervisor.activities,
             supervisor.said,
+            left=left,
             lower_priority=supervisor.lower_priority,
             expected=count,
             most_copies=copies_per_machine() if count else 0,

@@ -251,6 +251,7 @@ class StartedVectorEnv:
             description.step,
             first_session=int.from_bytes(os.urandom(6), "little"),
             local_workers=self.workers.supervisor,
+            processes=self.workers.processes,
             shared=shared,
             worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
         )

@@ -19,3 +19,5 @@ class Ending:
     """Its environment, or the worker, is to blame: it ended neither on purpose nor before it ran environment code."""
     worked: bool = False
     """Calls of its environment have returned."""
+    last_lines: str | None = None
+    """What it wrote last, if it ended by itself before it had joined a run."""

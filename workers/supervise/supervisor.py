@@ -6,6 +6,9 @@ and is reset once calls of the environment have returned, or a worker has run fo
 dies is soon there again; the learner counts its failures. A worker is on purpose only if it said so beforehand: the exit
 codes that an environment makes are failures. No worker outlives its supervisor.
 
+One that has never joined a run, and has ended soon after its start `MOST_FAILED_STARTS` times in a row, is not started
+again: what keeps it from starting, such as a broken installation, does not go away by itself.
+
 With `stay`, only a refusal is final: each worker that has left a run is followed by a new one, which waits for the next.
 """
 
@@ -18,7 +21,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from protocol.alive import NO_TIMEOUTS, CallTimeouts, WorkerActivity, WorkerExit
+from protocol.alive import NO_TIMEOUTS, CallTimeouts, StartFailed, WorkerActivity, WorkerExit
+from protocol.bounds import one_line
 from protocol.errors import UsageError
 from workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
 from workers.supervise.ending import Ending
@@ -26,6 +30,8 @@ from workers.supervise.ending import Ending
 log = logging.getLogger("millrace.worker")
 
 BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
+MOST_FAILED_STARTS = 4
+GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
 STOP_WITHIN_S = 3.0  # at the end of a local run, after the workers were asked to leave
@@ -101,6 +107,8 @@ class _NamedWorker:
     backoff_s: float = BACKOFF_FIRST_S
     restart_s: float | None = None
     exit_code: int = 0  # of the last one that ended
+    has_joined: bool = False  # one of them has joined a run
+    failed_starts: int = 0  # in a row
 
 
 class Supervisor:
@@ -133,12 +141,15 @@ class Supervisor:
             self.stop(0.0)
             raise
 
-    def poll(self) -> list[WorkerExit]:
+    def poll(self) -> list[WorkerExit | StartFailed]:
         """The workers that have ended since the last call. Ends those that hang, and starts those whose restart is due."""
-        return [each for each, _ in self._ended()]
+        return [
+            worker_exit if end.last_lines is None else StartFailed(worker_exit.worker, worker_exit.reason, end.last_lines)
+            for worker_exit, end in self._ended()
+        ]
 
     def _ended(self) -> list[tuple[WorkerExit, Ending]]:
-        ended, now = [], self._clock()
+        ended, now = list[tuple[WorkerExit, Ending]](), self._clock()
         enforce = now >= self._enforce_due_s
         if enforce:
             self._enforce_due_s = now + ENFORCE_EVERY_S
@@ -146,8 +157,10 @@ class Supervisor:
             if worker.running is not None and enforce:
                 worker.running.enforce(self._timeouts, now)
             if worker.running is not None and (end := worker.running.ended()) is not None:
-                ended.append((WorkerExit(worker.running.name, worker.running.process_nonce, end.reason, end.failed), end))
+                nonce = worker.running.process_nonce
                 self._record_end(worker, end, now)
+                reason = end.reason + (GIVEN_UP if worker.failed_starts == MOST_FAILED_STARTS else "")
+                ended.append((WorkerExit(worker.name, nonce, one_line(reason), end.failed), end))
             if worker.restart_s is not None and now >= worker.restart_s and not self._stopping:
                 self._restart(worker, now)
         return ended
@@ -168,10 +181,13 @@ class Supervisor:
         left = end.on_purpose and end.code in (0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE)
         told_early = self._stopping and end.code == -signal.SIGTERM  # to leave, before it could listen to signals
         worker.running, worker.exit_code = None, end.code if left else 0 if told_early else 1
-        if end.worked or now - worker.started_s > HEALTHY_S or (left and end.code == 0):
+        healthy = end.worked or now - worker.started_s > HEALTHY_S or (left and end.code == 0)
+        if healthy:
             worker.backoff_s = BACKOFF_FIRST_S
+        worker.has_joined |= end.last_lines is None
+        worker.failed_starts = 0 if healthy or worker.has_joined or self._stay else worker.failed_starts + 1
         final = left and (end.code == EXIT_REFUSED or not self._stay)
-        if not final and not self._stopping:
+        if not final and not self._stopping and worker.failed_starts < MOST_FAILED_STARTS:
             self._schedule(worker, now)
 
     def _schedule(self, worker: _NamedWorker, now: float) -> None:
@@ -190,10 +206,15 @@ class Supervisor:
         return {name: line for name, line in found.items() if line}
 
     @property
+    def names(self) -> list[str]:
+        """The names of the workers that run or will be restarted."""
+        restarts = not self._stopping
+        return [each.name for each in self._workers if each.running is not None or (restarts and each.restart_s is not None)]
+
+    @property
     def count(self) -> int:
         """Number of workers that run or will be restarted."""
-        restarts = not self._stopping
-        return sum(each.running is not None or (restarts and each.restart_s is not None) for each in self._workers)
+        return len(self.names)
 
     @property
     def exit_code(self) -> int:

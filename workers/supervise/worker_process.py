@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from protocol.alive import CALLS, NO_ENVIRONMENT_CODE, CallTimeouts, WorkerActivity
-from protocol.bounds import one_line
+from protocol.bounds import escaped, one_line
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
 from workers.activity import STACK_SIGNAL, ActivityReader
@@ -40,6 +40,7 @@ CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments a
 KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # bytes of a log that are read for what it ends with
+MOST_LAST_LINES, MAX_LAST_TEXT = 12, 2_000  # lines and characters of it that are shown if a worker cannot start
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -78,9 +79,11 @@ class WorkerProcess:
         command += ["--slots", str(self._slots), *start.flags]
         # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[2])])
-        secret = {NONCE_VARIABLE: str(self.process_nonce)}
+        # A token that this program has not given the worker is not for this learner.
+        environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
+        environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}
         if start.token is not None:
-            secret[TOKEN_VARIABLE] = start.token.to_text()
+            environment[TOKEN_VARIABLE] = start.token.to_text()
         try:
             with _opened(start.log) as stderr:
                 self._log_from = stderr.tell()  # what stands before is of another process
@@ -90,7 +93,7 @@ class WorkerProcess:
                     stdout=stderr if start.log else None,
                     stderr=stderr if start.log else None,
                     start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
-                    env={**os.environ, **SINGLE_THREADED, **secret, "PYTHONPATH": path},
+                    env=environment,
                     pass_fds=(self._page.fd, self._slots, *start.handed),
                 )
         except BaseException:
@@ -242,7 +245,8 @@ class WorkerProcess:
             line = f"ended with exit code {code}{meanwhile}{last if code else ''}"
         # In `close`, an environment has done its work: that its process ends there does not count against the run.
         failed = page.doing != "closing" and (worked or page.doing not in NO_ENVIRONMENT_CODE)
-        return Ending(code, one_line(line), failed=failed, worked=worked)
+        last_lines = _end_of(output) if page.doing == "starting" else None
+        return Ending(code, one_line(line), failed=failed, worked=worked, last_lines=last_lines)
 
     def _output(self) -> str:
         """What it has written to its log, the end of it if that is long: a simulator may write without a limit."""
@@ -262,6 +266,11 @@ class WorkerProcess:
             else:
                 with self._log.open("a") as log:
                     log.write(text)
+
+
+def _end_of(output: str) -> str:
+    """Its last lines."""
+    return escaped("\n".join(output.strip().splitlines()[-MOST_LAST_LINES:]))[-MAX_LAST_TEXT:]
 
 
 def _signal_name(number: int) -> str:

@@ -98,6 +98,13 @@ def test_a_description_that_cannot_be_read_gets_its_sender_refused_and_another_i
     assert made.described is not None
 
 
+def test_a_description_of_a_worker_of_ours_that_cannot_be_read_ends_the_start_with_the_reason() -> None:
+    made = coordinator()
+    made.receive(A, Described(join(made, A), BROKEN), 1.0)
+    assert "its description of the environment: " in str(made.unsuitable)
+    assert "low: expected float32(2,)" in str(made.unsuitable)
+
+
 def test_a_message_that_exceeds_the_bounds_gets_its_sender_refused() -> None:
     made = coordinator()
     join(made, A)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import cast
@@ -23,7 +24,7 @@ from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import OrderCoordinator
 from learner.vector_env.step_hub import StepHub
 from learner.vector_env.vector_env_status import status
-from protocol.alive import WorkerActivity, WorkerExit
+from protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from protocol.errors import NoWorkers
 from protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, ToLearner
 from protocol.wire.learner_link import LearnerLink
@@ -39,18 +40,22 @@ class Served:
 
     def __init__(self, settings: ServerSettings | None = None) -> None:
         self.link = FakeLink()
-        self.ended: list[WorkerExit] = []
+        self.ended: list[WorkerExit | StartFailed] = []
+        self.left = {"all": math.inf, "collecting": math.inf}
         self.running: list[WorkerActivity] = []
         self.asked = 0
         self.coordinator = OrderCoordinator(SPEC, 1, TIMEOUT_S)
         callbacks = ServerCallbacks(self.coordinator.receive, lambda now: status(self.coordinator, now), lambda event: None)
         link = cast(LearnerLink, self.link)
-        processes = ProcessCallbacks(self._ended, self._running)
+        processes = ProcessCallbacks(self._ended, self._running, left=self._left)
         self.server = MemberServer(link, self.coordinator, callbacks, processes, settings, lambda: self.link.now)
         self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
         self.server.listen(POLL_S)
 
-    def _ended(self) -> list[WorkerExit]:
+    def _left(self, collecting: bool) -> float:
+        return self.left["collecting" if collecting else "all"]
+
+    def _ended(self) -> list[WorkerExit | StartFailed]:
         ended, self.ended = self.ended, []
         return ended
 
@@ -245,6 +250,25 @@ def test_what_became_of_workers_is_said_where_one_is_missing() -> None:
     assert says.endswith("1 joined (3 were not let in; the log says why); start one: millrace worker fake --token FILE")
     served.says(b"w1", Hello(PROTOCOL_VERSION + 1, "w1", "host", 1, 1, "fake", 1))
     assert "1 joined (the last one was refused: protocol: expected" in str(served.server.no_workers(2, 1.0))
+
+
+def test_a_wait_ends_at_once_when_nobody_is_left_who_could_work(caplog: pytest.LogCaptureFixture) -> None:
+    served, why = Served(), "ended with exit code 1 while it started (no licence)"
+    served.left = {"all": 1.0, "collecting": 0.0}
+    served.server.check_members(TIMEOUT_S, collecting=True)  # there is a member
+    served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
+    served.ended.append(StartFailed("w1", why, "first\nno licence"))
+    served.server.listen(POLL_S)
+    assert caplog.messages[-1] == f"worker w1 {why}\n    first\n    no licence"
+    served.server.check_members(TIMEOUT_S)  # one that only evaluates is left
+    with pytest.raises(NoWorkers) as raised:
+        served.server.check_members(TIMEOUT_S, collecting=True)
+    assert str(raised.value) == f"no worker is left, and none will be started again: the last one {why}"
+    served.left["collecting"] = 1.0
+    with pytest.raises(
+        NoWorkers, match=r"waited for 2 workers \(--min-workers\), and only 1 of them can still join: the last"
+    ):
+        served.server.wait_for(2, TIMEOUT_S, lambda: served.server.listen(POLL_S))
 
 
 def test_new_members_of_one_key_are_limited() -> None:

@@ -21,6 +21,13 @@ from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
 from tests.system.stage.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within
 
+LOCAL = {"transport": "tcp", "rollout-steps": 16, "batch-size": 64, "n-epochs": 1, "eval-episodes": 1}
+LOCAL_FLAGS = [
+    *("--env-kwargs", "seconds", "0.005"),
+    *(word for name, value in LOCAL.items() for word in (f"--{name}", str(value))),
+]
+"""of a run whose workers are child processes of the learner"""
+
 # ---------------------------------------------------------------- workers
 
 
@@ -36,9 +43,7 @@ def test_training_goes_on_after_a_worker_is_killed(stage: Stage) -> None:
 
 def test_a_killed_worker_of_a_local_run_is_restarted(stage: Stage) -> None:
     """The worker is a child process of the learner, which notices its death at once and restarts it."""
-    settings = {"transport": "tcp", "rollout-steps": 16, "batch-size": 64, "n-epochs": 1, "eval-episodes": 1}
-    flags = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
-    command = [sys.executable, "-m", "millrace", "train", TOY, "--env-kwargs", "seconds", "0.005", *flags]
+    command = [sys.executable, "-m", "millrace", "train", TOY, *LOCAL_FLAGS]
     said = stage.tmp_path / "train.log"
     learner = Learner([*command, "--run-dir", str(stage.runs)], said, stage.runs)
     stage.started.append(learner)
@@ -81,6 +86,36 @@ def test_a_run_without_workers_saves_a_checkpoint_and_fails(stage: Stage) -> Non
     assert int(learner.checkpoints()[-1].stem) == summary["env_steps"], "the last update was not saved"
     ledger = accounted(summary)
     assert ledger["lost"] > 0
+
+
+def test_a_local_run_ends_at_once_when_its_last_worker_has_left(stage: Stage) -> None:
+    command = [sys.executable, "-m", "millrace", "train", TOY, *LOCAL_FLAGS, "--run-dir", str(stage.runs)]
+    learner = Learner([*command, "--workers", "1"], stage.tmp_path / "train.log", stage.runs)
+    stage.started.append(learner)
+    learner.trains(2)
+    os.kill(workers_of(learner.pid)[0].pid, signal.SIGTERM)
+    began_s = time.monotonic()
+    assert learner.ends() == 1
+    within("the only worker asked to leave, the run ended", time.monotonic() - began_s, NOTICED_S + 2)
+    why = "no worker is left, and none will be started again: the last one left: told to stop"
+    assert why in learner.said().splitlines()[-1]
+    assert int(learner.checkpoints()[-1].stem) == learner.summary()["env_steps"], "the last update was not saved"
+
+
+def test_a_local_run_whose_workers_cannot_start_ends_with_what_they_wrote(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\nif 'workers' in sys.orig_argv:\n    raise SystemExit('no licence')\n"
+    )
+    command = [sys.executable, "-m", "millrace", "train", TOY, "--workers", "1", "--run-dir", str(tmp_path / "runs")]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=START_S)
+    assert run.returncode == 1
+    assert run.stdout.count("worker w0 ended with exit code 1 while it started (SystemExit: no licence)") == 4
+    assert "\n    SystemExit: no licence\n" in run.stdout
+    last = run.stderr.splitlines()[-1]
+    assert last.startswith(
+        "millrace: no worker is left, and none will be started again: the last one ended with exit code 1"
+    )
 
 
 def test_a_worker_delivers_its_rollout_after_sigterm(stage: Stage) -> None:

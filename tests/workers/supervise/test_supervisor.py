@@ -8,16 +8,18 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from protocol.alive import CallTimeouts, Doing, WorkerActivity, WorkerExit
+from protocol.alive import CallTimeouts, Doing, StartFailed, WorkerActivity, WorkerExit
 from workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
 from workers.supervise.ending import Ending
 from workers.supervise.supervisor import (
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
     ENFORCE_EVERY_S,
+    GIVEN_UP,
     HANGS_AFTER_S,
     HEALTHY_S,
     LEAVE_WITHIN_S,
+    MOST_FAILED_STARTS,
     POLL_S,
     Supervisor,
 )
@@ -73,9 +75,18 @@ class Machine:
         self.started.append((name, FakeRunning(name)))
         return self.started[-1][1]
 
-    def die(self, code: int, after_s: float = 0.0, *, on_purpose: bool = False, worked: bool = False) -> list[WorkerExit]:
+    def die(
+        self,
+        code: int,
+        after_s: float = 0.0,
+        *,
+        on_purpose: bool = False,
+        worked: bool = False,
+        last_lines: str | None = None,
+    ) -> list[WorkerExit | StartFailed]:
         self.now += after_s
-        self.started[-1][1].end = Ending(code, "why", on_purpose, failed=not on_purpose, worked=worked)
+        failed = not on_purpose and last_lines is None
+        self.started[-1][1].end = Ending(code, "why", on_purpose, failed, worked, last_lines)
         return self.host.poll()
 
     def pause_s(self) -> float:
@@ -112,6 +123,32 @@ def test_a_worker_that_cannot_be_started_again_now_is_tried_again(monkeypatch: p
     machine.die(1)
     assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S * (1 + 2 + 4), abs=0.31)
     assert machine.host.count == 2
+
+
+def test_one_that_ends_again_and_again_before_it_has_joined_is_given_up() -> None:
+    machine = Machine()
+    for _ in range(MOST_FAILED_STARTS - 1):
+        assert machine.die(1, last_lines="no licence") == [StartFailed("w0", "why", "no licence")]
+        assert machine.host.names == ["w0"]
+        machine.pause_s()
+    assert machine.die(1, last_lines="") == [StartFailed("w0", f"why{GIVEN_UP}", "")]
+    assert machine.host.names == []
+    assert machine.host.exit_code == 1
+
+
+@pytest.mark.parametrize("stay", [False, True])
+def test_one_that_has_joined_or_waited_for_long_or_stays_is_started_again_however_often_it_cannot_start(stay: bool) -> None:
+    machine = Machine(stay=stay)
+    if not stay:
+        machine.die(1)  # it had joined
+        machine.pause_s()
+    for _ in range(2 * MOST_FAILED_STARTS):
+        machine.die(1, last_lines="no memory")
+        machine.pause_s()
+    patient = Machine()
+    for _ in range(2 * MOST_FAILED_STARTS):
+        patient.die(-9, after_s=HEALTHY_S + 1, last_lines="")
+        patient.pause_s()
 
 
 def test_if_a_worker_cannot_be_started_at_first_none_is_left_behind() -> None:

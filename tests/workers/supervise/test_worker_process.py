@@ -16,11 +16,12 @@ from typing import Any
 
 import pytest
 
+from protocol.keys.key_folder import TOKEN_VARIABLE
 from workers import program
 from workers.activity import ENV_CALLS, ActivityReader
 from workers.supervise import worker_process
 from workers.supervise.ending import Ending
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from workers.supervise.worker_process import MOST_LAST_LINES, WorkerCommand, WorkerProcess
 
 WITHIN_S = 60.0
 
@@ -49,18 +50,20 @@ def children_reaped_by_the_system() -> Iterator[None]:
 
 def test_the_signal_that_ended_a_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     ending = ending_of("kill -9 $$", monkeypatch)
-    assert ending == Ending(-9, "was killed by SIGKILL while it started")
+    assert ending == Ending(-9, "was killed by SIGKILL while it started", last_lines="")
 
 
 def test_a_signal_without_a_name_is_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
     ending = ending_of(f"kill -{signal.SIGRTMIN + 1} $$", monkeypatch)
-    assert ending == Ending(-signal.SIGRTMIN - 1, f"was killed by signal {signal.SIGRTMIN + 1} while it started")
+    assert ending == Ending(
+        -signal.SIGRTMIN - 1, f"was killed by signal {signal.SIGRTMIN + 1} while it started", last_lines=""
+    )
 
 
 def test_a_process_that_was_reaped_already_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     with children_reaped_by_the_system():
         ending = ending_of("exit 3", monkeypatch)
-    assert ending == Ending(0, "ended while it started; its exit code is not known")
+    assert ending == Ending(0, "ended while it started; its exit code is not known", last_lines="")
 
 
 def test_the_wait_for_a_process_that_no_signal_ends_has_a_deadline(
@@ -79,7 +82,7 @@ def test_the_wait_for_a_process_that_no_signal_ends_has_a_deadline(
         f"worker w0 (process {worker.pid}) was killed and has not ended; it is left behind"
     ]
     worker.wait(0.0)  # with a signal that ends it
-    assert worker.ended() == Ending(-9, "was killed by SIGKILL while it started")
+    assert worker.ended() == Ending(-9, "was killed by SIGKILL while it started", last_lines="")
 
 
 def test_a_worker_is_spoken_for_until_its_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +95,7 @@ def test_a_worker_is_spoken_for_until_its_end_is_told(monkeypatch: pytest.Monkey
         os.waitid(os.P_PID, worker.pid, os.WEXITED | os.WNOWAIT)
         assert worker.ended() is None
         assert worker.activity(time.monotonic()) is not None
-    assert worker.ended() == Ending(3, "ended with exit code 3 while it started")
+    assert worker.ended() == Ending(3, "ended with exit code 3 while it started", last_lines="")
     assert worker.activity(time.monotonic()) is None
 
 
@@ -107,6 +110,24 @@ def test_the_end_says_whether_calls_of_the_environment_had_returned(monkeypatch:
         assert ending is not None
         worked.append(ending.worked)
     assert worked == [False, True]
+
+
+def test_what_a_worker_wrote_last_is_told_if_it_ended_before_it_had_joined(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    script = "for i in $(seq 100); do echo line $i; done; exit 3"
+    monkeypatch.setattr(worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", script], **how))
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0", tmp_path / "w0.log"))
+    worker.wait(WITHIN_S)
+    last_lines = "\n".join(f"line {n}" for n in range(101 - MOST_LAST_LINES, 101))
+    assert worker.ended() == Ending(3, "ended with exit code 3 while it started (line 100)", last_lines=last_lines)
+
+
+def test_a_worker_gets_the_token_that_its_supervisor_gives_it_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(TOKEN_VARIABLE, "of another learner")
+    ending = ending_of(f"exit ${{#{TOKEN_VARIABLE}}}", monkeypatch)
+    assert ending is not None
+    assert ending.code == 0, "the length of the token"
 
 
 def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatch: pytest.MonkeyPatch) -> None:
