@@ -109,9 +109,9 @@ class RolloutKeywords(TypedDict, total=False):
     max_env_failures: int
     """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
     between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this ×
-    (1 + env copies × hours since the learner began, at most 1). A failure is an exception or an unusable result of the
-    environment or of an `OwnPolicy`, or a worker process that ends without being told to: the environment may have
-    ended it.
+    (1 + env copies × hours since the learner began, at most 1, + w / 30), where w is the seconds that the failed
+    workers had worked before. A failure is an exception or an unusable result of the environment or of an `OwnPolicy`,
+    or a worker process that ends without being told to: the environment may have ended it.
     """
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
+from learner.members.events import Event
 from learner.members.failure_count import FailureCount
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -63,10 +64,14 @@ def described_by_workers(
     )
     failures = FailureCount(settings.max_env_failures, began_s=clock())
     members = coordinator.membership.members
+
+    def count(event: Event) -> None:
+        failures.count(event, clock())  # none comes after env steps, so there is no line to log
+
     callbacks = ServerCallbacks(
         coordinator.receive,
         lambda now: coordinator.status(settings.steps, now),
-        lambda event: failures.count(event, clock()),
+        count,
     )
     server_settings = ServerSettings(log_joins=False)
     server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)

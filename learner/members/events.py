@@ -54,8 +54,8 @@ class Failed:
     traceback: str = ""
     lanes: tuple[int, ...] = ()
     """The lane that failed, if it is known; else those that the worker held."""
-    stepped: bool = False
-    """Whether the worker's process is known to have made an env step."""
+    worked_s: float | None = None
+    """For how many seconds the worker had made env steps before; None if its process is not known to have made one."""
     spare: bool = False
     """Whether it held no lane while every lane had a worker. Such a failure does not count against the run."""
 

@@ -5,9 +5,12 @@ Rule: a failure is counted twice, and either count ends the run.
 * In a row: the failures of one lane since its last rollout. `max_env_failures` are allowed, and never more than
   `MOST_IN_A_ROW`, so that what never works ends the run soon also where many failures are allowed. A failure after env steps
   counts as `AFTER_STEPS`: by chance, a simulator that often dies fails a few times before a rollout is whole.
-* Within an hour: the failures of all lanes that came after env steps. `max_env_failures` are allowed, and as many again for
-  each env copy and each hour since the learner began. So a mistake in an environment's code ends a run that has just begun,
-  and a run of many copies and hours survives crashes in proportion.
+* Within an hour: the failures of all lanes that came after env steps. `max_env_failures` are allowed; as many again for each
+  env copy and each hour since the learner began; and as many again for each `WORK_S` that the workers which failed had
+  worked. So a mistake in an environment's code ends a run that has just begun, and a simulator that crashes now and then
+  does not, as long as its workers work for most of the time.
+
+That ends a run late, so a person is told early: of the fourth failure within an hour, and whenever their number has doubled.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from protocol.errors import EnvironmentFailed, PolicyFailed
 MOST_IN_A_ROW = 10
 AFTER_STEPS = 0.25
 HOUR_S = 3600.0
+WORK_S = 30.0
+TOLD_FIRST = 4
 
 
 class FailureCount:
@@ -30,20 +35,25 @@ class FailureCount:
         self._allowed, self._copies, self._began_s = allowed, copies, began_s
         self._in_a_row: dict[int | str, float] = {}
         self._error: EnvironmentFailed | PolicyFailed | None = None
-        self._failed_at_s: list[float] = []  # times of the failures of the last hour, of those after env steps
+        self._within_hour: list[tuple[float, float]] = []  # of failures after env steps: when, and the seconds worked before
+        self._told_at = TOLD_FIRST  # number of failures within an hour
 
-    def failed(self, lanes: Collection[int | str], stepped: bool, now: float) -> str:
+    def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:
         """Count one failure, which took these lanes down. Returns why the run ends, or an empty string.
 
-        `stepped`: whether the worker's process is known to have made an env step.
+        `worked_s`: for how long the worker had made env steps; None if its process is not known to have made one.
         """
+        stepped = worked_s is not None
         for lane in lanes:
             self._in_a_row[lane] = self._in_a_row.get(lane, 0.0) + (AFTER_STEPS if stepped else 1.0)
-        if stepped:
-            self._failed_at_s = [*(at_s for at_s in self._failed_at_s if now - at_s < HOUR_S), now]
-            failures, copy_hours = len(self._failed_at_s), self._copies * min(1.0, (now - self._began_s) / HOUR_S)
-            if failures > (allowed := int(self._allowed * (1 + copy_hours))):
-                why = f"{self._allowed}, and as many an hour for each of {self._copies} env copies; set it higher if need be"
+        if worked_s is not None:
+            recent = [(at_s, before_s) for at_s, before_s in self._within_hour if now - at_s < HOUR_S]
+            self._within_hour = [*recent, (now, min(worked_s, HOUR_S))]
+            failures, allowed = len(self._within_hour), self._allowed_within_hour(now)
+            if failures > allowed:
+                more = f"as many for each {WORK_S:g} s that the workers which failed had worked"
+                copies = f"as many an hour for each of {self._copies} env copies"
+                why = f"{self._allowed}, {more}, and {copies}; set it higher if need be"
                 return f"failure {failures} within an hour; max_env_failures allows {allowed} ({why})"
         in_a_row, allowed = max(map(self._in_a_row.__getitem__, lanes)), min(self._allowed, MOST_IN_A_ROW)
         if in_a_row <= allowed:
@@ -52,13 +62,37 @@ class FailureCount:
         why = f" (one after env steps counts as {AFTER_STEPS:g}{hint})" if in_a_row % 1 else ""
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
 
-    def count(self, event: Event, now: float) -> None:
-        """Count an event that is a failure, of the environment or of the user's policy: they are counted together."""
+    def count(self, event: Event, now: float) -> str:
+        """Count an event that is a failure, of the environment or of the user's policy: they are counted together.
+
+        Returns a line for the log, if a person should hear how often the environment fails; else an empty string.
+        """
         if not isinstance(event, Failed) or event.spare or self._error is not None:
-            return
-        if why := self.failed(event.lanes or (event.worker,), event.stepped, now):
+            return ""
+        if why := self.failed(event.lanes or (event.worker,), event.worked_s, now):
             line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
             self._error = (PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed)(line, event.traceback)
+            return ""
+        return self._how_often(now)
+
+    def _allowed_within_hour(self, now: float) -> int:
+        copy_hours = self._copies * min(1.0, (now - self._began_s) / HOUR_S)
+        worked_s = sum(before_s for _, before_s in self._within_hour)
+        return int(self._allowed * (1 + copy_hours + worked_s / WORK_S))
+
+    def _how_often(self, now: float) -> str:
+        failures = len(self._within_hour)
+        if failures < self._told_at:
+            self._told_at = max(TOLD_FIRST, min(self._told_at, 2 * failures))  # they have become fewer
+            return ""
+        self._told_at = 2 * failures
+        seconds = now - self._within_hour[0][0]
+        worked_s = sum(before_s for _, before_s in self._within_hour) / failures
+        last = self._allowed_within_hour(now) + 1
+        return (
+            f"the environment has failed {failures} times in {seconds:.0f} s, after {worked_s:.0f} s of work on average; "
+            f"its workers are started again, and failure {last} within an hour would end the run"
+        )
 
     def check(self) -> None:
         """Raise the error that ends the run: the first failure that was one too many, if there was one."""

@@ -131,8 +131,8 @@ class Member:
     """Seconds in each stage of the worker's process before this session."""
     speed: Speed | None = None
     """Measured by its heartbeats; None: there was none."""
-    stepped: bool = False
-    """Whether its process is known to have made an env step: it has reported one, or sent a rollout."""
+    first_step_s: float | None = None
+    """Time since which its process is known to make env steps: it has reported one, or sent a rollout."""
     activity: WorkerActivity | None = None
     """What the worker does, as its supervisor said last."""
     activity_s: float = 0.0
@@ -165,7 +165,13 @@ class Member:
     ) -> Failed:
         """The event that says that the worker failed, in this lane if it is known."""
         lanes = (lane,) if lane in self.lanes else tuple(sorted(self.lanes))
-        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, self.stepped, spare)
+        worked_s = None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
+        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, worked_s, spare)
+
+    def has_stepped(self) -> None:
+        """Its process is known to have made an env step."""
+        if self.first_step_s is None:
+            self.first_step_s = self.heard_s
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
         """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
@@ -182,7 +188,8 @@ class Member:
         if self.heartbeat is None and not self.hello.is_first_attempt:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
-        self.stepped |= heartbeat.steps > 0
+        if heartbeat.steps:
+            self.has_stepped()
         if self.speed is None:
             self.speed = Speed(heartbeat.steps, self.heard_s)
         elif heartbeat.steps != self.speed.steps and self.heard_s - self.speed.at_s >= MEASURE_S:

@@ -15,6 +15,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from learner.members.events import Event
 from learner.members.failure_count import FailureCount
 from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
@@ -133,7 +134,7 @@ class Hub:
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
-        callbacks = ServerCallbacks(self._answer, self.status, lambda event: self._failures.count(event, clock()))
+        callbacks = ServerCallbacks(self._answer, self.status, self._count_failure)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)
 
@@ -343,9 +344,13 @@ class Hub:
         self._listen(timeout_s)
         self._check_interrupt()
         while self._processes.failed:
-            self._failures.count(self._processes.failed.pop(0), self._clock())
+            self._count_failure(self._processes.failed.pop(0))
         self._failures.check()
         self._server.check_members(self.settings.no_workers_timeout_s, collecting=not self._time.evaluating)
+
+    def _count_failure(self, event: Event) -> None:
+        if line := self._failures.count(event, self._clock()):
+            log.warning("%s", line)
 
     def _listen(self, timeout_s: float, short: bool = False) -> None:
         self._server.listen(timeout_s, short)

@@ -145,7 +145,7 @@ class RolloutDealer:
             return f"ticket {ticket.number}: expected {expects}, got {got}"
         self.ledger.transitions_received += rollout.env_steps
         self._end(member, ticket).arrived(rollout.sequence)
-        member.stepped = True
+        member.has_stepped()
         self.ready.setdefault(ticket.round, {})[ticket.lane] = AcceptedRollout(rollout, ticket.incarnation)
         return ""
 

@@ -5,6 +5,7 @@ Rule: whatever happens, no worker, socket file or folder of ours is left behind.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import time
@@ -143,9 +144,10 @@ def make_vec(
     deaths = FailureCount(settings.max_env_failures, len(settings.envs), time.monotonic())
 
     def died(event: Failed) -> None:
-        for lane in event.lanes if event.stepped else ():
+        for lane in event.lanes if event.worked_s is not None else ():
             deaths.collected(lane)  # every step is a result of its own
-        deaths.count(event, time.monotonic())
+        if line := deaths.count(event, time.monotonic()):
+            logging.getLogger("millrace.learner").warning("%s", line)
 
     timeouts = _call_timeouts(settings.timeout_s)
     flags = timeout_flags(timeouts)

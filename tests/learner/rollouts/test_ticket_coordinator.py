@@ -910,7 +910,7 @@ def test_a_failure_belongs_to_its_lane_or_to_all_of_the_workers_lanes(lane: int 
     learner.says(A, Failure(learner.session(A), "ValueError: x", "", lane))
     (failed,) = [event for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
     assert failed.lanes == lanes
-    assert failed.stepped, "a rollout has env steps"
+    assert failed.worked_s is not None, "a rollout has env steps"
 
 
 @pytest.mark.parametrize("kind", [PolicyRaised, EnvironmentRaised])
