@@ -1,8 +1,11 @@
 """The slots of this machine: each env copy holds the lowest number that is free, for its port, folder or display.
 
-Rule: no two live env copies on a machine have the same slot. A slot is a lock on one byte of a file that all users of the
-machine share and that stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor
-hold it together, and the kernel frees it when both are gone.
+Rule: no two live env copies that use one file of slots have the same slot. A slot is a lock on one byte of this file, which
+stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor hold it together, and the
+kernel frees it when both are gone.
+
+Rule: each user of the machine has a file of their own, because whoever can write the file can lock all of it. Users who
+trust one another share one on purpose: they set `FILE_VARIABLE` to the same path. A search for a slot ends after `MOST`.
 
 Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none waits for
 `WAIT_S`; then its worker leaves the run, so that the learner can place its lanes elsewhere, and is started again when there
@@ -13,9 +16,9 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import itertools
 import logging
 import os
+import pwd
 import socket
 import stat
 import struct
@@ -30,9 +33,10 @@ from protocol.errors import UsageError
 log = logging.getLogger("millrace.worker")
 
 FILE_VARIABLE, LIMIT_VARIABLE = "MILLRACE_SLOTS", "MILLRACE_COPIES_PER_MACHINE"
-FILE = "/tmp/millrace-slots"  # not of $TMPDIR, which may differ between the users of a machine
+FILE = "/tmp/millrace-slots-{user}"  # not of $TMPDIR, which may differ between the processes of a user
 FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is not followed, a FIFO does not block
-MODE = 0o666
+OWN, SHARED = 0o600, 0o666  # modes
+MOST = 1 << 16  # slots of a file; there are as many ports
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
 TOUCH_EVERY_S = 3600.0
@@ -52,6 +56,7 @@ class Slots:
         `most`: how many slots the machine has; 0: no limit.
         """
         self.most = most
+        """How many slots the machine has; 0: no limit."""
         self.fd = open_slots() if fd is None else fd
         self._taken: set[int] = set()
         self._lock = threading.Lock()
@@ -59,11 +64,17 @@ class Slots:
     def take(self) -> int:
         """Hold the lowest number that is free on this machine, from 0. Give it back when the env copy is closed.
 
-        Raises `NoSlot` if none becomes free within `WAIT_S`.
+        Raises `NoSlot` if none becomes free within `WAIT_S`, and `UsageError` if there is no limit and all are locked.
         """
         until_s, said = time.monotonic() + WAIT_S, False
-        line = f"{NO_SLOT} on {socket.gethostname()}: other env copies hold all {self.most} of {LIMIT_VARIABLE}"
+        file = f"{slots_path()}, a file of {_owner(self.fd)}"
+        line = f"{NO_SLOT} on {socket.gethostname()}: other env copies hold all {self.most} of {LIMIT_VARIABLE} ({file})"
         while (slot := self._take_now()) is None:
+            if not self.most:
+                raise UsageError(
+                    f"no env copy can get a slot: another process has locked all of {file}; end that process "
+                    f"(`lslocks` shows it), or set {FILE_VARIABLE} to a file of your own"
+                )
             if time.monotonic() >= until_s:
                 raise NoSlot(line)
             if not said:
@@ -81,7 +92,7 @@ class Slots:
 
     def _take_now(self) -> int | None:
         with self._lock:
-            for slot in range(self.most) if self.most else itertools.count():
+            for slot in range(self.most or MOST):
                 if slot not in self._taken and _is_locked_by(self.fd, slot):
                     self._taken.add(slot)
                     touch(self.fd)
@@ -120,29 +131,37 @@ def copies_per_machine() -> int:
     Raises `UsageError`.
     """
     text = os.environ.get(LIMIT_VARIABLE) or "0"
-    if not text.isdecimal():
-        raise UsageError(f"{LIMIT_VARIABLE}: expected a whole number, or 0 for no limit, got {text!r:.60}")
+    if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) <= MOST):
+        raise UsageError(f"{LIMIT_VARIABLE}: expected a whole number up to {MOST:,}, or 0 for no limit, got {text!r:.60}")
     return int(text)
+
+
+def slots_path() -> Path:
+    """The file that holds the slots of this process: the one that several users share on purpose, or this user's own."""
+    return Path(os.environ.get(FILE_VARIABLE) or FILE.format(user=os.geteuid()))
 
 
 def open_slots() -> int:
     """A descriptor whose locks belong to it and its copies. Raises `UsageError` if the file or the limit cannot be used."""
     copies_per_machine()  # before any worker starts
-    path = Path(os.environ.get(FILE_VARIABLE, FILE))
+    path, shared = slots_path(), bool(os.environ.get(FILE_VARIABLE))
+    mode = SHARED if shared else OWN
     try:
         with suppress(FileExistsError):
-            fd = os.open(path, FLAGS | os.O_CREAT | os.O_EXCL, MODE)
-            os.fchmod(fd, MODE)  # for every user, whatever the umask
+            fd = os.open(path, FLAGS | os.O_CREAT | os.O_EXCL, mode)
+            os.fchmod(fd, mode)  # whatever the umask
             return fd
         fd = os.open(path, FLAGS)
-        if stat.S_ISREG(os.fstat(fd).st_mode):
+        found = os.fstat(fd)
+        if stat.S_ISREG(found.st_mode) and (shared or found.st_uid == os.geteuid()):
             return fd
+        why = f"a file of {_owner(fd)}" if stat.S_ISREG(found.st_mode) else "not a regular file"
         os.close(fd)
-        why = "not a regular file"
     except OSError as error:
         why = os.strerror(error.errno or 0)
-    line = f"{path}: {why}; it holds the slots of this machine's env copies, so expected a file that every user may write"
-    raise UsageError(f"{line}; set {FILE_VARIABLE} to another path, the same for all processes of this machine")
+    expected = "every user who shares it may write" if shared else f"belongs to {_name(os.geteuid())}"
+    line = f"{path}: {why}; it holds the slots of this machine's env copies, so expected a file that {expected}"
+    raise UsageError(f"{line}; set {FILE_VARIABLE} to another path, the same for all processes that share slots")
 
 
 def free_all(fd: int) -> None:
@@ -156,6 +175,19 @@ def touch(fd: int) -> None:
     with suppress(OSError):
         if time.time() - os.fstat(fd).st_mtime > TOUCH_EVERY_S:
             os.utime(fd)
+
+
+def _owner(fd: int) -> str:
+    """Whose file this is."""
+    return _name(os.fstat(fd).st_uid)
+
+
+def _name(user: int) -> str:
+    """A user, by name where the system knows one."""
+    try:
+        return f"user {pwd.getpwuid(user).pw_name}"
+    except KeyError:
+        return f"user {user}"
 
 
 def _is_locked_by(fd: int, slot: int) -> bool:

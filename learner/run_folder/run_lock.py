@@ -197,6 +197,11 @@ class RunLock:
                     return
 
     def _refusal(self, owner: Owner | None) -> UsageError:
+        if owner is not None and _is_gone(owner):  # whoever can read a file can lock it
+            return UsageError(
+                f"run {self._folder}: {owner}, which trained it, is gone, but another process has locked {self._path}; end that "
+                f"process (`lslocks` shows it) or delete the file, then resume"
+            )
         who = str(owner) if owner is not None else "another process"
         here = owner is not None and owner.boot == self._owner.boot
         how = f"kill {owner.pid}" if here and owner is not None else "end that process"
@@ -298,10 +303,19 @@ def living_owner(folder: Path, now: float) -> Owner:
         raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {reason(error)}") from error
     if owner is None:
         raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
-    by_number = owner.boot == _boot() and owner.numbers == _namespace(NUMBERS)
-    if not (_is_alive(owner.pid) if by_number else age_s < PACE.dead_after):
+    if _is_gone(owner) or (not _has_our_numbers(owner) and age_s >= PACE.dead_after):
         raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
     return owner
+
+
+def _is_gone(owner: Owner) -> bool:
+    """Whether no process has the owner's number any more. False where that cannot be known."""
+    return _has_our_numbers(owner) and not _is_alive(owner.pid)
+
+
+def _has_our_numbers(owner: Owner) -> bool:
+    """Whether the owner's process has the same number for it and for us: it is on this machine, in the same container."""
+    return owner.boot == _boot() and owner.numbers == _namespace(NUMBERS)
 
 
 def _is_alive(pid: int) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import pwd
+import re
 import signal
 import socket
 import stat
@@ -114,13 +116,61 @@ def test_a_process_and_its_fork_never_share_a_slot() -> None:
             os.waitpid(pid, 0)
 
 
-def test_every_user_may_use_the_file_whatever_the_umask(own_file: Path) -> None:
+def test_every_user_may_use_a_file_that_is_shared_on_purpose_whatever_the_umask(own_file: Path) -> None:
     before = os.umask(0o077)
     try:
         Slots()
     finally:
         os.umask(before)
     assert stat.S_IMODE(own_file.stat().st_mode) == 0o666
+
+
+@pytest.fixture
+def file_of_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where users who share no file have theirs: a path with a place for the number of the user."""
+    monkeypatch.delenv(FILE_VARIABLE)
+    monkeypatch.setattr(module, "FILE", str(tmp_path / "slots-{user}"))
+    return module.FILE
+
+
+def test_a_user_who_shares_no_file_has_one_that_no_other_user_can_open(file_of_user: str) -> None:
+    first, second = Slots(), Slots()
+    assert (first.take(), second.take()) == (0, 1)
+    assert stat.S_IMODE(Path(file_of_user.format(user=os.geteuid())).stat().st_mode) == 0o600
+
+
+def test_a_file_that_another_user_put_in_the_place_of_ones_own_is_refused_and_its_owner_named(
+    file_of_user: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stranger = pwd.getpwuid(os.geteuid()).pw_name
+    Path(file_of_user.format(user=4_000_000_000)).touch()
+    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)
+    expected = rf"slots-4000000000: a file of user {stranger}; .* belongs to user 4000000000; set {FILE_VARIABLE} to "
+    with pytest.raises(UsageError, match=expected):
+        Slots()
+
+
+@pytest.fixture
+def all_locked(own_file: Path) -> Iterator[str]:
+    """Somebody has locked the whole file. What a line says of the file."""
+    fd = open_slots()
+    module._lock(fd, fcntl.F_WRLCK, 0, 0)
+    yield f"{own_file}, a file of user {pwd.getpwuid(os.geteuid()).pw_name}"
+    os.close(fd)
+
+
+def test_a_search_for_a_slot_ends_if_somebody_has_locked_the_whole_file_and_names_the_file_and_its_owner(
+    all_locked: str,
+) -> None:
+    with pytest.raises(UsageError, match=f"has locked all of {re.escape(all_locked)}; .* MILLRACE_SLOTS") as error:
+        Slots().take()
+    assert not isinstance(error.value, NoSlot), "there is no limit, so there is no room to wait for"
+
+
+def test_who_waits_for_room_is_told_the_file_and_its_owner(all_locked: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "WAIT_S", 0.0)
+    with pytest.raises(NoSlot, match=f"hold all 3 of {LIMIT_VARIABLE} [(]{re.escape(all_locked)}[)]$"):
+        Slots(most=3).take()
 
 
 def test_the_file_stays_empty_and_looks_used_so_that_nothing_that_cleans_tmp_deletes_it(own_file: Path) -> None:
@@ -147,7 +197,7 @@ def test_what_is_no_file_of_slots_is_refused_in_one_line(
             own_file.mkdir()
         case "no folder":
             monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "none" / "slots"))
-    with pytest.raises(UsageError, match=r"slots: .*; set MILLRACE_SLOTS to another path"):
+    with pytest.raises(UsageError, match=r"slots: .* who shares it may write; set MILLRACE_SLOTS to another path"):
         Slots()
 
 
@@ -173,14 +223,15 @@ def test_with_a_limit_a_copy_waits_until_a_slot_is_free(
     assert licensed.take() == 1
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith("no slot is free on ")
-    assert caplog.messages[0].endswith("other env copies hold all 2 of MILLRACE_COPIES_PER_MACHINE; waiting for one")
+    assert caplog.messages[0].endswith("; waiting for one")
+    assert "other env copies hold all 2 of MILLRACE_COPIES_PER_MACHINE (" in caplog.messages[0]
 
 
 def test_a_copy_that_waited_long_enough_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.0)
     licensed = Slots(most=1)
     licensed.take()
-    with pytest.raises(NoSlot, match=r"other env copies hold all 1 of MILLRACE_COPIES_PER_MACHINE$"):
+    with pytest.raises(NoSlot, match=r"other env copies hold all 1 of MILLRACE_COPIES_PER_MACHINE \("):
         licensed.take()
 
 
@@ -194,9 +245,9 @@ def test_the_variable_is_the_limit_of_every_process_and_what_is_no_number_is_ref
     assert (slots().fd, slots().most) == (fd, 3)
     monkeypatch.setenv(LIMIT_VARIABLE, "")
     os.close(open_slots())
-    for wrong in ("-1", "four"):
+    for wrong in ("-1", "four", "65537", "9" * 5000, "²"):
         monkeypatch.setenv(LIMIT_VARIABLE, wrong)
-        with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE}: expected a whole number, .*, got '{wrong}'"):
+        with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE}: expected a whole number up to 65,536, .*'{wrong:.58}"):
             open_slots()
 
 

@@ -123,6 +123,19 @@ def test_the_lock_of_a_process_that_was_killed_is_taken_over_and_said(
     assert "held its lock and is gone; this process takes over" in caplog.text
 
 
+def test_a_lock_that_a_stranger_holds_is_not_said_to_be_that_of_a_process_that_is_gone(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", "pass"]) as other:
+        other.wait()
+    with lock(tmp_path):
+        owner = owner_of(tmp_path)
+    (tmp_path / LOCK_FILE).write_bytes(replace(owner, pid=other.pid).encoded())
+    with (tmp_path / LOCK_FILE).open() as read_only:
+        fcntl.flock(read_only, fcntl.LOCK_EX)
+        expected = rf"process {other.pid} on \S+, .*, is gone, but another process has locked {tmp_path}/run.lock; "
+        with pytest.raises(UsageError, match=expected):
+            lock(tmp_path).__enter__()
+
+
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"run.lock not written: No such file or directory"):
         lock(tmp_path / "nowhere").__enter__()

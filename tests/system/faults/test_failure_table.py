@@ -6,6 +6,7 @@ ticket and every transition must be accounted for. Network faults are in `test_n
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ import pytest
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
 from tests.system.stage.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within
+from workers.slots import FILE_VARIABLE
 
 LOCAL = {"transport": "tcp", "rollout-steps": 16, "batch-size": 64, "n-epochs": 1, "eval-episodes": 1}
 LOCAL_FLAGS = [
@@ -54,6 +56,20 @@ def test_a_killed_worker_of_a_local_run_is_restarted(stage: Stage) -> None:
     learner.trains()
     wait_for(lambda: len(workers_of(learner.pid)) == 2, START_S, "the worker's return")
     finish(learner, [])
+
+
+def test_a_run_whose_file_of_slots_is_locked_ends_and_names_the_file(stage: Stage) -> None:
+    path = os.environ[FILE_VARIABLE]
+    with open(path, "w") as file:
+        fcntl.lockf(file, fcntl.LOCK_EX)
+        ended = subprocess.run(
+            [sys.executable, "-m", "millrace", "train", TOY, "--run-dir", str(stage.runs)],
+            capture_output=True,
+            text=True,
+            timeout=START_S,
+        )
+    assert ended.returncode == 2, ended.stderr
+    assert f"has locked all of {path}, a file of user " in ended.stderr
 
 
 def test_a_stopped_worker_joins_again_when_it_continues(stage: Stage) -> None:
