@@ -15,8 +15,8 @@ from threading import Lock
 from threadpoolctl import threadpool_limits
 
 from learner.config.config import Config
-from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
+from protocol.machine.cpu_cores import usable_cores
 from protocol.policy.layout import parameter_layout
 from protocol.specs import PolicySpec
 

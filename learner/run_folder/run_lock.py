@@ -199,8 +199,8 @@ class RunLock:
     def _refusal(self, owner: Owner | None) -> UsageError:
         if owner is not None and _is_gone(owner):  # whoever can read a file can lock it
             return UsageError(
-                f"run {self._folder}: {owner}, which trained it, is gone, but another process has locked {self._path}; end that "
-                f"process (`lslocks` shows it) or delete the file, then resume"
+                f"run {self._folder}: {owner}, which trained it, is gone, but another process has locked "
+                f"{self._path}; end that process (`lslocks` shows it) or delete the file, then resume"
             )
         who = str(owner) if owner is not None else "another process"
         here = owner is not None and owner.boot == self._owner.boot

@@ -5,7 +5,6 @@ Rule: a value out of its range is refused here, in one line, before a worker is 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -17,6 +16,7 @@ from learner.members.bind_settings import BindSettings
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
+from protocol.machine.cpu_cores import usable_cores
 
 ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
 """gymnasium's. A tuple has the observation spaces of the batch and of a single copy."""
@@ -83,7 +83,7 @@ class VectorEnvSettings:
         """Number of worker processes to start on this machine; 0 if workers are started elsewhere."""
         if self.listen.bind:
             return 0
-        return min(self.workers if self.workers is not None else (os.cpu_count() or 1), len(self.envs))
+        return min(self.workers if self.workers is not None else usable_cores(), len(self.envs))
 
     @property
     def lane_count(self) -> int:

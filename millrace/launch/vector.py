@@ -32,11 +32,11 @@ from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
-from protocol.cpu_cores import usable_cores
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
+from protocol.machine.cpu_cores import usable_cores
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
 from workers.supervise.supervisor import timeout_flags
@@ -80,8 +80,8 @@ def make_vec(
             TCP only to workers that have a key.
         num_envs: number of env copies; by default 1, or the length of the list. With several agents, as PettingZoo's
             environments have, each of a copy has a row of its own, and the attribute `num_envs` counts rows; see `step`.
-        workers: number of worker processes to start on this machine; by default one for each core, at most `num_envs`.
-            They end with the vector environment.
+        workers: number of worker processes to start on this machine; by default one for each core that this process may
+            use, at most `num_envs`. They end with the vector environment.
         lanes: number of groups of env copies. A group lives in one worker. By default there is one for each worker.
         bind: an address for workers that are started elsewhere with `millrace worker ADDRESS`. The default is local workers.
         keys: the folder of the keys. An address that other machines can reach needs keys; they are made if there are none.

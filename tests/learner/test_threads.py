@@ -17,8 +17,6 @@ from learner.config.layers import resolve
 from learner.run_folder.run_format import POLICY_ARRAYS
 from learner.torch_setup import one_thread, threads
 from millrace.launch.local_worker_options import worker_cores
-from protocol import cpu_cores as counting
-from protocol.cpu_cores import usable_cores
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CORES = {2, 3}
@@ -65,27 +63,6 @@ def test_where_the_system_cannot_they_do_not(monkeypatch: pytest.MonkeyPatch) ->
     assert worker_cores(resolve("CartPole-v1", workers=2)) == []
 
 
-@pytest.mark.parametrize(
-    ("told", "count"),
-    [
-        ("max 100000\n", 8),
-        ("400000 100000\n", 4),
-        ("150000 100000\n", 1),
-        ("5000 100000\n", 1),
-        ("9900000 100000\n", 8),
-        ("", 8),
-    ],
-)
-def test_a_container_has_its_share_of_the_cores(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, told: str, count: int
-) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
-    monkeypatch.setattr(counting, "CPU_MAX", tmp_path / "cpu.max")
-    assert usable_cores() == 8  # no container
-    (tmp_path / "cpu.max").write_text(told)
-    assert usable_cores() == count
-
-
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
 SMALL = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION)
 WIDE = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, net=(256, 256))
@@ -120,8 +97,7 @@ IMAGES = PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ACTION)
 def test_the_learner_takes_the_cores_that_workers_leave(
     monkeypatch: pytest.MonkeyPatch, policy: PolicySpec, max_lag: int, workers: int, count: int
 ) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
-    monkeypatch.setattr(counting, "CPU_MAX", Path("nowhere"))
+    monkeypatch.setattr(torch_setup, "usable_cores", lambda: 8)
     assert threads(policy, max_lag, workers) == count
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.bounds import Stages, last_text, one_line
-from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError, first_line
+from protocol.machine.cpu_cores import usable_cores
 from protocol.messages import DESCRIPTION, Answer, Array, Call, Described, Order, Reset, Returned, Step, Stepped
 from protocol.specs import StepSpec
 from protocol.wire.codec import encode

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.settings import VectorEnvSettings
 from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.worker_link import WorkerLink
@@ -432,6 +433,12 @@ def test_with_more_lanes_than_workers_all_lanes_are_placed_at_once() -> None:
     assert env.step(np.zeros(4, np.int64))[1].tolist() == [1.0] * 4
     assert len(env.hub.coordinator.members) == 1
     env.close()
+
+
+def test_by_default_there_is_a_worker_for_each_core_that_this_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("learner.vector_env.settings.usable_cores", lambda: 3)
+    assert VectorEnvSettings("CartPole-v1", 8).local_workers == 3
+    assert VectorEnvSettings("CartPole-v1", 2).local_workers == 2
 
 
 @pytest.mark.parametrize("name", ["workers", "max_env_failures"])

@@ -6,7 +6,6 @@ import copy
 import io
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -17,9 +16,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.replay import available_memory as memory
 from learner.algorithms.replay import replay_buffer as module
-from learner.algorithms.replay.available_memory import GIB, available_bytes
+from learner.algorithms.replay.available_memory import GIB
 from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
 from learner.algorithms.replay.sum_tree import SumTree
 from protocol.errors import UsageError
@@ -463,21 +461,3 @@ def test_a_rollout_that_does_not_fit_is_refused() -> None:
     with pytest.raises(UsageError, match="replay_size 9: a rollout takes up to 10; take --replay-size 10 or more"):
         replay(9).add(Lanes(0).rollout(0))
     replay(10).add(Lanes(0).rollout(0))
-
-
-def test_memory_is_the_machines_or_what_its_container_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = {name: tmp_path / name for name in ("meminfo", "max", "current", "stat")}
-    monkeypatch.setattr(memory, "MEMINFO", files["meminfo"])
-    monkeypatch.setattr(memory, "CGROUPS", ((files["max"], files["current"], files["stat"], "inactive_file"),))
-    assert available_bytes() is None
-    files["meminfo"].write_text("MemTotal:  9000 kB\nMemAvailable:  4000 kB\nHugePages_Total:  0\n")
-    assert available_bytes() == 4000 * 1024
-    files["max"].write_text("max\n")
-    files["current"].write_text("1000\n")
-    assert available_bytes() == 4000 * 1024
-    files["max"].write_text("3000\n")
-    assert available_bytes() == 2000
-    files["stat"].write_text("anon 1\ninactive_file 500\n")
-    assert available_bytes() == 2500
-    files["current"].write_text("5000\n")
-    assert available_bytes() == 0

@@ -1,0 +1,1 @@
+"""What this machine, or the job or container on it, leaves to a process."""

@@ -1,0 +1,14 @@
+"""The number of cores that this process may use: its CPU affinity, or the CPU quota of its job or container if less."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from protocol.machine.control_groups import cpu_quota
+
+
+def usable_cores(system: Path = Path("/")) -> int:
+    """Number of cores, at least 1."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, int(min(allowed, cpu_quota(system))))
