@@ -120,12 +120,17 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
 def check_size(description: EnvDescription) -> None:
     """Raise `BadMessage` if the spaces exceed the limits of leaves, nesting or elements. Allocates nothing."""
     for name, space in (("observation", description.observation), ("action", description.action)):
-        leaves = list(_leaves(space, 0))
-        if len(leaves) > MAX_LEAVES:
-            raise BadMessage(f"{name} space: expected at most {MAX_LEAVES} arrays, got {len(leaves)}")
-        elements = sum(leaves)
-        if elements > MAX_ELEMENTS:
-            raise BadMessage(f"{name} space: expected at most {MAX_ELEMENTS} elements, got {elements}")
+        check_space(f"{name} space", space)
+
+
+def check_space(name: str, space: SpaceSpec) -> None:
+    """The same for one space, which messages call `name`."""
+    leaves = list(_leaves(space, 0))
+    if len(leaves) > MAX_LEAVES:
+        raise BadMessage(f"{name}: expected at most {MAX_LEAVES} arrays, got {len(leaves)}")
+    elements = sum(leaves)
+    if elements > MAX_ELEMENTS:
+        raise BadMessage(f"{name}: expected at most {MAX_ELEMENTS} elements, got {elements}")
 
 
 def _leaves(space: SpaceSpec, depth: int) -> Iterator[int]:

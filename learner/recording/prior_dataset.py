@@ -7,15 +7,17 @@ is left out.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
+from learner.recording.dataset_files import DatasetFiles
 from protocol.arrays import Array
 from protocol.bounds import one_line
-from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, stored_actions_of
-from protocol.errors import UsageError, first_line
+from protocol.envs.spaces import stored_actions_of
+from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.rows.array_checks import wrong_values
 from protocol.specs import PolicySpec
@@ -29,27 +31,25 @@ class PriorDataset:
     def __init__(self, dataset_id: str, policy: PolicySpec) -> None:
         """Raises `UsageError` if there is no such dataset, if it does not fit the policy, or if Minari is not installed."""
         self._id, self._policy = dataset_id, policy
-        self._dataset = _open(dataset_id)
+        self._files = _open(dataset_id)
         self._check_spaces()
-        self.rows = int(self._dataset.total_steps)
+        self.rows = self._files.rows
         """number of transitions"""
-        self.episodes = int(self._dataset.total_episodes)
+        self.episodes = self._files.episodes
         if not self.rows:
             raise UsageError(f"prior {dataset_id}: expected transitions, got an empty dataset")
 
     def batches(self) -> Iterator[Batch]:
         """One batch for each episode, in the order of the dataset. Raises `UsageError` if an episode cannot be used."""
-        flatten = make_flatten(self._dataset.observation_space)
         to_stored = stored_actions_of(self._policy)
-        for episode in self._dataset.iterate_episodes():
-            leaves = zip(flatten(episode.observations), self._policy.observation, strict=True)
+        for number, obs, action, reward, terminated, truncated in self._files.read_episodes():
             yield self._batch(
-                int(episode.id),
-                tuple(np.asarray(array).astype(leaf.dtype, copy=False)[:, None] for array, leaf in leaves),
-                to_stored(np.asarray(episode.actions))[:, None],
-                np.asarray(episode.rewards, np.float32)[:, None],
-                np.asarray(episode.terminations, bool)[:, None],
-                np.asarray(episode.truncations, bool)[:, None],
+                number,
+                tuple(leaf[:, None] for leaf in obs),
+                to_stored(action)[:, None],
+                reward[:, None],
+                terminated[:, None],
+                truncated[:, None],
             )
 
     def _batch(
@@ -58,8 +58,6 @@ class PriorDataset:
         """An episode [T, 1] as a batch. Its last row ends the episode, whatever the dataset says: no row follows it."""
         T = len(reward)
         where = f"prior {self._id}: episode {number}"
-        if any(len(leaf) != T + 1 for leaf in obs) or len(action) != T:
-            raise UsageError(f"{where}: expected {T + 1} observations and {T} actions, got {len(obs[0])} and {len(action)}")
         leaves = [(leaf.name, array, leaf) for leaf, array in zip(self._policy.observation, obs, strict=True)]
         for name, array, space in [("reward", reward, None), ("action", action, self._policy.action), *leaves]:
             if why := wrong_values(array, space, axes=("step",)):
@@ -86,10 +84,10 @@ class PriorDataset:
         )
 
     def _check_spaces(self) -> None:
-        dataset, policy = self._dataset, self._policy
+        files, policy = self._files, self._policy
         for what, expected, got in (
-            ("observations", policy.observation, observation_leaves(dataset.observation_space)),
-            ("actions", (policy.action,), (action_spec(dataset.action_space),)),
+            ("observations", policy.observation, files.observation),
+            ("actions", (policy.action,), (files.action,)),
         ):
             if expected != got:
                 raise UsageError(
@@ -98,20 +96,22 @@ class PriorDataset:
                 )
 
 
-def _open(dataset_id: str) -> Any:
+def _open(dataset_id: str) -> DatasetFiles:
     try:
         import h5py  # noqa: F401
-        import minari
+        from minari.storage import get_dataset_path
     except ImportError as error:
         raise UsageError("--prior needs minari; pip install 'minari[hdf5]'") from error
-    try:
-        return minari.load_dataset(dataset_id)
-    except FileNotFoundError:
-        have = ", ".join(sorted(minari.list_local_datasets())[:5]) or "none"
-        raise UsageError(
-            f"prior {dataset_id}: no such dataset here; there are: {have}. `minari download` gets others"
-        ) from None
-    except Exception as error:
-        raise UsageError(
-            f"prior {dataset_id}: it cannot be read: {one_line(first_line(error, type(error).__name__))}"
-        ) from error
+    folder = get_dataset_path(dataset_id) / "data"
+    if not os.path.lexists(folder):
+        have = ", ".join(sorted(_ids(get_dataset_path()))[:5]) or "none"
+        raise UsageError(f"prior {dataset_id}: no such dataset here; there are: {have}. `minari download` gets others")
+    return DatasetFiles(f"prior {dataset_id}", folder)
+
+
+def _ids(root: Path) -> Iterator[str]:
+    """The ids of the datasets here. Their files are not read."""
+    for folder, inside, _ in os.walk(root):
+        if "data" in inside:
+            inside.clear()
+            yield Path(folder).relative_to(root).as_posix()

@@ -1,0 +1,93 @@
+"""Groups and arrays of an HDF5 file that may come from a stranger.
+
+Rule: nothing leads out of the file. A link is not followed, wherever it leads, and the numbers of an array are all in the
+file, compressed only by what h5py brings with it. So memory is bounded by the size of the file: an array has at most
+`MOST_EXPANSION` times as many bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+from learner.run_folder.regular_files import open_regular
+
+MOST_EXPANSION = 1_032  # deflate, the strongest compression that is read, makes no more bytes of one
+FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf. Any other may be a plug-in, which the file would choose
+
+
+class UnfitFile(Exception):
+    """What is wrong with the file, in one line."""
+
+
+class ClosedHDF5:
+    """An open file. Its methods raise `UnfitFile`; h5py raises other errors, of several types, if the file is damaged."""
+
+    def __init__(self, file: Any, most_bytes: int) -> None:
+        """`most_bytes`: of its arrays."""
+        self.root = file
+        self.most_bytes = most_bytes
+
+    @classmethod
+    @contextmanager
+    def open(cls, path: Path) -> Iterator[Self]:
+        """Open a file to read it. Raises `OSError`, also for a link or anything but a regular file."""
+        descriptor = open_regular(path)
+        try:
+            size = os.fstat(descriptor).st_size
+        finally:
+            os.close(descriptor)
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            yield cls(file, size * MOST_EXPANSION)
+
+    def group(self, parent: Any, name: str) -> Any:
+        """The group of this name inside another."""
+        import h5py
+
+        if not isinstance(found := self._member(parent, name), h5py.Group):
+            raise UnfitFile(f"{found.name}: expected a group, got {type(found).__name__}")
+        return found
+
+    def array(self, parent: Any, name: str) -> Any:
+        """The array of this name inside a group, not read yet: h5py's `Dataset`."""
+        import h5py
+
+        found = self._member(parent, name)
+        if not isinstance(found, h5py.Dataset) or found.shape is None:
+            raise UnfitFile(f"{found.name}: expected an array, got {type(found).__name__}")
+        if found.is_virtual or found.external:
+            raise UnfitFile(f"{found.name}: expected its numbers in this file, got an array that names other files")
+        made = found.id.get_create_plist()
+        if unknown := {made.get_filter(each)[0] for each in range(made.get_nfilters())} - FILTERS:
+            raise UnfitFile(f"{found.name}: expected no compression, gzip or lzf, got filter {min(unknown)}")
+        of_chunk = math.prod(found.chunks or ()) * found.dtype.itemsize  # HDF5 decompresses whole chunks
+        if (most := max(found.nbytes, of_chunk)) > self.most_bytes:
+            raise UnfitFile(f"{found.name}: expected at most {self.most_bytes:,} bytes in a file of this size, got {most:,}")
+        if not _is_whole(found):
+            raise UnfitFile(f"{found.name}: expected all of its numbers in this file, got a part of them")
+        return found
+
+    def _member(self, parent: Any, name: str) -> Any:
+        import h5py
+
+        where = f"{parent.name.rstrip('/')}/{name}"
+        link = parent.get(name, getlink=True)
+        if link is None:
+            raise UnfitFile(f"expected {where}, got none")
+        if "/" in name or not isinstance(link, h5py.HardLink):
+            raise UnfitFile(f"{where}: expected a name in this file, got a link")
+        return parent[name]
+
+
+def _is_whole(array: Any) -> bool:
+    """Whether the file has every number of an array. HDF5 would make up those that were not written."""
+    if not array.chunks:
+        return bool(array.id.get_storage_size() >= array.nbytes)
+    sides = zip(array.shape, array.chunks, strict=True)
+    return bool(array.id.get_num_chunks() >= math.prod(-(-length // chunk) for length, chunk in sides))

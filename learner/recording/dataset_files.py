@@ -1,0 +1,198 @@
+"""Reads the files of a Minari dataset as data: its spaces from metadata.json, its episodes from main_data.hdf5.
+
+Rule: a dataset may come from a stranger. Nothing that it names is made, imported or called, and what metadata.json says is
+compared with the arrays before it is believed. (Minari itself makes the environment of a dataset that has no spaces, and so
+runs whatever its entry point names. It also follows links to other files, and lets Pillow open images of any format.)
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import msgspec
+import numpy as np
+from gymnasium import spaces
+
+from learner.recording.closed_hdf5 import ClosedHDF5, UnfitFile
+from learner.recording.minari_spaces import space_of_json
+from learner.run_folder.regular_files import read, reason
+from protocol.arrays import Array
+from protocol.bounds import Natural, one_line
+from protocol.envs.spaces import STORED_KINDS, action_spec, observation_leaves
+from protocol.errors import UsageError
+from protocol.specs import ActionSpec, Leaf
+
+METADATA, ARRAYS = "metadata.json", "main_data.hdf5"
+MOST_METADATA_BYTES = 1 << 24  # it has two bounds of each element of a space
+REWARD, END = Leaf("", "box", (), "float32"), Leaf("", "box", (), "bool")
+
+
+class StoredEpisode(NamedTuple):
+    """L steps, with the shapes and the dtypes of the dataset's spaces."""
+
+    number: int
+    obs: tuple[Array, ...]  # [L+1, *leaf] for each leaf of the observation
+    action: Array  # [L, *action] as the environment took it
+    reward: Array  # [L] float32
+    terminated: Array  # [L] bool
+    truncated: Array  # [L] bool
+
+
+class _Metadata(msgspec.Struct):
+    """What is used of metadata.json."""
+
+    data_format: str
+    total_episodes: Natural
+    total_steps: Natural
+    observation_space: str | None = None
+    action_space: str | None = None
+    jpeg_encoding: bool = True
+
+
+class DatasetFiles:
+    """A dataset whose metadata fits its arrays. h5py must be installed, and Pillow for JPEG images."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        """`name` begins each message; `folder` has the two files. Raises `UsageError` if the dataset cannot be used."""
+        self._name, self._folder = name, folder
+        with self._as_usage_error(METADATA):
+            if not stat.S_ISDIR(folder.lstat().st_mode):
+                raise ValueError(f"{folder}: expected a folder, got a link or a file")
+            metadata = msgspec.convert(json.loads(read(folder / METADATA, MOST_METADATA_BYTES)), _Metadata)
+            if metadata.data_format != "hdf5":
+                raise UsageError(f"{name}: expected data_format hdf5 in {METADATA}, got {metadata.data_format}")
+            self._observation_space = self._space("observation_space", metadata.observation_space)
+            self._action_space = self._space("action_space", metadata.action_space)
+        self.observation = observation_leaves(self._observation_space)
+        self.action = action_spec(self._action_space)
+        self.rows, self.episodes = metadata.total_steps, metadata.total_episodes
+        """number of steps, and of episodes"""
+        self._has_jpeg = metadata.jpeg_encoding
+        self._check_counts()
+
+    def read_episodes(self) -> Iterator[StoredEpisode]:
+        """The episodes, in their order. Raises `UsageError` at one that cannot be used."""
+        for number in range(self.episodes):
+            with self._as_usage_error(ARRAYS), ClosedHDF5.open(self._folder / ARRAYS) as file:
+                episode = self._episode(file, number)
+            yield episode
+
+    def _check_counts(self) -> None:
+        """Raise `UsageError` unless there are as many episodes and steps as the metadata says, and as the file can hold."""
+        with self._as_usage_error(ARRAYS), ClosedHDF5.open(self._folder / ARRAYS) as file:
+            if (episodes := len(file.root)) != self.episodes:
+                raise UnfitFile(f"expected {self.episodes} episodes, as {METADATA} says, got {episodes}")
+            groups = (file.group(file.root, f"episode_{number}") for number in range(episodes))
+            if (rows := sum(_length(file.array(group, "rewards")) for group in groups)) != self.rows:
+                raise UnfitFile(f"expected {self.rows:,} steps, as {METADATA} says, got {rows:,}")
+            leaves: tuple[Leaf | ActionSpec, ...] = (*self.observation, self.action)
+            size = rows * sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves)
+            if size > file.most_bytes:
+                raise UnfitFile(f"expected at most {file.most_bytes:,} bytes in a file of this size, got {size:,}")
+
+    def _episode(self, file: ClosedHDF5, number: int) -> StoredEpisode:
+        group = file.group(file.root, f"episode_{number}")
+        L = _length(file.array(group, "rewards"))
+        if not L:
+            raise UnfitFile(f"{group.name}: expected steps, got none")
+        stored = zip(_leaves(file, group, "observations", self._observation_space), self.observation, strict=True)
+        return StoredEpisode(
+            number,
+            tuple(self._read_leaf(array, L + 1, leaf, space) for (array, space), leaf in stored),
+            _read(file.array(group, "actions"), L, self.action),
+            _read(file.array(group, "rewards"), L, REWARD),
+            _read(file.array(group, "terminations"), L, END),
+            _read(file.array(group, "truncations"), L, END),
+        )
+
+    def _read_leaf(self, stored: Any, rows: int, leaf: Leaf, space: gymnasium.Space[Any]) -> Array:
+        """The array [rows, *leaf] of an observation."""
+        from minari.dataset.minari_storage import is_image_space
+
+        if self._has_jpeg and is_image_space(space):
+            return _read_images(stored, (rows, *leaf.shape))
+        return _read(stored, rows, leaf)
+
+    def _space(self, name: str, text: str | None) -> gymnasium.Space[Any]:
+        if text is None:
+            raise UsageError(
+                f"{self._name}: expected {name} in {METADATA}, got none; only the environment that the dataset names could "
+                "tell it, and making that may run any code. Write the dataset again with a newer Minari"
+            )
+        return space_of_json(name, text)
+
+    @contextmanager
+    def _as_usage_error(self, file: str) -> Iterator[None]:
+        try:
+            yield
+        except UsageError:
+            raise
+        except Exception as error:  # json, msgspec, numpy, HDF5 and Pillow raise a dozen types for damaged files
+            why = one_line(reason(error), 500)
+            raise UsageError(f"{self._name}: {file}: {why}; get the dataset again, or record another") from error
+
+
+def _length(rewards: Any) -> int:
+    """The number of steps of an episode."""
+    if len(rewards.shape) != 1:
+        raise UnfitFile(f"{rewards.name}: expected a number for each step, got an array {list(rewards.shape)}")
+    return int(rewards.shape[0])
+
+
+def _leaves(file: ClosedHDF5, parent: Any, name: str, space: gymnasium.Space[Any]) -> Iterator[tuple[Any, Any]]:
+    """The stored arrays of an observation, in the order of its leaves, with their spaces."""
+    match space:
+        case spaces.Dict():
+            inside = dict(space.spaces)
+        case spaces.Tuple():
+            inside = {f"_index_{number}": inner for number, inner in enumerate(space.spaces)}
+        case _:
+            yield file.array(parent, name), space
+            return
+    group = file.group(parent, name)
+    for key, inner in inside.items():
+        yield from _leaves(file, group, key, inner)
+
+
+def _read(stored: Any, rows: int, leaf: Leaf | ActionSpec) -> Array:
+    """The array [rows, *leaf] in the dtype of the leaf, which must hold each of its values."""
+    shape = (rows, *leaf.shape)
+    if stored.shape != shape or stored.dtype.kind not in STORED_KINDS:
+        expected, got = f"{leaf.dtype}{list(shape)}", f"{stored.dtype}{list(stored.shape)}"
+        raise UnfitFile(f"{stored.name}: expected {expected}, got {got}")
+    raw: Array = stored[()]
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
+        array = raw.astype(leaf.dtype, copy=False)
+    if array.dtype.kind != "f" and (changed := array != raw).any():
+        raise UnfitFile(f"{stored.name}: expected {leaf.dtype}, got {raw[changed][0]}")
+    return array
+
+
+def _read_images(stored: Any, shape: tuple[int, ...]) -> Array:
+    """JPEG files, one a row, as an array [rows, height, width(, 3)]."""
+    from PIL import Image, UnidentifiedImageError
+
+    rows, height, width = shape[:3]
+    if stored.shape[:1] != (rows,):
+        raise UnfitFile(f"{stored.name}: expected {rows} images, got an array {list(stored.shape)}")
+    mode = "L" if len(shape) == 3 else "RGB"
+    images = np.empty(shape, np.uint8)
+    for row, content in enumerate(stored):
+        file = io.BytesIO(np.asarray(content, np.uint8).tobytes())
+        try:
+            image = Image.open(file, formats=["JPEG"])  # of those that Pillow would recognize, one starts another program
+        except UnidentifiedImageError:
+            raise UnfitFile(f"{stored.name}: expected JPEG images, got others") from None
+        if (image.size, image.mode) != ((width, height), mode):
+            expected, got = f"{mode} of {width} × {height}", f"{image.mode} of {image.width} × {image.height}"
+            raise UnfitFile(f"{stored.name}: expected images {expected} pixels, got {got}")
+        images[row] = np.asarray(image)
+    return images
