@@ -66,8 +66,8 @@ class ClosedHDF5:
         made = found.id.get_create_plist()
         if unknown := {made.get_filter(each)[0] for each in range(made.get_nfilters())} - FILTERS:
             raise UnfitFile(f"{found.name}: expected no compression, gzip or lzf, got filter {min(unknown)}")
-        of_chunk = math.prod(found.chunks or ()) * found.dtype.itemsize  # HDF5 decompresses whole chunks
-        if (most := max(found.nbytes, of_chunk)) > self.most_bytes:
+        elements = max(found.size, math.prod(found.chunks or ()))  # HDF5 decompresses whole chunks
+        if (most := elements * found.dtype.itemsize) > self.most_bytes:
             raise UnfitFile(f"{found.name}: expected at most {self.most_bytes:,} bytes in a file of this size, got {most:,}")
         if not _is_whole(found):
             raise UnfitFile(f"{found.name}: expected all of its numbers in this file, got a part of them")

@@ -80,10 +80,9 @@ class DatasetFiles:
 
     def read_episodes(self) -> Iterator[StoredEpisode]:
         """The episodes, in their order. Raises `UsageError` at one that cannot be used."""
-        for number in range(self.episodes):
-            with self._as_usage_error(ARRAYS), ClosedHDF5.open(self._folder / ARRAYS) as file:
-                episode = self._episode(file, number)
-            yield episode
+        with self._as_usage_error(ARRAYS), ClosedHDF5.open(self._folder / ARRAYS) as file:
+            for number in range(self.episodes):
+                yield self._episode(file, number)
 
     def _check_counts(self) -> None:
         """Raise `UsageError` unless there are as many episodes and steps as the metadata says, and as the file can hold."""
@@ -100,7 +99,8 @@ class DatasetFiles:
 
     def _episode(self, file: ClosedHDF5, number: int) -> StoredEpisode:
         group = file.group(file.root, f"episode_{number}")
-        L = _length(file.array(group, "rewards"))
+        rewards = file.array(group, "rewards")
+        L = _length(rewards)
         if not L:
             raise UnfitFile(f"{group.name}: expected steps, got none")
         stored = zip(_leaves(file, group, "observations", self._observation_space), self.observation, strict=True)
@@ -108,7 +108,7 @@ class DatasetFiles:
             number,
             tuple(self._read_leaf(array, L + 1, leaf, space) for (array, space), leaf in stored),
             _read(file.array(group, "actions"), L, self.action),
-            _read(file.array(group, "rewards"), L, REWARD),
+            _read(rewards, L, REWARD),
             _read(file.array(group, "terminations"), L, END),
             _read(file.array(group, "truncations"), L, END),
         )
@@ -165,8 +165,9 @@ def _leaves(file: ClosedHDF5, parent: Any, name: str, space: gymnasium.Space[Any
 def _read(stored: Any, rows: int, leaf: Leaf | ActionSpec) -> Array:
     """The array [rows, *leaf] in the dtype of the leaf, which must hold each of its values."""
     shape = (rows, *leaf.shape)
-    if stored.shape != shape or stored.dtype.kind not in STORED_KINDS:
-        expected, got = f"{leaf.dtype}{list(shape)}", f"{stored.dtype}{list(stored.shape)}"
+    dtype = stored.dtype
+    if stored.shape != shape or dtype.kind not in STORED_KINDS:
+        expected, got = f"{leaf.dtype}{list(shape)}", f"{dtype}{list(stored.shape)}"
         raise UnfitFile(f"{stored.name}: expected {expected}, got {got}")
     raw: Array = stored[()]
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
