@@ -147,9 +147,9 @@ def open_run(
     past = (state.ledger, state.incarnations)
     pool = _opponent_pool(config, spec, state.opponents)
     hub = open_hub(config, spec, link, processes, setup.check_running, observer, past, pool)
-    if state.opponent_policies is not None:
+    if state.opponent_policies is not None and pool is not None:
         hub.keep_opponents(*state.opponent_policies)
-        state.opponent_policies = None
+    state.opponent_policies = None
     dataset = _training_recorder(config, folder, setup.known, spec)
     setup.check_interrupt()
     folder.remove_temporary()

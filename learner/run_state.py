@@ -32,7 +32,7 @@ from protocol.specs import PolicySpec
 
 log = logging.getLogger("millrace.learner")
 
-MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, BadMessage)
+MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, BadMessage)
 """What loading a state of another form raises."""
 POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # of a `RunState`; a checkpoint has them as tensors
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
@@ -91,6 +91,7 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
             if (policy := found.state.get(name)) is not None:
                 setattr(state, name, tuple(array.numpy() for array in policy))
         algorithm.load_state_dict(found.state["algorithm"])
+        _check_policies(state, algorithm.weights())
     except MISFITS as error:
         raise CheckpointError(
             f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
@@ -98,6 +99,20 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
         ) from error
     state.ledger.end_outstanding()
     return state
+
+
+def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
+    """Raise `ValueError` unless each policy that the state speaks of is there, as large as the run's `own`."""
+    snapshots = len(state.opponents.snapshots)
+    for name, is_there, rows in (
+        ("best_policy", state.best is not None, ()),
+        ("pending_policy", state.pending is not None, ()),
+        ("opponent_policies", snapshots > 0, (snapshots,)),
+    ):
+        expected = [f"float32{[*rows, *each.shape]}" for each in own] if is_there else []
+        got = [f"{each.dtype}{list(each.shape)}" for each in getattr(state, name) or ()]
+        if expected != got:
+            raise ValueError(f"{name}: expected {' and '.join(expected) or 'none'}, got {' and '.join(got) or 'none'}")
 
 
 def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
@@ -117,7 +132,10 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
         parts = "critic" if whole and policy.stores_scaled_actions else "policy"
     if whole:
         saved = _newest(run)
-        state, taken = saved.state["algorithm"], f"policy, statistics{BESIDES[parts]}, after {saved.env_steps:,} env steps"
+        state, taken = (
+            saved.state.get("algorithm", {}),
+            f"policy, statistics{BESIDES[parts]}, after {saved.env_steps:,} env steps",
+        )
     elif parts in ("policy", "best"):
         state, taken = _of_policy_alone(config, policy, parameters, buffers), f"{'best ' * (parts == 'best')}policy"
     else:

@@ -3,23 +3,28 @@
 Rule: a checkpoint is there whole or not at all; the newest whole one is used; and reading one executes no code
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
-first.
+first. Each element of a tensor must be in the file: one with a stride of 0 is a few bytes there, but any number once copied.
 """
 
 from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from learner.run_folder.atomic_write import TEMPORARY, write_atomically
 from learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
 from protocol.errors import CheckpointError, UsageError
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 FORMAT = 1
 FOLDER = "checkpoints"
 SUFFIX = ".pt"
+MOST_VIEWS = 16  # of the same numbers: an algorithm may save parts of a tensor besides the whole
 
 
 class Checkpoint(NamedTuple):
@@ -105,8 +110,10 @@ def _read(path: Path) -> Checkpoint:
                 damaged = archive.testzip()
             if damaged is not None:
                 raise _Unreadable(f"checksum of {damaged} does not match")
+            size = file.seek(0, os.SEEK_END)
             file.seek(0)
             record = torch.load(file, map_location="cpu", weights_only=True)
+        _check_memory(record, size)
     except _Unreadable:
         raise
     except Exception as error:  # zipfile and torch raise a dozen types for damaged files
@@ -124,6 +131,42 @@ def _read(path: Path) -> Checkpoint:
             raise _Unreadable("it has no state")
 
 
+def _check_memory(record: object, size: int) -> None:
+    """Raise `_Unreadable` unless the tensors are as large as a file of this size can be."""
+    tensors = list(_tensors(record))
+    if any(each.device.type != "cpu" or not _is_whole(each) for each in tensors):
+        raise _Unreadable("it has a tensor whose elements are not all in the file")
+    if sum(each.nbytes for each in tensors) > MOST_VIEWS * size:
+        raise _Unreadable("its tensors are larger than the file")
+
+
+def _tensors(record: object) -> Iterator[Tensor]:
+    """Each tensor once. A stranger's lists may have themselves as an entry, or the same one many times."""
+    import torch
+
+    seen: set[int] = set()
+    left = [record]
+    while left:
+        each = left.pop()
+        if id(each) in seen:
+            continue
+        seen.add(id(each))
+        match each:
+            case torch.Tensor():
+                yield each
+            case dict():
+                left += [*each.keys(), *each.values()]
+            case list() | tuple() | set():
+                left += each
+
+
+def _is_whole(tensor: Tensor) -> bool:
+    """Whether each element has memory of its own."""
+    import torch
+
+    return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()
+
+
 def _check_plain(value: object, where: str) -> None:
     import torch
 
@@ -136,7 +179,11 @@ def _check_plain(value: object, where: str) -> None:
             for index, inner in enumerate(value):
                 _check_plain(inner, f"{where}[{index}]")
         case torch.Tensor():
-            pass
+            if not _is_whole(value):
+                raise UsageError(
+                    f"checkpoint: {where}: expected a tensor with memory for each of its elements, got a sparse or an "
+                    "expanded one; mend state_dict, as by clone()"
+                )
         case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
             got = f"{type(value).__module__}.{type(value).__name__}"
             raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; mend state_dict")

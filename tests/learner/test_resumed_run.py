@@ -8,6 +8,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
+import torch
 
 from learner.algorithms.ppo import PPO
 from learner.between_updates.between_updates import BetweenUpdates
@@ -17,8 +18,9 @@ from learner.config.layers import resolve
 from learner.resume_checks import unless_finished
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.opponent_pool import PoolState, Snapshot
 from learner.run_folder import checkpoint
-from learner.run_folder.results import Evaluation, Summary
+from learner.run_folder.results import EvaluatedPolicy, Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState, restore
 from learner.train import train
@@ -138,3 +140,34 @@ def test_a_checkpoint_of_another_structure_is_one_line(tmp_path: Path, part: str
     checkpoint.save(folder.path, content, env_steps=0, keep=3)
     with pytest.raises(CheckpointError, match="expected the state of this configuration, got another"):
         restore(folder, algorithm)
+
+
+@pytest.mark.parametrize(
+    ("says", "policy"),
+    [
+        ({"best": (1.0, 10)}, {"best_policy": None}),
+        ({"best": (1.0, 10)}, {"best_policy": "a number fewer"}),
+        ({"best": (1.0, 10)}, {"best_policy": "float64"}),
+        ({}, {"best_policy": "one"}),
+        ({"pending": EvaluatedPolicy(1, 10)}, {"pending_policy": None}),
+        ({"pending": EvaluatedPolicy(1, 10)}, {"pending_policy": "a number fewer"}),
+        ({"opponents": PoolState(snapshots=[Snapshot(0, 0, 1200.0)] * 2)}, {"opponent_policies": None}),
+        ({"opponents": PoolState(snapshots=[Snapshot(0, 0, 1200.0)] * 2)}, {"opponent_policies": "one"}),
+    ],
+)
+def test_a_policy_that_a_checkpoint_speaks_of_is_in_it(tmp_path: Path, says: dict[str, Any], policy: dict[str, Any]) -> None:
+    config = resolve("CartPole-v1", run_dir=str(tmp_path))
+    algorithm = PPO(ppo(config), run_spec(config, EnvSpec("CartPole-v1")).policy, total_steps=100, seed=1)
+    own = [torch.from_numpy(array) for array in algorithm.weights()]
+    made = {
+        None: None,
+        "one": own,
+        "a number fewer": [own[0][1:], own[1]],
+        "float64": [each.double() for each in own],
+    }
+    content = RunState(**says).checkpoint_content(algorithm) | {name: made[kind] for name, kind in policy.items()}
+    folder = RunFolder.create(config)
+    checkpoint.save(folder.path, content, env_steps=0, keep=3)
+    with pytest.raises(CheckpointError, match=f"got another \\({next(iter(policy))}: expected ") as refused:
+        restore(folder, algorithm)
+    assert "\n" not in str(refused.value)

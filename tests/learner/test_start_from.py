@@ -295,3 +295,12 @@ def test_an_algorithm_that_cannot_start_from_another_run_says_so(tmp_path: Path)
 
     with pytest.raises(UserFacingError, match="Mine does not start from another run"):
         Algorithm.start_from(object.__new__(Mine), None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("missing", ["algorithm", "parameters", "optimizer"])
+def test_a_checkpoint_that_lacks_a_part_is_one_line(tmp_path: Path, missing: str) -> None:
+    run, _ = earlier_run("ppo", tmp_path)
+    found = checkpoint.newest(run)[0]
+    del (found.state if missing in found.state else found.state["algorithm"])[missing]
+    checkpoint.save(run, found.state, found.env_steps, keep=1)
+    assert "expected the state of ppo, got another" in refusal("ppo", tmp_path, run, from_parts="all")

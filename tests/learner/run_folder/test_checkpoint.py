@@ -177,6 +177,49 @@ def test_reading_runs_no_code(tmp_path: Path) -> None:
         checkpoint.load(path)
 
 
+def cycle() -> list[Any]:
+    within: list[Any] = [torch.ones(3).expand(10**12, 3)]
+    within.append(within)
+    return within
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        torch.zeros(1).expand(10**12),
+        torch.zeros(8)[:4].as_strided((10**6, 4), (0, 1)),
+        torch.sparse_coo_tensor(torch.zeros(1, 1, dtype=torch.long), torch.ones(1), (10**12,), check_invariants=True),
+        torch.empty(10**12, device="meta"),
+        list(torch.ones(1, 10_000).expand(100, 10_000)),
+        [[[torch.zeros(1).expand(10**12)] * 2] * 2] * 2,
+        cycle(),
+    ],
+    ids=["expanded", "strided", "sparse", "meta", "views", "shared", "cycle"],
+)
+def test_a_tensor_that_is_larger_than_the_file_is_damage(tmp_path: Path, tensors: Any) -> None:
+    """Whoever copies it, as an optimizer does, would fill the memory."""
+    (tmp_path / "checkpoints").mkdir()
+    path = tmp_path / "checkpoints" / "000000000100.pt"
+    torch.save({"format": 1, "env_steps": 100, "state": {"x": {"y": [tensors]}}}, path)
+    with pytest.raises(CheckpointError, match="broken"):
+        checkpoint.load(path)
+    checkpoint.save(tmp_path, state(2), 50, keep=1)
+    assert checkpoint.newest(tmp_path)[0].env_steps == 50
+
+
+def test_views_come_back(tmp_path: Path) -> None:
+    flat = torch.arange(60_000.0)
+    saved: dict[str, Any] = {"flat": flat, "parts": [flat[:100], flat[100:]], "transposed": flat.reshape(100, 600).T}
+    checkpoint.save(tmp_path, saved, 100, keep=1)
+    found = checkpoint.newest(tmp_path)[0].state
+    assert all(torch.equal(found[name], saved[name]) for name in ("flat", "transposed"))
+
+
+def test_an_expanded_tensor_is_refused_before_it_is_written(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"state\['flat'\]: expected a tensor with memory for each of its elements"):
+        checkpoint.save(tmp_path, {"flat": torch.zeros(1).expand(30)}, 100, keep=3)
+
+
 @pytest.mark.parametrize("stray", [np.float64(1.0), np.zeros(3), {1, 2}, np.random.default_rng(0)])
 def test_a_state_that_could_not_be_read_back_is_not_written(tmp_path: Path, stray: object) -> None:
     with pytest.raises(UsageError, match=r"state\['inner'\]\[0\]: expected tensors and plain data, got"):
