@@ -6,7 +6,8 @@ from slot to slot when they are drawn. A slot without a row holds the final obse
 newest observation of an env copy, whose row comes with its next rollout.
 
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
-the oldest slot first. So a row that is still stored always finds the rows that follow it.
+the oldest slot first. So a row that is still stored always finds the rows that follow it: those of the same seat, however
+long it waits between them. The observation in which it waits is the one that its row led to, and stands in that slot.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import torch
 
 from learner.algorithms.replay.available_memory import GIB, available_bytes
 from learner.algorithms.replay.sum_tree import SumTree
+from learner.algorithms.returns import EpisodeEnds
 from protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, generator
@@ -108,6 +110,18 @@ class Remembered(NamedTuple):
     generator: Any
 
 
+def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
+    """[T+1, N] whether row t begins with an observation that is stored, because the row before it in its episode led there.
+
+    `continues` [N]: whether row 0 does. With seats, rows that are not valid may stand between the two.
+    """
+    goes_on = np.concatenate([continues[None], ends.valid & ~ends.ended])
+    if ends.with_seats:
+        for t, valid in enumerate(ends.valid):
+            goes_on[t + 1] |= goes_on[t] & ~valid
+    return goes_on
+
+
 class ReplayBuffer:
     """The newest transitions of all lanes, drawn uniformly or by priority."""
 
@@ -173,13 +187,14 @@ class ReplayBuffer:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
         newest = self._newest.get(lane) if not batch.fresh[columns.start] else None
         continues, newest = self._continues([leaf[0] for leaf in obs], newest, most)
-        needed = np.zeros((len(valid) + 1, valid.shape[1]), bool)  # [T+1, N] observations to store
-        needed[:-1] = valid
+        goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
+        needed = np.zeros(goes_on.shape, bool)  # [T+1, N] observations to store
+        needed[:-1] = valid & ~goes_on[:-1]
         needed[1:] |= valid & ~terminated
-        needed[0] &= ~continues
         written = np.full(needed.shape, NO_SLOT)  # [T+1, N] value of `_written` for each
         written[needed] = self._written + np.arange(np.count_nonzero(needed))
         written[0][continues] = newest[continues]
+        written = np.maximum.accumulate(written)  # while a seat waits, its newest observation stays where it is
         self._written += int(np.count_nonzero(needed))
         slot = written % self.size
         if batch.mask is not None:
@@ -202,8 +217,7 @@ class ReplayBuffer:
         self._rows += len(rows)
         if self._tree is not None and self._alpha is not None:
             self._tree.set(rows, self._highest**self._alpha)
-        ended = terminated[-1] | batch.truncated[-1, columns] | ~valid[-1]
-        self._newest[lane] = np.where(ended, NO_SLOT, written[-1])
+        self._newest[lane] = np.where(goes_on[-1], written[-1], NO_SLOT)
 
     def _make_mask(self, choices: int) -> None:
         if self._mask is None:

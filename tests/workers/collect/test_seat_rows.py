@@ -11,6 +11,7 @@ import pytest
 
 from learner.algorithms.minibatches import log_probs
 from learner.algorithms.ppo import PPO
+from learner.algorithms.replay.replay_buffer import ReplayBuffer
 from learner.algorithms.returns import EpisodeEnds, complete, discounted_return, gae, vtrace
 from learner.config.hyperparameters import PPOConfig
 from protocol.arrays import Array
@@ -213,6 +214,53 @@ def test_so_do_those_of_ten_thousand_histories(form: str) -> None:
         check_returns(form, 1250, 5 + k) for k in range(2)
     )
     assert compared > 100_000
+
+
+def in_own_steps(lived: Lived, k: int, n_step: int, known: int) -> tuple[float, float, float]:
+    """From an agent's action k: reward and discount of at most n of its own steps, and what it saw after them.
+
+    `known`: how many of its steps have been collected.
+    """
+    reward = 0.0
+    for i in range(n_step):
+        reward += GAMMA**i * lived.reward[k + i]
+        if k + i == len(lived.step) - 1 or k + i == known - 1:
+            ends = lived.terminated and k + i == len(lived.step) - 1
+            return reward, 0.0 if ends else GAMMA ** (i + 1), lived.saw[k + i]
+    return reward, GAMMA**n_step, lived.saw[k + n_step - 1]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("T", [1, 3, 16])
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_the_replay_buffer_follows_each_agent_in_its_own_time_and_stores_what_it_saw_once(
+    form: str, T: int, n_step: int
+) -> None:
+    """Compare every transition with the whole history of the game, as the environment wrote it down."""
+    rows = 240
+    run = seated_run(form, T=T, N=1)
+    collector, rollouts = collected(run, rows // T)
+    replay = ReplayBuffer(run.policy.observation, size=2000, n_step=n_step, gamma=GAMMA, seed=0)
+    for rollout in rollouts:
+        replay.add(stack_rollouts([rollout]))
+    expected: dict[float, tuple[int, tuple[float, float, float]]] = {}
+    observations = 0
+    for _, start, lived in in_own_time(collector, 0, rows):
+        known = sum(start + step < rows for step in lived.step)
+        for k in range(known):
+            expected[lived.seen[k]] = lived.did[k], in_own_steps(lived, k, n_step, known)
+        cut = known and not (lived.terminated and known == len(lived.step))
+        observations += known + int(cut)  # the last one of a part that goes on, or was truncated, is of no row
+    assert len(replay) == len(expected) > 100
+    assert len(replay.state_dict()["arrays"]["reward"]) == observations
+    drawn = replay.sample(30 * len(expected))
+    assert set(drawn.leaves[0].ravel().tolist()) == set(expected)
+    for i, seen in enumerate(drawn.leaves[0].ravel().tolist()):
+        did, (reward, discount, saw) = expected[seen]
+        assert drawn.action[i] == did
+        assert drawn.reward[i] == pytest.approx(reward, abs=1e-5)
+        assert drawn.discount[i] == pytest.approx(discount)
+        assert not discount or drawn.next_leaves[0][i, 0] == saw
 
 
 def test_a_monte_carlo_return_is_known_where_the_seats_part_ends_within_the_rollout() -> None:
