@@ -40,9 +40,9 @@ METRICS: dict[str, dict[str, Meaning]] = {
     "Self-play": {
         "self_play/elo": Meaning("Elo", "Rating of the policy, 1200 at first, by episodes against snapshots and programs."),
         "self_play/snapshots": Meaning("versions", "Earlier versions of the policy that are kept.", "snapshots"),
-        "rollout/score": Meaning(NONE, "Share of the last 100 training episodes that were won; a tie is half of one."),
+        "rollout/score": Meaning(NONE, "Share of the last 100 training episodes that were won; those that tie share it."),
         "eval/score": Meaning(
-            NONE, "Share of the evaluation's episodes that were won; a tie is half of one.", "score of evaluations"
+            NONE, "Share of the evaluation's episodes that were won; those that tie share it.", "score of evaluations"
         ),
     },
     "Progress and speed": {

@@ -110,8 +110,9 @@ class OtherTeams:
     def result(self, n: int, returns: Sequence[float]) -> tuple[float, float, int]:
         """Of an episode of copy n, by the returns of its seats: the return of the policy's team, the score, the opponent."""
         of_teams = [sum(returns[seat] for seat in team) for team in self._run.teams]
-        own = of_teams.pop(self._matches[n].team)
-        return own, 0.5 * ((own > max(of_teams)) + (own >= max(of_teams))), self._matches[n].opponent.number
+        own, best = of_teams[self._matches[n].team], max(of_teams)
+        score = 1 / of_teams.count(best) if own == best else 0.0  # of all teams the scores add up to 1
+        return own, score, self._matches[n].opponent.number
 
 
 def whole_episode(

@@ -110,6 +110,8 @@ def wrong_facts(episode: Episode, run: RunSpec) -> str:
     if episode.opponent is not None:
         if episode.opponent < -len(run.scripted):
             return f"expected an opponent from {-len(run.scripted)}, got {episode.opponent}"
-        if episode.facts[-1] not in (0.0, 0.5, 1.0):
-            return f"expected the score 0, 0.5 or 1, got {episode.facts[-1]}"
+        teams = len(run.teams)
+        if episode.facts[-1] not in {0.0, *(1 / sharing for sharing in range(1, teams + 1))}:
+            shared = "1 or 1/2" if teams == 2 else f"1/n for n from 1 to {teams}"
+            return f"expected the score 0, {shared}, got {episode.facts[-1]}"
     return ""

@@ -21,7 +21,7 @@ from protocol.env_spec import EnvSpec
 from protocol.errors import BadRollout
 from protocol.messages import Weights
 from protocol.rollout import Episode, Rollout
-from protocol.rows.rollout_checks import LARGEST_REWARD, validate
+from protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
 from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
 from tests.support.in_process.collectors import SESSION, VERSION, no_pulse, random_collector, random_weights
 from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
@@ -248,7 +248,7 @@ def test_with_teams_a_rollout_has_the_columns_of_one_team() -> None:
         (None, 0.5, "expected an opponent, got None"),
         (-2, 0.5, "expected an opponent from -1, got -2"),
         (-(2**52), 0.5, f"expected an opponent from -1, got {-(2**52)}"),
-        *((0, score, f"expected the score 0, 0.5 or 1, got {score}") for score in (0.25, -1.0, 1.5, math.nan)),
+        *((0, score, f"expected the score 0, 1 or 1/2, got {score}") for score in (0.25, 1 / 3, -1.0, 1.5, math.nan)),
         (0, math.inf, "expected finite facts, got (nan, inf)"),
         *((opponent, score, "") for opponent in (-1, 0, 7) for score in (0.0, 0.5, 1.0)),
     ],
@@ -259,6 +259,13 @@ def test_with_teams_an_episode_has_an_opponent_and_a_score(opponent: int | None,
     other = msgspec.structs.replace(first, opponent=opponent, facts=(math.nan, score))
     for episodes in ((other, second), (first, other)):
         assert refusal(msgspec.structs.replace(rollout, episodes=episodes), run) == (says and f"episode: {says}")
+
+
+@pytest.mark.parametrize("score", [0.0, 1 / 3, 0.5, 1.0, 0.25, 2 / 3])
+def test_of_three_teams_as_many_as_share_the_first_place_share_the_score(score: float) -> None:
+    run = msgspec.structs.replace(of_one_team()[1], seats=tuple("abc"), teams=((0,), (1,), (2,)), facts=("score",))
+    says = "" if score in (0, 1, 1 / 2, 1 / 3) else f"expected the score 0, 1/n for n from 1 to 3, got {score}"
+    assert wrong_facts(Episode(0.0, 1, 0.0, (score,), 0), run) == says
 
 
 def test_without_teams_an_episode_has_no_opponent() -> None:

@@ -124,8 +124,8 @@ def test_opponents_take_turns_and_each_meets_all_teams() -> None:
         ((0, 0, -1, -1, 0, 3), 0.5, r"expected the opponents \(.*\), got \[0, 0, -1, -1, 0, 3\]"),
         ((0, 0, -1, -1, 0, None), 0.5, "episode: expected an opponent, got None"),
         ((0, 0, -1, -1, 0, -2), 0.5, "episode: expected an opponent from -1, got -2"),
-        ((0, 0, -1, -1, 0, 0), 0.6, r"episode: expected the score 0, 0\.5 or 1, got 0\.6"),
-        ((0, 0, -1, -1, 0, 0), math.nan, r"episode: expected the score 0, 0\.5 or 1, got nan"),
+        ((0, 0, -1, -1, 0, 0), 0.6, r"episode: expected the score 0, 1 or 1/2, got 0\.6"),
+        ((0, 0, -1, -1, 0, 0), math.nan, r"episode: expected the score 0, 1 or 1/2, got nan"),
     ],
 )
 def test_an_answer_of_other_matches_is_refused_and_its_ticket_is_dealt_again(

@@ -9,6 +9,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from learner.algorithms.minibatches import log_probs
 from learner.algorithms.ppo import PPO
@@ -19,8 +21,8 @@ from protocol.errors import PolicyFailed, UsageError
 from protocol.messages import Evaluate, Weights
 from protocol.policy.layout import acting_size
 from protocol.policy.policy import make_policy
-from protocol.rollout import Rollout, stack_rollouts
-from protocol.rows.rollout_checks import validate
+from protocol.rollout import Episode, Rollout, stack_rollouts
+from protocol.rows.rollout_checks import validate, wrong_facts
 from protocol.specs import SCORE, PolicySpec, RunSpec
 from tests.support.in_process.collectors import no_pulse, random_policy
 from tests.support.users_code.seat_envs import AGENTS
@@ -215,6 +217,8 @@ def test_the_score_compares_the_return_of_the_team_with_the_best_of_the_others()
         (0, (2.0, 1.0, 2.0), (2.0, 0.5, 9)),
         (1, (2.0, 1.0, -3.0), (1.0, 0.0, 9)),
         (2, (-2.0, -1.0, -0.5), (-0.5, 1.0, 9)),
+        (1, (2.0, 2.0, 2.0), (2.0, 1 / 3, 9)),
+        (2, (2.0, 2.0, 1.0), (1.0, 0.0, 9)),
     ):
         assert OtherTeams(run, [Match(team, opponent)], np.random.default_rng(0)).result(0, returns) == result
     pairs = msgspec.structs.replace(
@@ -223,6 +227,23 @@ def test_the_score_compares_the_return_of_the_team_with_the_best_of_the_others()
     others = OtherTeams(pairs, [Match(1, opponent)], np.random.default_rng(0))
     assert others.mine.tolist() == [False, True, False, True]
     assert others.result(0, (1.0, 2.0, 3.0, 1.0)) == (3.0, 0.0, 9)
+
+
+@given(returns=st.lists(st.integers(-1, 2), min_size=2, max_size=5))
+def test_the_scores_of_all_teams_of_an_episode_add_up_to_one(returns: list[int]) -> None:
+    """So equal policies score one over the number of teams, however often they tie, and no rating grows without end."""
+    seats = tuple("abcde"[: len(returns)])
+    run, opponent = with_teams(seated_run("turns", T=5, N=1)), Opponent.__new__(Opponent)
+    run = msgspec.structs.replace(run, seats=seats, teams=teams_of(seats), facts=(SCORE,))
+    opponent.number = 9
+    scores = []
+    for team in range(len(returns)):
+        others = OtherTeams(run, [Match(team, opponent)], np.random.default_rng(0))
+        own, score, _ = others.result(0, returns)
+        assert own == returns[team]
+        assert wrong_facts(Episode(own, 1, 0.0, (score,), 9), run) == ""
+        scores.append(score)
+    assert sum(scores) == pytest.approx(1)
 
 
 def test_an_evaluation_is_played_as_it_is_ordered() -> None:
