@@ -38,13 +38,15 @@ from workers.conversation.held import Assignment
 
 ATARI = RunSpec(
     EnvSpec("ALE/Pong-v5"),
-    PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ActionSpec("discrete", (), "int64", (6,), (0,))),
+    PolicySpec((Leaf("", "box", (84, 84, 4), "uint8", divisor=255),), ActionSpec("discrete", (), "int64", (6,), (0,))),
     rollout_steps=128,
     copies=4,
     lanes=2,
     seed=1,
 )
-STACKS = msgspec.structs.replace(ATARI, policy=PolicySpec((Leaf("", "box", (4, 84, 84), "uint8"),), ATARI.policy.action))
+STACKS = msgspec.structs.replace(
+    ATARI, policy=PolicySpec((Leaf("", "box", (4, 84, 84), "uint8", divisor=255),), ATARI.policy.action)
+)
 
 WAYS = {
     "as they lie": Packing(),

@@ -51,7 +51,7 @@ def sizes(cores: int) -> dict[str, Size]:
     """Both, on this number of cores."""
     sb3 = "benchmarks.train_stable_baselines3"
     flags = ("--lanes", "2", "--torch-threads")
-    image, features = Leaf("", "box", (4, 84, 84), "uint8"), Leaf("", "box", (17,), "float32")
+    image, features = Leaf("", "box", (4, 84, 84), "uint8", divisor=255), Leaf("", "box", (17,), "float32")
     buttons = ActionSpec("discrete", (), "int64", (6,), (0,))
     torques = ActionSpec("box", (6,), "float32", low=(-1.0,) * 6, high=(1.0,) * 6)
     cheetah = {"env": "HalfCheetah-v5", "envs": 8, "rollout_steps": 256, "n_epochs": 10, "net": [64, 64]}

@@ -46,7 +46,10 @@ def stable_baselines3_actor(run: str | os.PathLike[str]) -> Callable[[Any], Any]
         state["log_std"] = arrays["actor.log_std"]
     policy.load_state_dict(state)
 
+    divisor = spec["observation"][0]["divisor"]  # 255 for bytes from 0 to 255, else 1
+
     def act(observation: Any) -> Any:
+        observation = np.asarray(observation) / np.float32(divisor)
         if "observation_mean" in arrays:
             mean, std = arrays["observation_mean"].numpy(), arrays["observation_std"].numpy()
             observation = np.clip((observation - mean) / std, -10, 10)

@@ -33,7 +33,7 @@ from protocol.rollout import Episode, Rollout
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
-PROTOCOL_VERSION = 9
+PROTOCOL_VERSION = 10
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
 

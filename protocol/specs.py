@@ -27,6 +27,8 @@ class Leaf(msgspec.Struct, frozen=True):
     """how many values each entry can take (discrete, multidiscrete)"""
     start: tuple[int, ...] = ()
     """the smallest value of each entry (discrete, multidiscrete)"""
+    divisor: Literal[1, 255] = 1
+    """a network sees each value divided by this: 255 for a Box of bytes (uint8) whose bounds are 0 and 255"""
 
     @property
     def name(self) -> str:

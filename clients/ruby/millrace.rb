@@ -48,7 +48,7 @@ class Worker
   end
 
   def hello
-    say({ type: "Hello", protocol: 9, worker: @name, host: Socket.gethostname.encode("UTF-8"),
+    say({ type: "Hello", protocol: 10, worker: @name, host: Socket.gethostname.encode("UTF-8"),
           pid: Process.pid, process_nonce: @nonce, software: "millrace.rb", attempt: @attempt })
     @next_at, @pause_s = now + @pause_s, [2 * @pause_s, 4].min
   end

@@ -74,7 +74,8 @@ class Normalizer:
         """The features [T+1, N, D] float32 of a batch: (x − mean) / std, clipped to ±10.
 
         Before `update` these are the ones that the policy saw, if it normalizes and `max_lag` is 0. Arrays of the
-        observation are flattened and side by side; discrete values are one-hot vectors, bytes are divided by 255 before.
+        observation are flattened and side by side; discrete values are one-hot vectors, and bytes of a Box from 0 to 255
+        are divided by 255 before.
         """
         return normalize(self._features(batch), self.mean, self.std)
 

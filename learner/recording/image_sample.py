@@ -2,7 +2,7 @@
 
 A row for each of four steps, from the first to the last of a rollout of one env copy. The channels are side by side, as
 those of stacked frames are; three channels are shown as red, green and blue. Of large images every second, third, … pixel is
-taken.
+taken. Where the bounds are not those of bytes, the largest value is white, so that planes of 0 and 1 can be seen.
 """
 
 from __future__ import annotations
@@ -43,8 +43,10 @@ def png(pixels: Pixels) -> bytes:
 
 def _sheet(array: Array, leaf: Leaf) -> Pixels:
     """Rows of images, as one image."""
-    steps = np.linspace(0, len(array) - 1, ROWS).astype(int)
-    return _joined([_row(array[t, 0], leaf) for t in dict.fromkeys(steps.tolist())], axis=0)
+    steps = dict.fromkeys(np.linspace(0, len(array) - 1, ROWS).astype(int).tolist())
+    images = [np.asarray(array[t, 0], np.uint8) for t in steps]
+    white = 255 if leaf.divisor == 255 else max(1, *(int(image.max()) for image in images))
+    return _joined([_row(image * np.uint8(255 // white), leaf) for image in images], axis=0)
 
 
 def _row(image: Array, leaf: Leaf) -> Pixels:

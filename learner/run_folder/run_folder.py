@@ -63,7 +63,7 @@ from protocol.policy.possible import why_impossible
 from protocol.space_spec import MAX_SEATS
 from protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
 
-POLICY_FORMAT = 1
+POLICY_FORMAT = 2
 Which = Literal["final", "best"]
 UNREADABLE = (OSError, msgspec.MsgspecError, ValueError, RecursionError)  # what reading a damaged file raises
 
@@ -307,7 +307,10 @@ class RunFolder:
         encoder = description.policy.encoder
         refuse_modules_in(self.path, (description.env, *description.wrappers, encoder.factory if encoder else ""))
         if description.format != POLICY_FORMAT:
-            raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}")
+            raise UsageError(
+                f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}; "
+                "install the millrace that wrote it"
+            )
         acting, _ = parameter_layout(description.policy)
         buffers = buffer_layout(description.policy)
         names = tuple(field.name for field in buffers)

@@ -67,7 +67,7 @@ def _walk(space: gymnasium.Space[Any], path: tuple[str | int, ...]) -> Iterator[
 def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
     match space:
         case spaces.Box() if space.dtype.kind in STORED_KINDS and space.dtype.itemsize <= 8:
-            return Leaf(path, "box", space.shape, space.dtype.name)
+            return Leaf(path, "box", space.shape, space.dtype.name, divisor=255 if _has_all_bytes(space) else 1)
         case spaces.Discrete():
             return Leaf(path, "discrete", (), "int64", (int(space.n),), (int(space.start),))
         case spaces.MultiDiscrete():
@@ -77,6 +77,11 @@ def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
         case _:
             where = f" at {path}" if path else ""
             raise UsageError(f"observation space {space}{where} is not supported; supported are {OBSERVATIONS}")
+
+
+def _has_all_bytes(space: spaces.Box) -> bool:
+    """Whether values are bytes from 0 to 255. Of other bounds, such as those of flags, a byte is a number as any other."""
+    return space.dtype == np.uint8 and bool((space.low == 0).all() and (space.high == 255).all())
 
 
 def with_last(space: gymnasium.Space[Any], keys: Sequence[str]) -> gymnasium.Space[Any]:

@@ -34,7 +34,7 @@ def _leaf_features(leaf: Leaf) -> int:
 def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
-    Arrays are flattened, discrete values become one-hot vectors, and bytes are divided by 255. The dtype is float32, or
+    Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32, or
     float64 if the policy normalizes and an array of the observation is float64: `normalize` makes float32 of them.
     """
     plain = [(leaf, array) for leaf, array in zip(spec.observation, leaves, strict=True) if not leaf.is_image]
@@ -55,8 +55,8 @@ def _features(leaf: Leaf, array: Array, keeps_float64: bool) -> Array:
             flat = np.repeat(flat, leaf.sizes, -1)
         return np.equal(flat, _one_hot_values(leaf)).astype(np.float32)
     flat = array.reshape(*lead, math.prod(leaf.shape))
-    if leaf.dtype == "uint8":
-        return flat * np.float32(1 / 255)
+    if leaf.divisor != 1:
+        return flat * np.float32(1 / leaf.divisor)
     return flat if keeps_float64 and leaf.dtype == "float64" else flat.astype(np.float32, copy=False)
 
 

@@ -137,12 +137,13 @@ class Convolutions(NamedTuple):
     channels_last: bool
     parameters: list[tuple[Tensor, Tensor]]  # weight and bias of each convolution, then of the layer
     strides: list[int]
-    bfloat16: bool = False  # parameters are bfloat16, and the first weight is divided by 255
+    divisor: int  # of the values of the image
+    bfloat16: bool = False  # parameters are bfloat16, and the first weight is divided by `divisor`
 
     def in_bfloat16(self) -> Convolutions:
         """The same with bfloat16 copies of the parameters, in channels-last format, which takes half the time of others."""
         (first, bias), *others = ((weight.to(torch.bfloat16), bias.to(torch.bfloat16)) for weight, bias in self.parameters)
-        *convs, out = [(first / 255, bias), *others]
+        *convs, out = [(first / self.divisor, bias), *others]
         channels_last = [(weight.contiguous(memory_format=torch.channels_last), bias) for weight, bias in convs]
         return self._replace(parameters=[*channels_last, out], bfloat16=True)
 
@@ -155,7 +156,7 @@ class Convolutions(NamedTuple):
             h = h.contiguous(memory_format=torch.channels_last)
             convs = [(w.contiguous(memory_format=torch.channels_last), b) for w, b in convs]
         h = h.to(weight.dtype, copy=True)
-        h = h.contiguous(memory_format=torch.channels_last) if self.bfloat16 else h.mul_(1 / 255)
+        h = h.contiguous(memory_format=torch.channels_last) if self.bfloat16 else h.mul_(1 / self.divisor)
         for (w, b), stride in zip(convs, self.strides, strict=True):
             h = F.relu(F.conv2d(h, w, b, stride), inplace=True)
         return F.relu(F.linear(h.flatten(1), weight, bias)).float()
@@ -234,7 +235,8 @@ class FlatNetwork:
         stack, (channels, _, _), _ = convolutions(leaf)
         names = [f"image{i}.{j}" for j in range(len(stack))] + [f"image{i}.out"]
         parameters = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
-        return Convolutions(leaf.shape != (channels, *leaf.shape[1:]), parameters, [conv.stride for conv in stack])
+        channels_last = leaf.shape != (channels, *leaf.shape[1:])
+        return Convolutions(channels_last, parameters, [conv.stride for conv in stack], leaf.divisor)
 
     def inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].

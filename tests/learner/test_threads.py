@@ -69,7 +69,7 @@ WIDE = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, net=(256, 256))
 LARGE = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, net=(512, 512))
 RECURRENT = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, core="lstm")
 FEATURES = PolicySpec((Leaf("", "discrete", (), "int64", (500,), (0,)),), ACTION)
-IMAGES = PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ACTION)
+IMAGES = PolicySpec((Leaf("", "box", (84, 84, 4), "uint8", divisor=255),), ACTION)
 
 
 @pytest.mark.parametrize(

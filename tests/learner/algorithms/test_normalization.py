@@ -53,7 +53,7 @@ SPEC = PolicySpec(
     (
         Leaf("a", "box", (2,), "float32"),
         Leaf("b", "discrete", (), "int64", (3,), (0,)),
-        Leaf("c", "box", (8, 8, 3), "uint8"),
+        Leaf("c", "box", (8, 8, 3), "uint8", divisor=255),
         Leaf("d", "box", (1,), "float32"),
     ),
     ActionSpec("discrete", (), "int64", (2,), (0,)),

@@ -37,7 +37,7 @@ def rollout(*shape: int) -> np.ndarray[Any, Any]:
 
 def test_stacked_frames_are_side_by_side_and_a_row_is_a_step() -> None:
     obs = rollout(4, SIDE, SIDE)
-    (file,) = image_samples([obs], [Leaf("", "box", (4, SIDE, SIDE), "uint8")]).values()
+    (file,) = image_samples([obs], [Leaf("", "box", (4, SIDE, SIDE), "uint8", divisor=255)]).values()
     shown = pixels_of(file)
     each = SIDE + GAP
     assert shown.shape == (4 * each - GAP, 4 * each - GAP)
@@ -52,15 +52,21 @@ def test_stacked_frames_are_side_by_side_and_a_row_is_a_step() -> None:
 @pytest.mark.parametrize("shape", [(SIDE, SIDE + 1, 3), (3, SIDE, SIDE + 1)])
 def test_three_channels_are_colors_wherever_they_stand(shape: tuple[int, ...]) -> None:
     obs = rollout(*shape)
-    (file,) = image_samples([obs], [Leaf("", "box", shape, "uint8")]).values()
+    (file,) = image_samples([obs], [Leaf("", "box", shape, "uint8", divisor=255)]).values()
     shown = pixels_of(file)
     first = obs[0, 0] if shape[2] == 3 else obs[0, 0].transpose(1, 2, 0)
     np.testing.assert_array_equal(shown[:SIDE, : SIDE + 1], first)
 
 
+def test_planes_of_0_and_1_are_black_and_white() -> None:
+    obs = rollout(SIDE, SIDE, 1) % 2
+    (file,) = image_samples([obs], [Leaf("", "box", (SIDE, SIDE, 1), "uint8")]).values()
+    np.testing.assert_array_equal(pixels_of(file)[:SIDE], obs[0, 0, ..., 0] * 255)
+
+
 def test_each_image_of_an_observation_has_a_file_and_other_arrays_have_none() -> None:
-    image = Leaf("camera/left", "box", (SIDE, SIDE, 1), "uint8")
-    leaves = [image, Leaf("speed", "box", (2,), "float32"), Leaf("tiny", "box", (3, 3, 1), "uint8")]
+    image = Leaf("camera/left", "box", (SIDE, SIDE, 1), "uint8", divisor=255)
+    leaves = [image, Leaf("speed", "box", (2,), "float32"), Leaf("tiny", "box", (3, 3, 1), "uint8", divisor=255)]
     obs = [rollout(SIDE, SIDE, 1), np.zeros((T + 1, COPIES, 2), np.float32), rollout(3, 3, 1)]
     found = image_samples(obs, leaves)
     assert list(found) == ["observation-camera-left.png"]
@@ -68,7 +74,7 @@ def test_each_image_of_an_observation_has_a_file_and_other_arrays_have_none() ->
 
 
 def test_a_short_rollout_has_fewer_rows() -> None:
-    (file,) = image_samples([rollout(1, SIDE, SIDE)[:2]], [Leaf("", "box", (1, SIDE, SIDE), "uint8")]).values()
+    (file,) = image_samples([rollout(1, SIDE, SIDE)[:2]], [Leaf("", "box", (1, SIDE, SIDE), "uint8", divisor=255)]).values()
     assert pixels_of(file).shape == (2 * (SIDE + GAP) - GAP, SIDE)
 
 

@@ -158,8 +158,8 @@ def test_a_policy_that_does_not_fit_its_card_is_refused(tmp_path: Path) -> None:
     card.write_text(whole.replace('"net": [\n      8', '"net": [\n      9'))
     with pytest.raises(UsageError, match=r"actor\.0\.bias: expected float32 \(9,\), got \(8,\)"):
         folder.read_policy()
-    card.write_text(whole.replace('"format": 1', '"format": 2'))
-    with pytest.raises(UsageError, match="expected format 1, got 2"):
+    card.write_text(whole.replace('"format": 2', '"format": 1'))
+    with pytest.raises(UsageError, match="expected format 2, got 1; install the millrace that wrote it"):
         folder.read_policy()
     card.write_text(whole)
     (tmp_path / "policy.safetensors").write_bytes((tmp_path / "policy.safetensors").read_bytes()[:-4])

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import tracemalloc
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import msgspec
 import numpy as np
 import pytest
+import torch
 
 from learner.algorithms.minibatches import log_probs
 from learner.algorithms.normalization import ObservationNormalizer
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
+from learner.run_folder.run_folder import RunFolder
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import observation_leaves
 from protocol.policy.features import feature_size, features, normalize
-from protocol.policy.layout import acting_size, convolutions
+from protocol.policy.layout import acting_size, buffer_size, convolutions
 from protocol.policy.policy import make_policy
 from protocol.rollout import stack_rollouts
 from protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.docs.pages import blocks, written
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around
+from tests.support.in_process.saved_policies import policy_run
 from workers.envs.toy import Countdown
 
 TWO = ActionSpec("discrete", (), "int64", (2,), (0,))
@@ -68,6 +74,76 @@ def test_one_hot_features_take_no_more_memory_than_their_result(space: Any) -> N
     assert peak < 6 * found.nbytes
 
 
+# ------------------------------------------------------------------------------------------------ bytes
+
+
+def bounds(*values: int) -> Any:
+    return np.array(values, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "divisor"),
+    [
+        (0, 255, 255),
+        (0, 1, 1),
+        (0, 254, 1),
+        (1, 255, 1),
+        (bounds(0, 0, 0, 0), bounds(255, 255, 255, 255), 255),
+        (bounds(0, 0, 0, 0), bounds(255, 255, 255, 1), 1),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("normalized", [False, True])
+def test_bytes_are_divided_where_their_bounds_say_so_and_else_are_numbers_as_any_other(
+    low: Any, high: Any, divisor: int, normalized: bool
+) -> None:
+    shape = () if isinstance(low, np.ndarray) else (4,)
+    spec = policy_of(gymnasium.spaces.Box(low, high, shape or None, np.uint8), normalize_observations=normalized)
+    rows = np.arange(256, dtype=np.uint8).reshape(2, 32, 4)
+    found = features(spec, [rows])
+    assert found.dtype == np.float32
+    expected = rows * np.float32(1 / 255) if divisor == 255 else rows.astype(np.float32)
+    assert found.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("shape", [(8, 8, 2), (36, 40, 1)])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_planes_of_0_and_1_reach_the_convolutions_as_they_are(shape: tuple[int, ...], precision: Any) -> None:
+    """Those of 0 and 255 reach them as the same numbers."""
+    planes, picture = (policy_of(gymnasium.spaces.Box(0, high, shape, np.uint8)) for high in (1, 255))
+    rows = np.random.default_rng(0).integers(0, 2, (1, 5, *shape), np.uint8)
+    parameters = np.random.default_rng(1).normal(0, 0.1, acting_size(planes)).astype(np.float32)
+    found = []
+    for spec, seen in ((planes, rows), (picture, rows * np.uint8(255))):
+        policy = make_policy(spec, precision)
+        policy.load(parameters, np.zeros(0, np.float32))
+        found.append(policy([seen]))
+    if precision == "float32":
+        assert found[0].tobytes() == found[1].tobytes()  # 255 times float32(1/255) is 1
+    else:
+        # The first weights are rounded once more, to 8 bits. The outputs are sums of many of them, of the size of 1.
+        np.testing.assert_allclose(found[0], found[1], atol=0.1)
+        assert np.abs(found[0]).max() > 0.1
+
+
+@pytest.mark.parametrize(("dtype", "high"), [("uint8", 1), ("uint8", 255), ("int8", 1), ("float32", 1)])
+def test_the_exported_actor_of_the_page_sees_what_the_policy_sees(dtype: str, high: int, tmp_path: Path) -> None:
+    """The TorchScript module of docs/how-to/policies.md."""
+    (code,) = (block.text for block in blocks(written()["docs/how-to/policies.md"]) if "class Actor" in block.text)
+    names: dict[str, Any] = {}
+    exec(code.partition("\nactor = ")[0], names)
+    spec = policy_of(gymnasium.spaces.Box(0, high, (4,), np.dtype(dtype).type), normalize_observations=True)
+    generator = np.random.default_rng(0)
+    weights = generator.normal(0, 0.5, acting_size(spec)).astype(np.float32), np.ones(buffer_size(spec), np.float32)
+    RunFolder(tmp_path).write_policy(policy_run(spec, EnvSpec("Mine-v0")), *weights)
+    policy = make_policy(spec)
+    policy.load(*weights)
+    rows = generator.integers(0, high + 1, (1, 20, 4)).astype(dtype)
+    found = names["Actor"](tmp_path)(torch.from_numpy(rows[0]))
+    # A hundred float32 operations on numbers of the size of 1, in another order.
+    np.testing.assert_allclose(found.numpy(), policy([rows])[0], atol=1e-4)
+
+
 # ------------------------------------------------------------------------------------------------ images
 
 
@@ -80,7 +156,7 @@ def test_one_hot_features_take_no_more_memory_than_their_result(space: Any) -> N
     ],
 )  # fmt: skip
 def test_an_image_whose_side_is_too_small_for_the_convolutions_is_flattened(shape: tuple[int, ...], is_image: bool) -> None:
-    leaf = Leaf("", "box", shape, "uint8")
+    leaf = Leaf("", "box", shape, "uint8", divisor=255)
     assert leaf.is_image is is_image
     spec = PolicySpec((leaf,), TWO)
     if is_image:

@@ -36,5 +36,5 @@ def test_networks_that_look_at_images_keep_it_and_others_do_not(monkeypatch: pyt
     action = ActionSpec("discrete", (), "int64", (4,), (0,))
     ActorCriticNetwork(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
     assert kept == []
-    ActorCriticNetwork(PolicySpec((Leaf("", "box", (36, 36, 1), "uint8"),), action))
+    ActorCriticNetwork(PolicySpec((Leaf("", "box", (36, 36, 1), "uint8", divisor=255),), action))
     assert kept == [True]

@@ -28,16 +28,19 @@ from tests.support.numbers.rounding import in_double, in_float64, sampled
 BOX = Leaf("x", "box", (2, 3), "float32")
 OBSERVATIONS = {
     "box": (BOX,),
-    "bytes": (Leaf("x", "box", (5,), "uint8"),),
+    "bytes": (Leaf("x", "box", (5,), "uint8", divisor=255),),
     "discrete": (Leaf("x", "discrete", (), "int64", (5,), (-2,)),),
     "multidiscrete": (Leaf("x", "multidiscrete", (2,), "int64", (3, 4), (0, 1)),),
     "multibinary": (Leaf("x", "multibinary", (3,), "int8"),),
     "dict": (BOX, Leaf("y", "discrete", (), "int64", (3,), (0,))),
 }
 IMAGES = {
-    "channels last": (Leaf("i", "box", (12, 11, 3), "uint8"),),
-    "channels first, and a box": (BOX, Leaf("i", "box", (3, 12, 14), "uint8")),
-    "two, one large": (Leaf("i", "box", (36, 36, 1), "uint8"), Leaf("j", "box", (9, 9, 2), "uint8")),
+    "channels last": (Leaf("i", "box", (12, 11, 3), "uint8", divisor=255),),
+    "channels first, and a box": (BOX, Leaf("i", "box", (3, 12, 14), "uint8", divisor=255)),
+    "two, one large": (
+        Leaf("i", "box", (36, 36, 1), "uint8", divisor=255),
+        Leaf("j", "box", (9, 9, 2), "uint8", divisor=255),
+    ),
 }
 ACTIONS = {
     "discrete": ActionSpec("discrete", (), "int64", (4,), (0,)),

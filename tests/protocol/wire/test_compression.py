@@ -150,7 +150,7 @@ def test_what_a_worker_collects_of_gymnasiums_frame_stacks_is_packed(padding: st
 
 STACKS = RunSpec(
     EnvSpec("Stacks-v0"),
-    PolicySpec((Leaf("", "box", (4, 8, 8), "uint8"),), ActionSpec("discrete", (), "int64", (2,), (0,))),
+    PolicySpec((Leaf("", "box", (4, 8, 8), "uint8", divisor=255),), ActionSpec("discrete", (), "int64", (2,), (0,))),
     rollout_steps=16,
     copies=2,
     lanes=1,

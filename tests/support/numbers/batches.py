@@ -18,7 +18,7 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 BOX = Leaf("", "box", (4,), "float32")
 DISCRETE = PolicySpec((BOX,), ActionSpec("discrete", (), "int64", (4,), (0,)), (16,))
 GAUSSIAN = PolicySpec((BOX,), ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), (16,))
-IMAGE = PolicySpec((BOX, Leaf("i", "box", (8, 8, 1), "uint8")), DISCRETE.action, (16,))
+IMAGE = PolicySpec((BOX, Leaf("i", "box", (8, 8, 1), "uint8", divisor=255)), DISCRETE.action, (16,))
 LANES, COPIES, T = 2, 3, 20
 
 

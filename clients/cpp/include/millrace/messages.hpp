@@ -11,7 +11,7 @@
 
 namespace millrace {
 
-constexpr std::uint64_t PROTOCOL_VERSION = 9;
+constexpr std::uint64_t PROTOCOL_VERSION = 10;
 constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16,
                       MAX_SEATS = 1 << 10;
 
@@ -31,6 +31,7 @@ struct Leaf {  // Leaf and ActionSpec of the wire document
   std::string kind, dtype;
   std::vector<std::size_t> shape;
   std::vector<std::int64_t> sizes, start;
+  std::uint64_t divisor = 1;
 };
 
 struct Run {  // DescribeSpec, RunSpec or StepSpec
@@ -220,6 +221,7 @@ class Decoder {
       else if (name == "shape") list(r, leaf.shape);
       else if (name == "sizes") list(r, leaf.sizes);
       else if (name == "start") list(r, leaf.start);
+      else if (name == "divisor") leaf.divisor = r.natural();
       else return false;
       return true;
     });

@@ -32,7 +32,7 @@ class Policy {
  public:
   Policy() = default;
   Policy(const Run& run, const Space& observation, const Space& action)
-      : observation_(observation), action_(action), relu_(run.relu), normalize_(run.normalize),
+      : observation_(observation), action_(action), relu_(run.relu), normalize_(run.normalize), scale_(1.0f / static_cast<float>(observation.divisor())),
         inputs_(observation.kind == "discrete" ? static_cast<std::size_t>(observation.n) : observation.elements()),
         outputs_(action.kind == "discrete" ? static_cast<std::size_t>(action.n) : action.elements()) {
     std::size_t width = inputs_, widest = std::max(inputs_, outputs_);
@@ -133,7 +133,7 @@ class Policy {
     }
     double value = observation_.dtype == "float32"   ? static_cast<const float*>(obs)[i]
                    : observation_.dtype == "float64" ? static_cast<const double*>(obs)[i]
-                   : observation_.dtype == "uint8"   ? static_cast<const unsigned char*>(obs)[i] * (1 / 255.0f)
+                   : observation_.dtype == "uint8"   ? static_cast<const unsigned char*>(obs)[i] * scale_
                                                      : static_cast<float>(static_cast<const std::int64_t*>(obs)[i]);
     if (!normalize_) return static_cast<float>(value);
     double mean = buffers_[i], std = buffers_[inputs_ + i];
@@ -152,6 +152,7 @@ class Policy {
 
   Space observation_, action_;
   bool relu_ = false, normalize_ = false;
+  float scale_ = 1;  // of bytes
   std::size_t inputs_ = 0, outputs_ = 0, size_ = 0;
   std::vector<Layer> layers_;
   std::vector<float> x_, y_, params_, log_std_, buffers_;

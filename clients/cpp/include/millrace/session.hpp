@@ -59,8 +59,12 @@ struct Space {  // one array: a Box of float32, float64, uint8 or int64, or a Di
     else for (std::size_t i = 0; i < elements(); ++i) append(std::clamp(0.0, low[i % low.size()], high[i % high.size()]), value);
     return value;
   }
+  std::uint64_t divisor() const {  // a policy sees each value divided by it: bytes whose bounds are 0 and 255
+    auto all = [](const std::vector<double>& bounds, double bound) { return std::all_of(bounds.begin(), bounds.end(), [=](double each) { return each == bound; }); };
+    return kind == "box" && dtype == "uint8" && all(low, 0) && all(high, 255) ? 255 : 1;
+  }
   bool is(const Leaf& leaf) const {
-    return leaf.kind == kind && leaf.shape == shape && leaf.dtype == dtype &&
+    return leaf.kind == kind && leaf.shape == shape && leaf.dtype == dtype && leaf.divisor == divisor() &&
            (kind == "box" || (leaf.sizes == std::vector{n} && leaf.start == std::vector{start}));
   }
 };

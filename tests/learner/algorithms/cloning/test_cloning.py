@@ -22,7 +22,7 @@ from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 BOX = Leaf("", "box", (3,), "float32")
-IMAGE = Leaf("i", "box", (8, 8, 1), "uint8")
+IMAGE = Leaf("i", "box", (8, 8, 1), "uint8", divisor=255)
 DISCRETE = ActionSpec("discrete", (), "int64", (3,), (0,))
 CONTINUOUS = ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2)
 ACTIONS = [

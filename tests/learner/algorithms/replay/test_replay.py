@@ -453,7 +453,7 @@ def test_observations_stay_as_they_are(dtype: str) -> None:
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
 def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None) -> None:
-    observation = (Leaf("", "box", (84, 84, 4), "uint8"), Leaf("n", "discrete", (), "int64", (3,), (0,)))
+    observation = (Leaf("", "box", (84, 84, 4), "uint8", divisor=255), Leaf("n", "discrete", (), "int64", (3,), (0,)))
     kept = ReplayBuffer(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
     arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
     tree = 0 if kept._tree is None else kept._tree._nodes.nbytes
@@ -464,7 +464,7 @@ def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: py
     monkeypatch.setattr(module, "available_bytes", lambda: 2 * GIB)
     made: list[object] = []
     monkeypatch.setattr(np, "zeros", lambda *args: made.append(args))
-    image = (Leaf("", "box", (84, 84, 4), "uint8"),)
+    image = (Leaf("", "box", (84, 84, 4), "uint8", divisor=255),)
     with pytest.raises(UsageError) as refused:
         ReplayBuffer(image, size=1_000_000, n_step=1, gamma=GAMMA, seed=0)
     assert not made
