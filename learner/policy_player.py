@@ -21,13 +21,14 @@ from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.hub import Hub
 from learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
-from learner.run_folder.run_folder import RunFolder, Which
+from learner.run_folder.run_folder import RunFolder, StoredPolicy, Which
 from protocol.arrays import Floats
 from protocol.bounds import MAX_FACTS
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
+from protocol.own_module import refuse_modules_in
 from protocol.specs import SCORE, ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -50,7 +51,7 @@ class SavedPolicy(NamedTuple):
     """the names of its agents"""
     teams: tuple[tuple[int, ...], ...] = ()
     """the seats of each team, if it has met opponents"""
-    against: SavedPolicy | None = None
+    against: StoredPolicy | None = None
     """plays the other teams"""
 
 
@@ -63,6 +64,7 @@ def saved_policy(
     be found.
     """
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
+    refuse_modules_in(run, (*([card.env] if env is None else []), *(card.wrappers if wrappers is None else [])))
     outer = card.wrappers if wrappers is None else wrappers
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
     return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked, card.seats, card.teams)
@@ -97,7 +99,7 @@ class PolicyPlayer:
     def teams(self) -> tuple[tuple[int, ...], ...]:
         """The seats of each team, if another policy plays the other teams."""
         against = self.policy.against
-        return () if against is None else self.policy.teams or against.teams or teams_of(self.policy.seats)
+        return () if against is None else self.policy.teams or against.card.teams or teams_of(self.policy.seats)
 
     @property
     def facts(self) -> tuple[str, ...]:
@@ -165,7 +167,7 @@ class PolicyPlayer:
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
         else:
             keys = tuple(key for key in run.info_keys if key != SCORE)[: MAX_FACTS - 1]
-            run = msgspec.structs.replace(run, teams=self.teams, facts=(*keys, SCORE), opponent=against.spec)
+            run = msgspec.structs.replace(run, teams=self.teams, facts=(*keys, SCORE), opponent=against.card.policy)
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
             hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt, opponents=pool)
             hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)
@@ -173,19 +175,20 @@ class PolicyPlayer:
         return hub
 
 
-def _check_rival(policy: SavedPolicy, rival: SavedPolicy) -> None:
+def _check_rival(policy: SavedPolicy, against: StoredPolicy) -> None:
     """Raises `UsageError` unless this policy can play against the other one."""
+    rival = against.card
     if len(policy.seats) < 2:
         raise UsageError(f"against: expected an environment of several agents, got {policy.env.id}")
     for what, expected, got in (
         ("agents", policy.seats, rival.seats),
-        ("observations", policy.spec.observation, rival.spec.observation),
-        ("actions", policy.spec.action, rival.spec.action),
+        ("observations", policy.spec.observation, rival.policy.observation),
+        ("actions", policy.spec.action, rival.policy.action),
         ("action masks", policy.masked, rival.masked),
         ("teams", policy.teams or rival.teams, rival.teams or policy.teams),
     ):
         if expected != got:
-            of = "" if policy.env.id == rival.env.id else f" of {policy.env.id}, got one of {rival.env.id}:"
+            of = "" if policy.env.id == rival.env else f" of {policy.env.id}, got one of {rival.env}:"
             raise UsageError(
                 f"against: expected a policy{of} with the same {what}, {_in_words(expected)}; got {_in_words(got)}"
             )

@@ -18,8 +18,7 @@ from learner.config.hyperparameters import DQNConfig
 from learner.config.layers import config_of_run
 from learner.config.resume_rules import Change, OnResume, changes, refusal
 from learner.env_spaces import EnvSpaces
-from learner.run_folder.run_folder import PolicyDescription, RunFolder
-from protocol.arrays import Floats
+from learner.run_folder.run_folder import RunFolder, StoredPolicy
 from protocol.bounds import one_line
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError
@@ -47,8 +46,8 @@ def unless_finished(config: Config, resume: Path | None, train: Callable[[Resump
     return resume if _is_finished(config, RunFolder.open(resume)) else train(Resumption(resume, tuple(lines)))
 
 
-def policy_to_start_from(config: Config) -> tuple[PolicyDescription, Floats, Floats]:
-    """The policy that a new run starts from, as `RunFolder.read_policy` reads it. Raises `UsageError`."""
+def policy_to_start_from(config: Config) -> StoredPolicy:
+    """The policy that a new run starts from. Raises `UsageError`."""
     return RunFolder.open_policy(Path(config.start_from)).read_policy("best" if config.from_parts == "best" else "final")
 
 

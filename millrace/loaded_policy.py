@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from learner.policy_player import saved_policy
+from learner.run_folder.run_folder import RunFolder
 from millrace.arguments import checked
 from protocol.arrays import Array, Bools, Floats
 from protocol.envs.spaces import action_converter_of
@@ -55,22 +55,22 @@ class LoadedPolicy:
         check_at_least("load: seed", seed, 0)
         self.run: Path = run
         """The run folder."""
-        saved = saved_policy(run, "best" if best else "final")
-        self.spec: PolicySpec = saved.spec
+        card, parameters, buffers = RunFolder.open_policy(run).read_policy("best" if best else "final")
+        self.spec: PolicySpec = card.policy
         """The observations, the actions and the network, as plain data."""
-        self.parameters: Floats = saved.parameters
+        self.parameters: Floats = parameters
         """The flat float32 vector [P] that `RolloutService.publish` takes: a learner of your own can start from this policy.
         `PolicyParameters(policy.spec)` names its pieces.
         """
-        self.buffers: Floats = saved.buffers
+        self.buffers: Floats = buffers
         """Mean and standard deviation of the observations, flat float32 [2 D], likewise; empty if none are normalized."""
-        self._name = f"{saved.env.id}, {'best' if best else 'newest'} policy"
-        self._policy = make_policy(saved.spec)
-        self._policy.load(saved.parameters, saved.buffers)
-        self._distribution = distribution(saved.spec)
-        self._masked_distribution = masked_distribution(saved.spec)
-        self._is_masked = saved.masked
-        self._to_env_action = action_converter_of(saved.spec)
+        self._name = f"{card.env}, {'best' if best else 'newest'} policy"
+        self._policy = make_policy(card.policy)
+        self._policy.load(parameters, buffers)
+        self._distribution = distribution(card.policy)
+        self._masked_distribution = masked_distribution(card.policy)
+        self._is_masked = card.masked
+        self._to_env_action = action_converter_of(card.policy)
         self._generator = None if deterministic else generator(seed, Purpose.PLAYED_ACTIONS)
         self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was reset
 

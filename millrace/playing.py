@@ -17,6 +17,7 @@ from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_dataset
 from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation
+from learner.run_folder.run_folder import RunFolder, Which
 from millrace.arguments import checked
 from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.keywords import EvaluateKeywords, RecordKeywords
@@ -156,7 +157,7 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     count = useful_workers(flags.workers, episodes, copies)
     workers = _workers(flags, count, min(copies, episodes))
     if flags.against is not None:
-        saved = saved._replace(against=_saved(flags, given, flags.against))
+        saved = saved._replace(against=RunFolder.open_policy(flags.against).read_policy(_which(flags)))
     with policy_player(saved, workers, watch) as player:
         if flags.video:
             prefix = "" if flags.against is None else f"against-{flags.against.resolve().name}-"
@@ -182,10 +183,14 @@ def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> Pla
     return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
 
 
-def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None, run: Path | None = None) -> SavedPolicy:
-    """The policy to play, of `flags.run` or of another `run`."""
+def _which(flags: EvaluateFlags | RecordFlags) -> Which:
+    return "best" if flags.best else "final"
+
+
+def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
+    """The policy to play, and its environment."""
     env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
-    saved = saved_policy(run or flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
+    saved = saved_policy(flags.run, _which(flags), env=env, wrappers=wrappers)
     if saved.seats and flags.inference == "learner":
         raise UsageError(
             f"inference learner: {saved.env.id} has several agents, and workers must act; use --inference workers"

@@ -23,6 +23,7 @@ from learner.run_folder.newest_run import AUTO, newest_run
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder
+from learner.run_folder.run_format import read_config
 from millrace.arguments import checked
 from millrace.keywords import TrainKeywords
 from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
@@ -219,8 +220,8 @@ class Run(os.PathLike[str]):
     def _facts(self) -> dict[str, str]:
         """What is most important about the run, by name. Never raises."""
         try:
-            config, summary = self.config, self.summary
-            facts = {"environment": config.env, "algorithm": config.algo, "seed": f"seed {config.seed}"}
+            config, summary = read_config(self.path), self.summary  # not `self.config`, which imports the algorithm
+            facts = {"environment": config["env"], "algorithm": config["algo"], "seed": f"seed {config['seed']}"}
             if summary is None:
                 return facts | _newest_figures(self.metrics)
         except UserFacingError as error:

@@ -31,7 +31,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -108,6 +108,16 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """the names of the environment's agents; empty if it is gymnasium's"""
     teams: Annotated[tuple[tuple[Natural, ...], ...], Meta(max_length=MAX_SEATS)] = ()
     """the seats of each team, if it has met opponents"""
+
+
+class StoredPolicy(NamedTuple):
+    """A policy as its files describe it. What they name is not looked for: only the encoder is needed to act."""
+
+    card: PolicyDescription
+    parameters: Floats
+    """flat [P], for `Policy.load`"""
+    buffers: Floats
+    """flat, likewise"""
 
 
 class RunSettings(Protocol):
@@ -286,8 +296,8 @@ class RunFolder:
         self._write(POLICY_ARRAYS[which], save(contiguous, metadata={"crc32": checksum}))
         self._write(POLICY_JSON, msgspec.json.format(msgspec.json.encode(description), indent=2) + b"\n")
 
-    def read_policy(self, which: Which = "final") -> tuple[PolicyDescription, Floats, Floats]:
-        """Read policy.json, and the parameters and buffers for `Policy.load`.
+    def read_policy(self, which: Which = "final") -> StoredPolicy:
+        """Read policy.json and the arrays.
 
         Raises `UsageError`, with a one-line message, if they cannot be read.
         """
@@ -304,8 +314,8 @@ class RunFolder:
                 raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
         except (*UNREADABLE, SafetensorError) as error:
             raise UsageError(f"policy of run {self.path} cannot be read: {one_line(reason(error))}") from error
-        encoder = description.policy.encoder
-        refuse_modules_in(self.path, (description.env, *description.wrappers, encoder.factory if encoder else ""))
+        if (encoder := description.policy.encoder) is not None:
+            refuse_modules_in(self.path, [encoder.factory])
         if description.format != POLICY_FORMAT:
             raise UsageError(
                 f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}; "
@@ -324,7 +334,7 @@ class RunFolder:
                 expected = f"float32 {expected_shapes[name]}" if name in expected_shapes else "no such array"
                 raise UsageError(f"policy of run {self.path}: {name}: expected {expected}, got {shape}")
         parameters = _flat([arrays[field.name] for field in acting])
-        return description, parameters, _flat([arrays[name] for name in names])
+        return StoredPolicy(description, parameters, _flat([arrays[name] for name in names]))
 
     def policy_description(self) -> PolicyDescription | None:
         """What policy.json says. None if that file is missing or cannot be read."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from protocol.arrays import Array
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import make_action_converter, make_unflatten
 from protocol.messages import EpisodeRows
 from protocol.specs import RunSpec
@@ -227,6 +229,26 @@ def test_acting_imports_neither_torch_nor_an_environment_nor_an_algorithm(tmp_pa
         "'gymnasium.envs.classic_control', 'workers.worker'}"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("env", "wrappers"),
+    [
+        ("__main__:Mine", ()),  # a class of the script that trained it
+        ("<lambda>", ()),
+        ("CartPole-v1", ("__main__:Clip",)),
+        ("CartPole-v1", ("<Clip>",)),
+        ("not_installed_here:Mine-v0", ("nor_this:Clip",)),
+    ],
+)
+def test_it_needs_neither_the_environment_nor_the_wrappers(env: str, wrappers: tuple[str, ...], tmp_path: Path) -> None:
+    run = run_of("CartPole-v1")
+    elsewhere = msgspec.structs.replace(run, env=EnvSpec(env, wrappers=wrappers))
+    policy = millrace.load(folder_of(elsewhere, tmp_path / "elsewhere"))
+    here = millrace.load(folder_of(run, tmp_path / "here"))
+    seen = np.linspace(-0.1, 0.1, 12, dtype=np.float32).reshape(3, 4)
+    assert policy(seen).tolist() == here(seen).tolist()
+    assert repr(policy).startswith(f"<{env}, newest policy of ")
 
 
 def test_a_copy_of_the_two_files_is_enough(tmp_path: Path) -> None:

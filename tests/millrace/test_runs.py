@@ -110,6 +110,15 @@ def test_its_repr_says_how_it_went_and_never_raises(run: millrace.Run) -> None:
     assert "expected a run folder with a config.toml, got none" in repr(run)
 
 
+def test_its_repr_needs_no_algorithm(run: millrace.Run) -> None:
+    """Another program trained it with a class of its own."""
+    config = run.path / "config.toml"
+    own = config.read_text().replace('algo = "ppo"', 'algo = "__main__:Mine"').replace("[ppo]", '["__main__:Mine"]')
+    config.write_text(own)
+    assert repr(run).startswith(f"<run {run.path}: CartPole-v1, __main__:Mine, seed 1, ")
+    assert repr(run).endswith(", all steps done>")
+
+
 def test_html_shows_text_of_the_folder_as_text(run: millrace.Run) -> None:
     moved = millrace.Run(run.path.rename(run.path.with_name("<b>run")))
     assert "<b>" not in moved._repr_html_()

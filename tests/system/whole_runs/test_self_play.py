@@ -113,7 +113,10 @@ def test_a_program_is_beaten_and_the_score_says_so(plays_paper: Path) -> None:
 
 def test_a_run_is_compared_with_another_one_of_another_network(tmp_path: Path, plays_paper: Path) -> None:
     plays_scissors = trained(tmp_path / "b", "RockPaperScissors", opponents=(PAPER,), net=(5,), **AGAINST_ONE)
-    found = [millrace.evaluate(plays_scissors, 60, against=plays_paper, workers=n, transport="inproc") for n in (1, 2)]
+    rival = shutil.copytree(plays_paper, tmp_path / "rival")
+    card = json.loads((rival / "policy.json").read_text())  # its environment is not asked for: it was a script's
+    (rival / "policy.json").write_text(json.dumps(card | {"env": "__main__:Mine", "wrappers": ["<Clip>"]}))
+    found = [millrace.evaluate(plays_scissors, 60, against=rival, workers=n, transport="inproc") for n in (1, 2)]
     assert found[0] == found[1]
     of_loser = millrace.evaluate(plays_paper, 60, against=plays_scissors, workers=1, transport="inproc")
     for evaluation, low, high in ((found[0], 0.9, 1.0), (of_loser, 0.0, 0.1)):
