@@ -14,8 +14,8 @@ class RolloutKeywords(TypedDict, total=False):
     """Keywords of `millrace.RolloutService`."""
 
     env_kwargs: Mapping[str, bool | int | float | str]
-    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Texts may use number, slot, lane and copy of each
-    env copy, as in port "{5000 + slot}".
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. Texts may
+    use number, slot, lane and copy of each env copy, as in port "{5000 + slot}".
     """
     eval_env_kwargs: Mapping[str, bool | int | float | str]
     """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""

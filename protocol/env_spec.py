@@ -127,6 +127,8 @@ def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasi
     """
     for name, value in arguments.items():
         try:
+            if not isinstance(value, Scalar):  # msgspec would encode a date, and others, as text
+                raise TypeError
             msgspec.msgpack.decode(msgspec.msgpack.encode({name: value}), type=dict[str, Scalar])
         except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
             raise UsageError(

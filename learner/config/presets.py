@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
+from protocol.flags.toml_words import written
+
 if TYPE_CHECKING:
     from learner.config.config import Config
 
@@ -50,8 +52,8 @@ def environment_name(env: str, env_kwargs: Mapping[str, Any], algo: str) -> str:
 
 
 def added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
-    """Names and values of the entries of a table that its default does not have."""
-    return [str(word) for key, value in table.items() if default.get(key) != value for word in (key, value)]
+    """Names and values of the entries of a table that its default does not have, as the words of a flag."""
+    return [word for key, value in table.items() if default.get(key) != value for word in (key, written(value))]
 
 
 def origin(config: Config) -> str:

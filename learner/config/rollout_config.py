@@ -34,8 +34,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     env: Annotated[Fixed[str], Flag(positional=True)] = ""
     """Environment id for gymnasium.make, such as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
-    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Texts may use number, slot, lane and copy of each env
-    copy, as in port "{5000 + slot}".
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. Texts may use
+    number, slot, lane and copy of each env copy, as in port "{5000 + slot}".
     """
     eval_env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""

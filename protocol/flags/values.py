@@ -1,6 +1,7 @@
 """Words of a command line, or a keyword argument, as the value of a field; and why a value is refused: expected, got.
 
-Rule: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64.
+Rules: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64. The values of a table are written as
+in TOML (toml_words.py); those of any other field are read as its type.
 """
 
 from __future__ import annotations
@@ -8,12 +9,14 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from typing import Any, get_origin
+from typing import Any, get_args, get_origin
 
 import msgspec
 
+from protocol.bounds import one_line
 from protocol.errors import UsageError
 from protocol.flags.fields import FlagField, choices
+from protocol.flags.toml_words import as_text, read_word
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:
@@ -24,7 +27,7 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
         case origin if origin is dict:
             if len(words) % 2:
                 raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}")
-            return {name: _scalar(word) for name, word in zip(words[::2], words[1::2], strict=True)}
+            return {name: _entry(field, name, word) for name, word in zip(words[::2], words[1::2], strict=True)}
         case origin if origin in (tuple, list):
             value: object = list(words)
         case _:
@@ -75,16 +78,19 @@ def what_was_expected(message: str, hint: Any) -> str:
     if message.startswith("Invalid enum value"):
         return f"expected one of {', '.join(choices(hint))}"
     text = message.partition(" - at ")[0].replace(" | null", ' or "none"').replace("`object`", "table")
+    text = text.replace("bool | int | float | str", "a number, text, true or false")
     return re.sub(", got .*", "", text).replace("`", "").replace("Expected", "expected", 1)
 
 
-def _scalar(word: str) -> bool | int | float | str:
-    """A keyword argument: True, False, a number, or text."""
-    if word in ("True", "False"):
-        return word == "True"
-    for number in (int, float):
-        try:
-            return number(word)
-        except ValueError:
-            pass
-    return word
+def _entry(field: FlagField, name: str, word: str) -> Any:
+    """The value of an entry of a table. Raises `UsageError`."""
+    try:
+        value = read_word(word)
+        return msgspec.convert(value, get_args(field.kind)[1])
+    except UsageError as error:
+        raise UsageError(f"{field.name}: {name}: {error}") from None
+    except msgspec.ValidationError as error:
+        expected = what_was_expected(str(error), None)
+        raise UsageError(
+            f"{field.name}: {name}: {expected}, got {one_line(word, 60)}; write {as_text(word)} for this text"
+        ) from None

@@ -61,7 +61,7 @@ class Flags(Base, frozen=True, kw_only=True):
         ("--inner 1e6", {"inner": 1_000_000}),
         ("--inner 9007199254740993", {"inner": 2**53 + 1}),
         ("--to 1e6", {"path": Path("1e6")}),
-        ("--table a True b 2 c 2.5 d on", {"table": {"a": True, "b": 2, "c": 2.5, "d": "on"}}),
+        ("--table a true b 2 c 2.5 d text", {"table": {"a": True, "b": 2, "c": 2.5, "d": "text"}}),
         ("--level 2", {"level": 2}),
         ("--level none", {"level": None}),
         ("--to a/b", {"path": Path("a/b")}),

@@ -269,7 +269,7 @@ def test_for_programs_the_last_line_is_the_run_folder(asked: list[Any], capsys: 
 
 def test_flags_stand_above_the_file_and_the_preset(asked: list[Any], capsys: Captured) -> None:
     Path("my.toml").write_text('env = "CartPole-v1"\nseed = 7\n[ppo]\ngamma = 0.5\nnet = [8]\n[env_kwargs]\na = 1\nb = 1\n')
-    argv = "--config my.toml --net 32 16 --target-return -150 --no-normalize-advantage --env-kwargs b 2.5 c True --workers 3"
+    argv = "--config my.toml --net 32 16 --target-return -150 --no-normalize-advantage --env-kwargs b 2.5 c true --workers 3"
     assert main(["train", *argv.split()]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "  millrace dashboard runs/a-run",

@@ -71,7 +71,7 @@ def test_calls_that_take_longer_than_the_worker_timeout(stage: Stage, kind: str)
 
 def test_a_call_that_holds_the_interpreter_lock_for_longer_than_the_worker_timeout(stage: Stage) -> None:
     """No thread of the worker can run meanwhile: only its supervisor can speak."""
-    learner, _ = served(stage, "Slow-v0", {"env-kwargs": "make_s 1.2 step_s 1.2 holds_lock True"})
+    learner, _ = served(stage, "Slow-v0", {"env-kwargs": "make_s 1.2 step_s 1.2 holds_lock true"})
     learner.trains(2)
     never_given_up(learner)
 

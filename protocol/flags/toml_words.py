@@ -1,0 +1,82 @@
+"""A word of `NAME VALUE ...` as a value, and a value as such a word.
+
+Rule: a word in which TOML reads a value is that value, as in a config file. Any other word is text. But a word in which
+another language reads a value (`None`, `True`, `.5`) is refused, because as text it would be a value that nobody meant: the
+text "False" is true.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import shlex
+import tomllib
+
+from protocol.bounds import one_line
+from protocol.errors import UsageError
+
+IN_TOML = {
+    "true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false", "nan": "nan",
+}  # fmt: skip
+"""What to write for a word of another language, in small letters."""
+NOTHING = ("none", "null", "nil", "undefined")
+
+
+def read_word(word: str) -> object:
+    """The value of a word. Raises `UsageError` for a word that is a value in another language; it says what to write."""
+    try:
+        # in a table of one line, so that the word can neither begin a comment nor another key
+        table = tomllib.loads(f"one = {{value = {word}}}")
+    except (ValueError, RecursionError):
+        table = {}
+    match table:
+        case {"one": {"value": value} as one} if len(one) == len(table) == 1:
+            return value
+    if what := _what_to_write(word):
+        raise UsageError(f"expected a value as in TOML, got {one_line(word, 60)}; {what}, or {as_text(word)} for this text")
+    return word
+
+
+def as_text(word: str) -> str:
+    """What to type in a shell for the text of this word, whatever TOML would read in it."""
+    return one_line(shlex.quote(_in_toml(word)), 60)
+
+
+def written(value: object) -> str:
+    """The word in which `read_word` reads this value."""
+    try:
+        if isinstance(value, str) and read_word(value) == value:
+            return value
+    except UsageError:
+        pass
+    return _in_toml(value)
+
+
+def _in_toml(value: object) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        case _:
+            return str(value)
+
+
+def _what_to_write(word: str) -> str:
+    """What has the value in TOML that this word has in another language; empty if it has none there."""
+    if word.lower() in IN_TOML:
+        return f"write {IN_TOML[word.lower()]}"
+    if word.lower() in NOTHING:
+        return "leave the argument out"
+    for number in (int, float):
+        try:
+            return f"write {number(word)!r}"
+        except ValueError:
+            pass
+    if word[:1] in ("'", '"'):
+        return "write the quotes as in TOML"
+    try:
+        ast.literal_eval(word)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return ""
+    return "write a number, text, true or false"
