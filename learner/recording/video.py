@@ -1,7 +1,8 @@
 """`millrace evaluate --video`: greedy episodes as mp4 files. Workers play and render; this file only encodes.
 
-Rule: the episodes are the first ones that `millrace evaluate` plays with the same seed. A video is in the folder whole or
-not at all. Its name has the seed and the number of the episode, so the same episode overwrites its old video.
+Rule: the episodes are the first ones that `millrace evaluate` plays with the same seed. A video has each frame. It is
+in the folder whole or not at all. Its name has the seed and the number of the episode, so the same episode overwrites its
+old video.
 """
 
 from __future__ import annotations
@@ -11,18 +12,19 @@ import sys
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
 
 from learner.policy_player import PolicyPlayer
 from learner.recording.played_episodes import PlayedEpisodes
 from learner.rollouts.evaluation_dealer import PlayedEpisode, episode_seeds, evaluation_of
 from learner.run_folder.regular_files import subfolder
 from learner.run_folder.results import Evaluation
-from protocol.errors import EnvironmentFailed, RunError, UsageError
+from protocol.arrays import Array
+from protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 
 AT_ONCE = 2  # episodes whose frames are in memory
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
-FRAMES_PER_S, MOST_FRAMES_PER_S = 30, 1_000  # if the environment names no rate; what it names is what a worker says
+FRAMES_PER_S = 30  # if the environment names no rate
+LEAST_FRAMES_PER_S, MOST_FRAMES_PER_S = 0.01, 1_000  # what it names is what a worker says; moviepy writes two decimals
 FOLDER = "videos"
 
 
@@ -52,7 +54,7 @@ def record_videos(
     if env.render_mode != "rgb_array" or not isinstance(modes, list | tuple) or "rgb_array" not in modes:
         raise UsageError(f"environment {env_id} cannot be filmed: expected it to render rgb_array, got {modes}")
     frames_per_s = env.metadata.get("render_fps")
-    if not (isinstance(frames_per_s, int | float) and 0 < frames_per_s <= MOST_FRAMES_PER_S):
+    if not (isinstance(frames_per_s, int | float) and LEAST_FRAMES_PER_S <= frames_per_s <= MOST_FRAMES_PER_S):
         frames_per_s = FRAMES_PER_S
     folder = run / FOLDER
     episodes_played = PlayedEpisodes(player, episode_seeds(seed, episodes))
@@ -78,15 +80,19 @@ def record_videos(
             raise UsageError(line) from error
         raise
     except OSError as error:
-        raise RunError(f"videos of run {run} were not written: {error.strerror or error}") from error
+        raise RunError(f"videos of run {run} were not written: {error.strerror or first_line(error)}") from error
     return evaluation_of(results, player.facts), videos
 
 
-def _write(path: Path, frames: list[Any], frames_per_s: float) -> None:
-    from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
-
+def _write(path: Path, frames: list[Array], frames_per_s: float) -> None:
+    """Encode frames [H, W, 3], each once. moviepy's clips have a length in seconds, and lose the last one by rounding."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # from packages that moviepy uses
-        clip = ImageSequenceClip(frames, fps=frames_per_s)
-        clip.write_videofile(str(path), logger=None)
-        clip.close()
+        from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
+    height, width, _ = frames[0].shape
+    with FFMPEG_VideoWriter(str(path), (width, height), frames_per_s) as writer:
+        encoder = writer.proc
+        for frame in frames:
+            writer.write_frame(frame)
+    if encoder.returncode:
+        raise OSError(f"ffmpeg ended with exit code {encoder.returncode}")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from learner.policy_player import PolicyPlayer
@@ -40,3 +42,31 @@ def test_each_team_is_filmed_once_before_one_is_filmed_again(
     _, films = video.record_videos(cast(PolicyPlayer, player), tmp_path, 5, 7, 100, "against-old-")
     assert together == expected
     assert films == [tmp_path / "videos" / f"against-old-seed-7-episode-{n}.mp4" for n in range(5)]
+
+
+@pytest.mark.parametrize(
+    ("number", "rate"),
+    [
+        *((number, 30) for number in (1, 2, 3, 10, 49, 100)), *((number, 50) for number in (21, 58)),
+        (7, 29.97), (23, 12.5), (3, 0.01), (50, 1000), (200, 15), (101, 60),
+    ],
+)  # fmt: skip
+def test_a_film_has_each_frame_once(tmp_path: Path, number: int, rate: float) -> None:
+    """Each is brighter than the one before, so that the last one, in which the game ends, is known."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("moviepy")
+    shades = np.linspace(20, 230, number).astype(np.uint8)
+    film = tmp_path / "film.mp4"
+    video._write(film, [np.full((16, 32, 3), shade, np.uint8) for shade in shades], rate)
+    decode = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", film, "-fps_mode", "passthrough", "-f", "rawvideo"]
+    decoded = subprocess.run([*decode, "-pix_fmt", "gray", "-"], capture_output=True, timeout=60, check=True).stdout
+    frames = np.frombuffer(decoded, np.uint8).reshape(-1, 16, 32)
+    assert len(frames) == number
+    # shades of limited range, 16 to 235, which the encoder changes by a few
+    assert np.abs(frames.mean((1, 2)) - shades).max() <= 10
+
+
+def test_what_ends_the_encoder_is_an_error(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    with pytest.raises(OSError, match=r"(?i)ffmpeg"):
+        video._write(tmp_path / "no such folder" / "film.mp4", [np.zeros((16, 16, 3), np.uint8)] * 2, 30)
