@@ -39,6 +39,7 @@ from protocol.bounds import one_line
 from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.keys.key_folder import Keyring
 from protocol.logs.notices import log_notice
+from protocol.policy.flattened_images import flattened_images
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
@@ -138,6 +139,8 @@ def open_run(
     if line := unused_setting(setup.config):
         log.warning("%s", line)
     spec = run_spec(setup.config, setup.known.env, setup.known.spaces)
+    for line in flattened_images(spec.policy):
+        log.warning("%s", line)
     setup = _use_threads(setup, spec.policy, processes)
     config, folder = setup.config, setup.folder
     algorithm, prior = _new_algorithm(setup, spec)

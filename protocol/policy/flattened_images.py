@@ -1,0 +1,38 @@
+"""Says of observations that look like images, but are flattened, how the convolutions get them. Pure.
+
+Rule: what an image is decides `Leaf.is_image` alone. This file only recognizes what a user may have taken for one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from protocol.specs import Leaf, PolicySpec
+
+LEAST_SIDE = 36  # pixels, from which on an image goes through three convolutions
+COLORS = (1, 3, 4)
+GRAY, STACKED = "gymnasium.wrappers:GrayscaleObservation", '"gymnasium.wrappers:FrameStackObservation(stack_size=4)"'
+
+
+def flattened_images(policy: PolicySpec) -> Iterator[str]:
+    """A line for each array of the observation that perhaps holds images, and goes straight into a layer of `net`."""
+    if policy.encoder is not None or policy.own is not None or policy.stores_scaled_actions:  # sac and td3 take no images
+        return
+    for leaf in policy.observation:
+        if leaf.kind == "box" and not leaf.is_image and sum(side >= LEAST_SIDE for side in leaf.shape) >= 2:
+            numbers = math.prod(leaf.shape)
+            layer = f"a layer of {numbers * policy.net[0]:,} weights" if policy.net else "the output layer"
+            yield (
+                f"{leaf.name} {leaf.dtype}{list(leaf.shape)} goes through no convolutions: its {numbers:,} numbers go into "
+                f"{layer}; if these are images, {_what_to_do(leaf)}, or give --encoder"
+            )
+
+
+def _what_to_do(leaf: Leaf) -> str:
+    match leaf.shape:
+        case (_, _) if leaf.dtype == "uint8":
+            return f'stack them (--wrappers {STACKED}), or keep the channel ("{GRAY}(keep_dim=True)")'
+        case (_, _, _, colors) if leaf.dtype == "uint8" and colors in COLORS:
+            return f"stack gray frames: --wrappers {GRAY} {STACKED}"
+    return "make them uint8 from 0 to 255, of three dimensions"
