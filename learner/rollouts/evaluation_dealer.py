@@ -5,6 +5,10 @@ number. An evaluation beside training is played by the workers that only evaluat
 one without a lane. A ticket whose worker is lost goes to another. The numbers of these tickets start at `FIRST_TICKET`, far
 above those of rollouts, and the ledger does not count them.
 
+Rule: a worker that claims to play and never answers must not hold the learner for ever, and nobody can tell it from one that
+is slow. So `share` gives the ticket of one that takes long to a second worker as well. The seeds say what is played, so it
+does not matter who answers first: that answer counts. Who was late gets tickets only if nobody else can play.
+
 Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
 an answer that could not be used, is dropped, and its ticket is played again from the start.
 """
@@ -108,6 +112,8 @@ class EvaluationDealer:
         """`run` says what rows and episodes look like."""
         self.held: dict[int, Member] = {}
         """the tickets that workers hold, by number"""
+        self.second: dict[int, Member] = {}
+        """of these, those that a second worker plays as well"""
         self.most_copies: int | None = None
         """most env copies that play, on all workers together, unless one worker has more; None: no limit"""
         self._run = run
@@ -122,7 +128,8 @@ class EvaluationDealer:
         self._seeds: list[tuple[int, ...]] = []  # of each ticket
         self._undealt: list[int] = []  # heap: indices of tickets that no worker has
         self._played: dict[int, Evaluated] = {}  # by index of the ticket
-        self._rows: dict[int, dict[int, list[EpisodeRows]]] = {}  # by index of a held ticket, and by episode
+        self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by index of a ticket and worker; by episode
+        self._late: set[bytes] = set()  # the workers in whose place a second one has answered
 
     @property
     def pending(self) -> bool:
@@ -147,7 +154,7 @@ class EvaluationDealer:
     @property
     def players(self) -> list[Member]:
         """The workers that hold tickets."""
-        return list({member.peer: member for member in self.held.values()}.values())
+        return list({member.peer: member for member in [*self.held.values(), *self.second.values()]}.values())
 
     def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
         """Begin to evaluate this version, `beside` training if so. `deal` then gives out the tickets."""
@@ -164,9 +171,10 @@ class EvaluationDealer:
 
     def end(self) -> list[PlayedEpisode]:
         """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
-        for number, member in self.held.items():
+        for number, member in [*self.held.items(), *self.second.items()]:
             del member.tickets[number]
-        self._plan, self.held, self._rows = None, {}, {}
+        self._plan = None
+        self.held, self.second, self._rows = {}, {}, {}
         answers = [answer for _, answer in sorted(self._played.items())]
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
@@ -178,11 +186,8 @@ class EvaluationDealer:
         """
         plan, out = self._plan, list[Outgoing]()
         assert plan is not None
-        players = (member for member in active if member.hello.evaluates or not self.beside)
-        members = sorted(players, key=lambda member: not member.hello.evaluates)
-        if self.most_copies is not None:
-            members = members[: self._most_workers or max(1, self.most_copies // plan.copies)]
-        holds = Counter(member.peer for member in self.held.values())
+        members = self._who_may_play([member for member in active if member.hello.evaluates or not self.beside], plan)
+        holds = self._held_by()
         for most in range(1, HELD_AT_ONCE + 1):
             for member in members:
                 plenty = most == 1 or len(self._undealt) > len(members)
@@ -192,6 +197,19 @@ class EvaluationDealer:
                     holds[member.peer] += 1
                     out += self.send(member, [number])
         return out
+
+    def share(self, active: Sequence[Member]) -> list[Outgoing]:
+        """Give the oldest ticket that one worker plays to a second one, of those that play nothing."""
+        plan = self._plan
+        assert plan is not None
+        who = [member for member in active if member.hello.evaluates or not self.beside or self.most_copies is None]
+        holds = self._held_by()
+        idle = [member for member in self._who_may_play(who, plan) if not holds[member.peer]]
+        alone = sorted(self.held.keys() - self.second.keys())
+        if not idle or not alone:
+            return []
+        self.second[alone[0]] = idle[0]
+        return self.send(idle[0], alone[:1])
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
         """The orders for these tickets, those of an evaluation among them."""
@@ -204,13 +222,13 @@ class EvaluationDealer:
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
         """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""
-        if self.held.get(answer.ticket) is not member:
-            return ""  # it came twice, or after the end
+        if not self._plays(member, answer.ticket):
+            return ""  # it came twice, or after the end, or after that of another worker
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)
             return f"evaluation of ticket {answer.ticket}: {why}"
-        rows = self._rows.get(index, {})
+        rows = self._rows.get((index, member.peer), {})
         if self._on_rows is not None:
             if [_end(rows.get(n, ())) for n in range(len(answer.episodes))] != [one.length for one in answer.episodes]:
                 self.lose(member, answer.ticket)  # a message with rows was lost: the episodes are played again
@@ -219,19 +237,21 @@ class EvaluationDealer:
             for episode, messages in sorted(rows.items()):
                 for message in messages:
                     self._on_rows(index * self._plan.copies + episode, message)
-        self._end(member, answer.ticket)
+        if member is self.second.get(answer.ticket):
+            self._late.add(self.held[answer.ticket].peer)
+        self._end(answer.ticket)
         self._played[index] = answer
         return ""
 
     def take_rows(self, member: Member, rows: EpisodeRows) -> str:
         """Keep rows until their answer comes. Returns what is wrong with them, or nothing. Those that came are ignored."""
-        if self.held.get(rows.ticket) is not member or self._on_rows is None:
+        if not self._plays(member, rows.ticket) or self._on_rows is None:
             return ""
         index = rows.ticket - self._first
         if rows.episode >= len(self._seeds[index]):
             return f"rows of ticket {rows.ticket}: expected an episode below {len(self._seeds[index])}, got {rows.episode}"
         assert self._plan is not None
-        come = self._rows.setdefault(index, {}).setdefault(rows.episode, [])
+        come = self._rows.setdefault((index, member.peer), {}).setdefault(rows.episode, [])
         if rows.first_step != _end(come):
             return ""
         if why := reason_to_reject(rows, come, self._run, self._plan.most_steps, self._plan.send_frames):
@@ -240,17 +260,46 @@ class EvaluationDealer:
         return ""
 
     def lose(self, member: Member, number: int) -> None:
-        """The ticket, which this member holds, is lost: it is to be dealt again."""
-        heapq.heappush(self._undealt, self._end(member, number))
+        """A member that plays the ticket does so no more: if nobody else plays it, it is to be dealt again."""
+        other = self.held[number] if self.second.get(number) is member else self.second.get(number)
+        if other is None:
+            heapq.heappush(self._undealt, self._end(number))
+            return
+        self._forget(member, number)
+        del self.second[number]
+        self.held[number] = other
 
     # ---------------------------------------------------------------- inside
 
-    def _end(self, member: Member, number: int) -> int:
+    def _plays(self, member: Member, number: int) -> bool:
+        return self.held.get(number) is member or self.second.get(number) is member
+
+    def _held_by(self) -> Counter[bytes]:
+        """How many tickets each worker holds."""
+        return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
+
+    def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
+        """Those of these workers that may play: those that only evaluate first, and no late one if there is another.
+
+        With a limit of copies, the first of them, because a worker keeps its copies.
+        """
+        found = sorted(members, key=lambda member: not member.hello.evaluates)
+        found = [member for member in found if member.peer not in self._late] or found
+        if self.most_copies is None:
+            return found
+        return found[: self._most_workers or max(1, self.most_copies // plan.copies)]
+
+    def _end(self, number: int) -> int:
         """The ticket is with nobody, and its rows are dropped. Returns its index."""
-        del self.held[number], member.tickets[number]
-        index = number - self._first
-        self._rows.pop(index, None)
-        return index
+        for member in (self.held.pop(number), self.second.pop(number, None)):
+            if member is not None:
+                self._forget(member, number)
+        return number - self._first
+
+    def _forget(self, member: Member, number: int) -> None:
+        """The member plays the ticket no more, and its rows are dropped."""
+        del member.tickets[number]
+        self._rows.pop((number - self._first, member.peer), None)
 
     def _order(self, member: Member, number: int) -> Evaluate:
         plan = self._plan

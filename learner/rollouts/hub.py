@@ -26,7 +26,7 @@ from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpi
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.run_status import status
-from learner.rollouts.stall_watch import StallWatch, Standstill
+from learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.rollouts.waiting import LearnerTime
 from learner.rollouts.weight_age import WeightAge
@@ -327,12 +327,21 @@ class Hub:
             match self._stall_watch.check(now, progress(), evaluating=self._time.evaluating):
                 case Standstill(refuse=()):
                     raise Stalled(f"{nothing_came} for {self.settings.stall_timeout_s:.0f} s; {self.waiting(now)}")
+                case Overdue():
+                    self._share_evaluation(now)
                 case Standstill(members, why):
                     for member in members:
                         self._server.send(self.coordinator.refuse(member, why))
             watch()
         self._time.turn("learning", self._clock())
         return result
+
+    def _share_evaluation(self, now: float) -> None:
+        """A second worker plays what one has played for too long, if a worker is free."""
+        if out := self.coordinator.share_evaluation():
+            seconds, line = self.settings.stall_timeout_s, self.waiting(now)
+            log.warning("no episode of an evaluation came for %.0f s, so another worker plays it as well: %s", seconds, line)
+            self._server.send(out)
 
     def _worker_steps(self) -> int:
         """Env steps of all workers, as of their last heartbeats."""

@@ -5,6 +5,9 @@ while rollouts are awaited. While a call of the environment is under way within 
 the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused,
 and others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, of rollouts or of
 an evaluation, for longer than all calls of the environment may take together is refused, whatever it claims.
+
+That may be days for an evaluation. So if none of its episodes has come for `stall_timeout_s` while the learner waits for it,
+a second worker is to play the oldest ones as well, whatever the first one claims.
 """
 
 from __future__ import annotations
@@ -29,21 +32,27 @@ class Standstill:
     why: str
 
 
+@dataclass(frozen=True)
+class Overdue:
+    """A verdict: a second worker is to play the oldest ticket of the evaluation as well."""
+
+
 class StallWatch:
     """Watches one run."""
 
     def __init__(self, coordinator: TicketCoordinator, stall_timeout_s: float, timeouts: CallTimeouts) -> None:
         self._coordinator, self._stall_timeout_s, self._timeouts = coordinator, stall_timeout_s, timeouts
         self._mark: object = None
-        self._progress_s = 0.0
+        self._progress_s = self._answered_s = 0.0
+        self._answered = 0  # episodes of the pending evaluation
         self._dealt_s: dict[tuple[bytes, int], float] = {}  # worker and ticket -> when they were first seen here
         self._budgets_due_s = -math.inf
 
     def begin(self, now: float) -> None:
         """The learner begins to wait."""
-        self._progress_s = now
+        self._progress_s = self._answered_s = now
 
-    def check(self, now: float, progress: object, *, evaluating: bool = False) -> Standstill | None:
+    def check(self, now: float, progress: object, *, evaluating: bool = False) -> Standstill | Overdue | None:
         """None: the run goes on. `progress`: anything that changes when what the learner waits for makes progress.
 
         `evaluating`: whether the learner waits for an evaluation, and not for rollouts.
@@ -56,17 +65,26 @@ class StallWatch:
             self._budgets_due_s = now + CHECK_BUDGETS_EVERY_S
             if over := self._over_budget(now):
                 return Standstill(over, "it holds tickets for longer than they can take")
+        overdue = Overdue() if evaluating and self._is_overdue(now) else None
         if now - self._progress_s <= self._stall_timeout_s:
-            return None
+            return overdue
         coordinator = self._coordinator
         members = list(coordinator.members.values()) if evaluating else coordinator.membership.collectors()
         if any(self._in_call(member, now) for member in members):
-            return None
+            return overdue
         self._progress_s = now
         idle = tuple(member for member in members if member.tickets)
         if len(idle) == len(members):
             idle = ()
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
+
+    def _is_overdue(self, now: float) -> bool:
+        """Whether no episode of the evaluation has come for too long. Then it is asked again only after as long a time."""
+        answered = self._coordinator.evaluation.episodes_played
+        overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
+        if overdue or answered != self._answered:
+            self._answered, self._answered_s = answered, now
+        return overdue
 
     def _in_call(self, member: Member, now: float) -> bool:
         """Whether its supervisor says that it is in a call of the environment, which has not exceeded its timeout."""

@@ -132,6 +132,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.evaluation.all_play()
         return self._deal()
 
+    def share_evaluation(self) -> list[Outgoing]:
+        """No answer of the evaluation has come for long: a second worker plays the oldest ticket as well, if one is free."""
+        return self.weights.after(self.evaluation.share(self.membership.active()), self.members, self._named)
+
     # ---------------------------------------------------------------- inside
 
     def _deal(self) -> list[Outgoing]:

@@ -7,7 +7,7 @@ import pytest
 from learner.members.events import WorkerProcessFailed
 from learner.members.failure_count import FailureCount
 from learner.members.membership import Outgoing
-from learner.rollouts.stall_watch import StallWatch
+from learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
 from protocol.alive import CallTimeouts
 from protocol.bounds import Stages
 from protocol.errors import EnvironmentFailed
@@ -150,9 +150,38 @@ def test_their_env_steps_are_progress_only_while_the_learner_waits_for_an_evalua
     learner.now += 60.0
     learner.says(E, Heartbeat(learner.session(E), 0, (0,), (), 9, {}, 0))
     assert watch.check(learner.now, 0, evaluating=evaluating) is None
+    verdict = watch.check(learner.now + 39.0, 0, evaluating=evaluating)
+    assert verdict is None
     verdict = watch.check(learner.now + 60.0, 0, evaluating=evaluating)
-    assert (verdict is None) == evaluating
-    assert evaluating or (verdict is not None and verdict.refuse == ()), "the only worker that collects stands still"
+    assert isinstance(verdict, Overdue if evaluating else Standstill)
+    assert not isinstance(verdict, Standstill) or verdict.refuse == (), "the only worker that collects stands still"
+
+
+def test_claims_do_not_keep_an_evaluation_from_a_second_worker_and_only_an_answer_does() -> None:
+    learner = learner_with(A, E)
+    learner.begins(1, 2, 3, 4)
+    watch, steps = StallWatch(learner.coordinator, 100.0, CallTimeouts(0.0, 0.0)), 0
+
+    def verdicts(seconds: float) -> list[Standstill | Overdue]:
+        nonlocal steps
+        found = []
+        for _ in range(int(seconds / 10.0)):
+            learner.now += 10.0
+            steps += 1
+            learner.says(
+                E, Heartbeat(learner.session(E), 0, tuple(learner.coordinator.members[E].tickets), (), steps, {}, 0)
+            )
+            found.append(watch.check(learner.now, steps, evaluating=True))
+        return [verdict for verdict in found if verdict is not None]
+
+    watch.begin(learner.now)
+    assert verdicts(100.0) == []
+    assert verdicts(210.0) == [Overdue(), Overdue()], "once in the time, for one ticket each"
+    (order,) = of(learner.coordinator.share_evaluation(), Evaluate, A)
+    assert order.seeds == (1, 2), "one that collects plays the oldest"
+    learner.says(A, answer(order))
+    assert verdicts(100.0) == []
+    assert verdicts(20.0) == [Overdue()]
 
 
 def test_their_failures_count_and_only_their_own_episodes_end_their_row() -> None:

@@ -58,11 +58,15 @@ def test_without_faults_nothing_is_lost_or_said_twice() -> None:
 
 
 @pytest.mark.parametrize("evaluators", [None, 0, 2])
-def test_every_version_can_be_evaluated_although_workers_die_and_messages_are_lost(evaluators: int | None) -> None:
-    faults = Faults(loss=0.1, repeat=0.2, deaths=6, freezes=4, late_joiners=2, evaluations=1.0, until_s=20.0)
+@pytest.mark.parametrize("shares", [0.0, 0.5])
+def test_every_version_can_be_evaluated_although_workers_die_and_messages_are_lost(
+    evaluators: int | None, shares: float
+) -> None:
+    faults = Faults(0.1, 0.2, deaths=6, freezes=4, late_joiners=2, evaluations=1.0, shares=shares, until_s=20.0)
     world = World(3, faults, workers=3, lanes=2, max_lag=1, evaluators=evaluators)
     world.play(updates=61, limit_s=4000.0)
     assert world.evaluations >= 59  # those of the last two updates may be pending
+    assert (world.shared > 0) == (shares > 0)
 
 
 def test_a_worker_without_a_lane_evaluates_too() -> None:

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationPlan, OnRows, evaluation_of
 from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.rollout import Episode
@@ -192,3 +192,68 @@ def test_a_rollout_on_a_ticket_of_an_evaluation_costs_the_evaluation_nothing() -
     assert learner.coordinator.members[A].strikes == 1
     learner.says(A, answer(order))
     assert learner.coordinator.evaluation.done
+
+
+def shared(on_rows: OnRows | None = None) -> tuple[Learner, Evaluate, Evaluate]:
+    """Worker B plays the only ticket of worker A as well. Returns their orders."""
+    learner = learner_with(A, B)
+    found = EvaluationPlan((2, 3), copies=2, most_steps=9, send_rows=on_rows is not None)
+    (first,) = orders(learner.coordinator.begin_evaluation(found, on_rows))
+    (second,) = of(learner.coordinator.share_evaluation(), Evaluate, B)
+    assert (second.ticket, second.seeds) == (first.ticket, first.seeds)
+    assert learner.coordinator.share_evaluation() == [], "two workers play it, and no other is free"
+    return learner, first, second
+
+
+@pytest.mark.parametrize("faster", [A, B])
+def test_of_two_workers_that_play_a_ticket_the_first_answer_counts(faster: bytes) -> None:
+    learner, first, second = shared()
+    evaluation = learner.coordinator.evaluation
+    slower, late = (B, answer(second)) if faster == A else (A, answer(first))
+    learner.says(faster, answer(first) if faster == A else answer(second))
+    assert evaluation.done
+    assert not evaluation.players
+    held = [number for member in learner.coordinator.members.values() for number in member.tickets]
+    assert max(held) < FIRST_TICKET, "both are free for rollouts"
+    learner.says(slower, late)
+    assert [one.episode.length for one in evaluation.end()] == [2, 3]
+    assert learner.coordinator.members[slower].strikes == 0, "it is slow, and has done nothing wrong"
+
+
+def test_a_worker_that_was_late_plays_only_if_nobody_else_does() -> None:
+    learner, _, second = shared()
+    learner.says(B, answer(second))
+    learner.coordinator.evaluation.end()
+    assert {peer for peer, _ in learner.coordinator.begin_evaluation(plan(1, 2, 3, 4, 5, 6))} == {B}
+    outs = learner.balanced(process_ends(learner.coordinator, "b", "killed"))
+    assert {peer for peer, order in outs if isinstance(order, Evaluate)} == {A}
+
+
+@pytest.mark.parametrize("lost", [A, B])
+def test_a_ticket_that_two_play_stays_with_one_when_the_other_is_lost(lost: bytes) -> None:
+    learner, first, second = shared()
+    outs = learner.balanced(process_ends(learner.coordinator, lost.decode(), "killed"))
+    assert not of(outs, Evaluate), "the other plays it already"
+    learner.says(*((B, answer(second)) if lost == A else (A, answer(first))))
+    assert [one.episode.length for one in learner.coordinator.evaluation.end()] == [2, 3]
+
+
+def test_a_wrong_answer_of_one_leaves_the_ticket_with_the_other() -> None:
+    learner, first, second = shared()
+    learner.says(B, msgspec.structs.replace(answer(second), cut=()))
+    assert learner.coordinator.members[B].strikes == 1
+    assert [member.peer for member in learner.coordinator.evaluation.players] == [A]
+    learner.says(A, answer(first))
+    assert learner.coordinator.evaluation.done
+
+
+def test_rows_of_one_worker_count_only_with_its_own_answer() -> None:
+    used = list[tuple[int, EpisodeRows]]()
+    learner, first, second = shared(lambda episode, rows: used.append((episode, rows)))
+    learner.says(A, fake_rows(first.session, first.ticket, 0, 0))
+    for episode in (0, 1):
+        for step in (0, 1):
+            learner.says(B, fake_rows(second.session, second.ticket, episode, step))
+    assert used == []
+    learner.says(B, msgspec.structs.replace(answer(second), episodes=(Episode(0.0, 2, 0.0),) * 2))
+    assert [(episode, rows.session) for episode, rows in used] == [(n, second.session) for n in (0, 0, 1, 1)]

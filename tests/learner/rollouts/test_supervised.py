@@ -13,7 +13,7 @@ from learner.conversations import open_hub
 from learner.members.events import WorkerLeft, WorkerProcessFailed
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
+from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
 from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
 from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
@@ -180,7 +180,7 @@ def test_a_run_in_which_nothing_happens_stands_still() -> None:
     made = watch(learner)
     assert made.check(learner.now + STALL_S, 0) is None
     verdict = made.check(learner.now + STALL_S + 1, 0)
-    assert verdict is not None
+    assert isinstance(verdict, Standstill)
     assert verdict.refuse == ()
 
 
@@ -248,7 +248,7 @@ def test_a_worker_that_hoards_its_tickets_is_refused_and_another_gets_them() -> 
         learner.now += STALL_S / 2 + 1
         beats(learner, A, 0)
     verdict = made.check(learner.now, 0)
-    assert verdict is not None
+    assert isinstance(verdict, Standstill)
     (member,) = verdict.refuse
     assert member.peer == A
     outs = learner.balanced(learner.coordinator.refuse(member, verdict.why))
@@ -269,6 +269,7 @@ def test_a_worker_that_claims_progress_is_refused_when_its_budget_is_spent() -> 
         beats(learner, A, steps)
         assert learner.now < budget_s + STALL_S
     assert learner.now > budget_s
+    assert isinstance(verdict, Standstill)
     assert [member.peer for member in verdict.refuse] == [A]
 
 
@@ -320,6 +321,7 @@ def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent
         beats(learner, B, steps)
         assert learner.now < budget_s + STALL_S
     assert learner.now > budget_s
+    assert isinstance(verdict, Standstill)
     assert {member.peer for member in verdict.refuse} == {A, B}
     learner.coordinator.evaluation.end()
     assert made.check(learner.now + 2, steps + 1) is None, "an evaluation that has ended holds nobody to account"

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "held", "_played", "_rows", "beside"}
 """What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_run", "_on_rows", "most_copies", "_most_workers"}
+NOT_SAVED = {"_run", "_on_rows", "most_copies", "_most_workers", "second", "_late"}
+"""A second worker is asked only after ten minutes, so there is none here."""
 
 
 class EvaluatingLearner(Learner):
@@ -149,7 +150,7 @@ def saved(learner: EvaluatingLearner, now: float) -> Content:
     played = tuple((index, tuple(e.reward for e in answer.episodes)) for index, answer in sorted(tickets._played.items()))
     rows = tuple(
         (index, episode, session(each.session), each.first_step)
-        for index, of_ticket in sorted(tickets._rows.items())
+        for (index, _), of_ticket in sorted(tickets._rows.items())
         for episode, come in sorted(of_ticket.items())
         for each in come
     )
@@ -187,7 +188,8 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
             member.tickets[tickets._first + index] = sent_at.value
     tickets._played = {index: evaluated(0, tickets._first + index, returns) for index, returns in played}
     for index, episode, of_session, step in rows:
-        come = tickets._rows.setdefault(index, {}).setdefault(episode, [])
+        holder = tickets.held[tickets._first + index]
+        come = tickets._rows.setdefault((index, holder.peer), {}).setdefault(episode, [])
         come.append(fake_rows(of_session.value, tickets._first + index, episode, step))
     learner.barrier, learner.rows = 0 if barrier is None else barrier.value, list(of_learner)
     return learner

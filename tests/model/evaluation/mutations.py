@@ -18,7 +18,7 @@ TICKETS = "learner.rollouts.evaluation_dealer"
 MUTATIONS = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self.version,", "version=max(0, self.version - 1),"),
     "a ticket that was put back is lost": Mutation(
-        TICKETS, "heapq.heappush(self._undealt, self._end(member, number))", "self._end(member, number)"
+        TICKETS, "heapq.heappush(self._undealt, self._end(number))", "self._end(number)"
     ),
     "tickets for rollouts are dealt during an evaluation": Mutation(
         COORDINATOR,
@@ -42,12 +42,12 @@ MUTATIONS = {
     "two evaluations number their tickets alike": Mutation(TICKETS, "self._first += len(self._seeds)", "pass"),
     "a ticket of an evaluation is dealt twice": Mutation(TICKETS, "heapq.heappop(self._undealt)", "self._undealt[0]"),
     "an answer leaves its ticket with the worker": Mutation(
-        TICKETS, "del self.held[number], member.tickets[number]", "del self.held[number]"
+        TICKETS, "        del member.tickets[number]\n        self._rows", "        self._rows"
     ),
-    "rows of a lost worker are kept": Mutation(TICKETS, "self._rows.pop(index, None)", "pass"),
+    "rows of a lost worker are kept": Mutation(TICKETS, "self._rows.pop((number - self._first, member.peer), None)", "pass"),
     "an answer counts without its rows": Mutation(TICKETS, "!= [one.length for one in answer.episodes]:", "== []:"),
     "an evaluation that was played again is forgotten": Mutation(
-        TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(member, answer.ticket)  # a message"
+        TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(answer.ticket)  # a message"
     ),
     "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
     "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
@@ -63,9 +63,9 @@ MUTATIONS = {
     "a worker that only evaluates gets a lane": Mutation(
         PLACEMENT, "(each for each in active if not each.hello.evaluates)", "active"
     ),
-    "all play an evaluation beside training": Mutation(TICKETS, "if member.hello.evaluates or not self.beside)", "if True)"),
+    "all play an evaluation beside training": Mutation(TICKETS, "if member.hello.evaluates or not self.beside]", "if True]"),
     "only those that only evaluate ever play": Mutation(
-        TICKETS, "if member.hello.evaluates or not self.beside)", "if member.hello.evaluates)"
+        TICKETS, "if member.hello.evaluates or not self.beside]", "if member.hello.evaluates]"
     ),
     "rollouts wait for an evaluation beside training": Mutation(
         COORDINATOR, "if self.evaluation.beside or not self.evaluation.pending:", "if not self.evaluation.pending:"

@@ -151,6 +151,7 @@ class Faults:
     leaves: int = 0
     learner_restarts: int = 0
     evaluations: float = 0.0  # how many of the updates are evaluated
+    shares: float = 0.0  # how often, while the learner waits for one, a second worker is to play its oldest ticket
     places: int = 0  # in which a supervisor of all workers shares weights; 0: none does
     until_s: float = 30.0
 
@@ -200,6 +201,7 @@ class World:
         self.supervisor = FakeSupervisor()
         self.parameters: dict[int, Array] = {}  # of each learner, by its first session
         self.evaluations = 0
+        self.shared = 0
         self.plan: EvaluationPlan | None = None  # of the evaluation that is pending
         self.issued_at_barrier = 0
         self.rows: list[tuple[int, int]] = []  # episode and step, as they came
@@ -448,6 +450,9 @@ class World:
             if evaluation.beside and self.due:
                 self.to_workers(self.coordinator.await_evaluation())
                 self.issued_at_barrier = self.coordinator.rollouts.ledger.issued
+            if self.faults.shares and (self.due or not evaluation.beside) and self.random.random() < self.faults.shares:
+                self.to_workers(self.coordinator.share_evaluation())
+                self.shared += len(evaluation.second)
             return self.due or not evaluation.beside
         plan, self.plan = self.plan, None
         played = evaluation.end()
@@ -512,7 +517,7 @@ class World:
     # ------------------------------------------------------------ the rules
 
     def check(self) -> None:
-        check_tickets(self.coordinator, self.max_lag)
+        check_tickets(self.coordinator, self.max_lag, shares=self.faults.shares > 0.0)
         if self.plan is not None and not self.coordinator.evaluation.beside:
             issued = self.coordinator.rollouts.ledger.issued
             assert issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"

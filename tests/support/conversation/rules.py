@@ -20,7 +20,7 @@ def check_ledger(coordinator: TicketCoordinator) -> None:
     assert rollouts.ledger.transitions_waiting == waiting_steps, "transitions do not balance"
 
 
-def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
+def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool = False) -> None:
     """The ledger balances, a lane has one owner, and each ticket is with the owner of its lane."""
     rollouts, members, ledger = coordinator.rollouts, coordinator.members, coordinator.rollouts.ledger
     check_ledger(coordinator)
@@ -36,16 +36,16 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int) -> None:
     for number, each in rollouts.held.items():
         assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
         assert rollouts.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
-    held = sorted([*rollouts.held, *coordinator.evaluation.held])
+    held = sorted([*rollouts.held, *coordinator.evaluation.held, *coordinator.evaluation.second])
     assert held == sorted(number for member in members.values() for number in member.tickets), "a ticket has two holders"
     processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
     assert coordinator.membership._of_process == processes, "the processes are not those of the members"
     for member in members.values():
         assert not (member.lanes and member.hello.evaluates), "a worker that only evaluates has a lane"
-    check_evaluation(coordinator)
+    check_evaluation(coordinator, shares=shares)
 
 
-def check_evaluation(coordinator: TicketCoordinator) -> None:
+def check_evaluation(coordinator: TicketCoordinator, *, shares: bool = False) -> None:
     """While an evaluation is pending, its weights are kept, and each of its tickets is in one place."""
     tickets, members = coordinator.evaluation, coordinator.members
     if not tickets.pending:
@@ -54,10 +54,12 @@ def check_evaluation(coordinator: TicketCoordinator) -> None:
     held = [number - tickets._first for number in tickets.held]
     every = sorted([*tickets._undealt, *held, *tickets._played])
     assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
-    for number, member in tickets.held.items():
+    assert tickets.second.keys() <= tickets.held.keys(), "a ticket is with a second worker only"
+    for number, member in [*tickets.held.items(), *tickets.second.items()]:
         assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"
         assert number in member.tickets, "a worker does not know its ticket of an evaluation"
+    collects = [member for member in tickets.players if not member.hello.evaluates]
+    assert shares or not (tickets.beside and collects), "a worker that collects plays an evaluation beside training"
     for member in tickets.players:
-        assert member.hello.evaluates or not tickets.beside, "a worker that collects plays an evaluation beside training"
         mine = [number for number in member.tickets if number >= FIRST_TICKET]
         assert len(mine) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"
