@@ -15,6 +15,7 @@ import torch
 
 from learner.algorithms import Algorithm, algorithm_class
 from learner.between_updates.between_updates import BetweenUpdates, open_files
+from learner.between_updates.crowded_cores import CrowdedCores
 from learner.between_updates.run_parts import RunParts
 from learner.between_updates.tally import Tally
 from learner.callbacks.callbacks import Callbacks, Watch
@@ -32,13 +33,14 @@ from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_setup import KnownEnvironment, RunSetup
 from learner.run_spec import run_spec
 from learner.run_state import RunState, restore, start_from
-from learner.torch_setup import threads, torch_device, updates_use_all_cores
+from learner.torch_setup import minibatch_rows, threads, torch_device, updates_use_all_cores
 from learner.train import train
 from protocol.address import advertised_address, own_address
 from protocol.bounds import one_line
 from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.keys.key_folder import Keyring
 from protocol.logs.notices import log_notice
+from protocol.machine.waiting_threads import SPIN, VARIABLE
 from protocol.policy.flattened_images import flattened_images
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec, RunSpec
@@ -84,7 +86,9 @@ class OpenRun:
         try:
             if self.prior is not None and self.between.tally.state.version == 0:
                 self._learn_from_prior(self.prior)
-            train(self.algorithm, self.hub, self.between, workers, self._check_time)
+            config = self.setup.config
+            cores = CrowdedCores((config.torch_threads or 1) if torch_device(config) == "cpu" else 0)
+            train(self.algorithm, self.hub, self.between, workers, self._check_time, cores)
         except RunTakenOver as error:
             self.hub.drain(str(error), timeout_s=DRAIN_S)
             raise
@@ -191,8 +195,17 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: ProcessCallback
     config = setup.config
     if config.torch_threads is None:
         # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
-        config = msgspec.structs.replace(config, torch_threads=threads(policy, config.max_lag, processes.expected))
+        chosen = threads(policy, minibatch_rows(config), config.max_lag, processes.expected)
+        config = msgspec.structs.replace(config, torch_threads=chosen.number)
+        if chosen.line:
+            log_notice(log, chosen.line)
     torch.set_num_threads(config.torch_threads or 1)
+    if SPIN and (config.torch_threads or 1) > 1:
+        log.warning(
+            "PyTorch was imported before millrace, so its threads spin while they wait for one another, and updates take "
+            "far longer beside busy processes; import millrace first, or set %s=PASSIVE",
+            VARIABLE,
+        )
     if updates_use_all_cores(config):
         processes.lower_priority()
     return replace(setup, config=config)

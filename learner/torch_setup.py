@@ -11,16 +11,20 @@ import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from threading import Lock
+from typing import NamedTuple
 
 from threadpoolctl import threadpool_limits
 
 from learner.config.config import Config
 from protocol.errors import UsageError
 from protocol.machine.cpu_cores import usable_cores
+from protocol.policy.arithmetic import multiply_adds
 from protocol.policy.layout import parameter_layout
 from protocol.specs import PolicySpec
 
 MANY_WEIGHTS = 1 << 18  # 512 x 512
+WORTH_A_THREAD = 1 << 25
+"""Multiply-adds of a forward pass that make a thread worthwhile. With the backward pass, a core takes 2 to 5 ms for them."""
 
 
 _lock = Lock()
@@ -65,20 +69,45 @@ def torch_device(config: Config) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device
 
 
-def threads(policy: PolicySpec, max_lag: int, workers: int) -> int:
-    """Number of threads, where the settings name none. `workers` is the number of worker processes on this machine.
+class ThreadChoice(NamedTuple):
+    """How many threads PyTorch gets, where the settings name no number."""
 
-    Operations of small and recurrent networks are so short that a second thread gains nothing, and loses much while another
-    process keeps a core busy: the threads wait for one another at the end of each operation. Images, encoders and layers
-    with `MANY_WEIGHTS` use all cores. If workers collect meanwhile, they use the cores that are left, but only if those are
-    more than half: where updates take longer than collecting, workers wait for most of the time, and their cores with them.
+    number: int
+    line: str
+    """What was chosen and why, for the user; empty if nobody would expect another number"""
+
+
+def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> ThreadChoice:
+    """The number of threads, by the work of a pass of a minibatch of `rows`. `workers`: worker processes on this machine.
+
+    The threads wait for one another at the end of each operation. So a thread that has little to do gains nothing, and
+    loses much while another process keeps its core busy: each gets at least `WORTH_A_THREAD`. Networks of small layers have
+    one, because numpy computes most of their passes.
+
+    If workers collect meanwhile, they use the cores that are left, but only if those are more than half: where updates take
+    longer than collecting, workers wait for most of the time, and their cores with them.
     """
     largest = max(math.prod(field.shape) for fields in parameter_layout(policy) for field in fields)
     if not policy.needs_torch and largest < MANY_WEIGHTS:
-        return 1
+        return ThreadChoice(1, "")
     cores = usable_cores()
     left = cores - workers if max_lag else cores
-    return left if 2 * left > cores else cores
+    work = rows * multiply_adds(policy)
+    count = max(1, min(left if 2 * left > cores else cores, work // WORTH_A_THREAD))
+    line = (
+        f"PyTorch uses {count} of {cores} cores: a pass of {rows:,} rows has {work / 1e6:,.1f} million multiply-adds, and a "
+        f"thread is worthwhile for {WORTH_A_THREAD / 1e6:.0f} million; --torch-threads sets another number"
+    )
+    return ThreadChoice(count, line)
+
+
+def minibatch_rows(config: Config) -> int:
+    """Number of rows of a minibatch, by the settings: all rows of an update if none divides them."""
+    batch_size = getattr(config.algorithm, "batch_size", None)
+    if isinstance(batch_size, int):
+        return batch_size
+    minibatches = getattr(config.algorithm, "minibatches", 1)
+    return config.envs * config.algorithm.rollout_steps // (minibatches if isinstance(minibatches, int) else 1)
 
 
 def updates_use_all_cores(config: Config) -> bool:

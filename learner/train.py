@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from learner.algorithms import Algorithm
 from learner.algorithms.algorithm import numbers
 from learner.between_updates.between_updates import BetweenUpdates
+from learner.between_updates.crowded_cores import CrowdedCores
 from learner.rollouts.hub import Hub
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder.progress import Row
@@ -36,15 +37,17 @@ def train(
     between: BetweenUpdates,
     workers: int,
     check_time: Callable[[], None] = lambda: None,
+    cores: CrowdedCores | None = None,
 ) -> str:
     """Train until the tally gives a reason to stop. Returns that reason.
 
     `workers`: number of workers to wait for before the first rollout. If the run cannot go on (no worker is left, the
     environment raised too often, the user interrupted the run, a loss is not finite, the user's code raised), the state
     after the last whole update is saved. Then the error is raised. `check_time` is called between gradient steps: what it
-    raises takes the update back.
+    raises takes the update back. `cores` watches the updates.
     """
     tally, files, audience, evaluations = between
+    cores = cores or CrowdedCores(0)
 
     def pulse() -> None:
         hub.pulse()
@@ -76,7 +79,8 @@ def train(
                     hub.not_used(arrived)
                     continue
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
-                metrics = numbers(algorithm.update(batch, pulse), type(algorithm).__name__)
+                with cores.watching():
+                    metrics = numbers(algorithm.update(batch, pulse), type(algorithm).__name__)
                 weights = files.weights()
                 if not algorithm.is_finite():
                     raise RunError(f"learner: update {tally.state.version}: the weights are not finite after it; {ADVICE}")

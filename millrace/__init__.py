@@ -18,6 +18,7 @@ from millrace.import_conflict import check_imports
 
 check_imports()
 
+import protocol.machine.waiting_threads  # noqa: E402, F401  # before torch, if the program imports millrace first
 from protocol.errors import (  # noqa: E402
     CheckpointError,
     EnvironmentFailed,

@@ -185,9 +185,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     torch_threads: int | None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice
-    is 1; with images, an encoder or a layer of 512 x 512 weights it is all cores. If max_lag is above 0, one core is
-    then left to each local worker, unless this would leave half of the cores or less to the learner. Another number
-    changes the last bits of results.
+    is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a pass
+    of a minibatch, at most one for each core. If max_lag is above 0, one core is then left to each local worker,
+    unless this would leave half of the cores or less to the learner. Another number changes the last bits of results.
     """
     grace_s: float
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them;

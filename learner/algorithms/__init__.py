@@ -7,18 +7,13 @@ Each algorithm is one class in one file. Its settings are one record in `learner
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 
+import protocol.machine.waiting_threads  # noqa: F401  # before torch: whoever imports an algorithm imports this file first
 from learner.algorithms.algorithm import Algorithm
 from learner.config.algorithm_names import ALGORITHMS, is_own, own_class
 
 __all__ = ["ALGORITHMS", "Algorithm", "algorithm_class"]
-
-# PyTorch's threads sleep while they wait for one another. By default they spin, and hold the core that the slowest needs:
-# beside other busy processes an update takes up to ten times as long. This must be set before torch is imported, and whoever
-# imports an algorithm imports this module first.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def algorithm_class(name: str) -> type[Algorithm]:

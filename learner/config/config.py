@@ -106,9 +106,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     torch_threads: Free[Count | None] = None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The
-    choice is 1; with images, an encoder or a layer of 512 x 512 weights it is all cores. If max_lag is above 0, one core is
-    then left to each local worker, unless this would leave half of the cores or less to the learner. Another number
-    changes the last bits of results.
+    choice is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a
+    pass of a minibatch, at most one for each core. If max_lag is above 0, one core is then left to each local worker, unless
+    this would leave half of the cores or less to the learner. Another number changes the last bits of results.
     """
 
     grace_s: Free[NotNegative] = 30.0

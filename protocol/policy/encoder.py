@@ -13,6 +13,8 @@ probabilities.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from protocol.errors import UsageError, first_line
@@ -20,6 +22,8 @@ from protocol.own_module import own_callable
 from protocol.policy.features import feature_size
 from protocol.random_streams import Purpose, torch_seed
 from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
+
+ROWS = 2  # observations of a trial pass: with one, a module that mixes up rows would not be noticed
 
 
 def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
@@ -48,6 +52,27 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
     return module
 
 
+def multiply_adds_of_encoder(spec: PolicySpec) -> int:
+    """Multiply-adds of a pass of one observation: for each module, its weights times the places of its output.
+
+    Exact for linear layers and convolutions. A cell of an LSTM or attention uses its weights more often than this.
+    """
+    assert spec.encoder is not None
+    encoder = _make(spec.encoder.factory, spec, seed=0)
+    counts: list[int] = []
+
+    def count(module: torch.nn.Module, _: object, output: Any) -> None:
+        first = output[0] if isinstance(output, tuple) and output else output
+        if isinstance(first, torch.Tensor):
+            weights = [weight for weight in module.parameters(recurse=False) if weight.dim() > 1]  # [out, ...] each
+            counts.extend(weight.numel() * (first.numel() // ROWS // max(1, weight.shape[0])) for weight in weights)
+
+    for module in encoder.modules():
+        module.register_forward_hook(count)
+    _output_size(spec.encoder.factory, encoder, spec)
+    return sum(counts)
+
+
 def _parameter_shapes(module: torch.nn.Module) -> tuple[NamedShape, ...]:
     return tuple(NamedShape(name, tuple(parameter.shape)) for name, parameter in module.named_parameters())
 
@@ -73,14 +98,14 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
 
 
 def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:
-    """The output size K, found by a forward pass on two observations of zeros."""
-    images = [torch.zeros(2, *leaf.shape, dtype=torch.uint8) for leaf in spec.observation if leaf.is_image]
+    """The output size K, found by a forward pass on `ROWS` observations of zeros."""
+    images = [torch.zeros(ROWS, *leaf.shape, dtype=torch.uint8) for leaf in spec.observation if leaf.is_image]
     try:
         with torch.no_grad():
-            out = module(torch.zeros(2, feature_size(spec)), *images)
+            out = module(torch.zeros(ROWS, feature_size(spec)), *images)
     except Exception as error:
         raise UsageError(f"encoder {factory} raised {type(error).__name__}: {first_line(error)}") from error
-    if not isinstance(out, torch.Tensor) or out.dim() != 2 or len(out) != 2 or out.dtype != torch.float32:
+    if not isinstance(out, torch.Tensor) or out.dim() != 2 or len(out) != ROWS or out.dtype != torch.float32:
         got = f"{out.dtype}{list(out.shape)}" if isinstance(out, torch.Tensor) else type(out).__name__
-        raise UsageError(f"encoder {factory}: expected float32[2, K] of two observations, got {got}")
+        raise UsageError(f"encoder {factory}: expected float32[{ROWS}, K] of two observations, got {got}")
     return out.shape[1]

@@ -38,6 +38,10 @@ class Conv(NamedTuple):
     kernel: int
     stride: int
 
+    def output_side(self, side: int) -> int:
+        """The height or width of its output, from that of its input."""
+        return (side - self.kernel) // self.stride + 1
+
 
 CRITICS = ("critic0", "critic1")  # of a squashed or deterministic head; each takes the features and the action
 LOG_STD_BOUNDS = (-20.0, 2.0)  # of a squashed Gaussian (Haarnoja et al. 2018)
@@ -55,7 +59,7 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
     stack = NATURE if min(chw[1:]) >= 36 else SMALL
     height, width = chw[1:]
     for conv in stack:
-        height, width = ((side - conv.kernel) // conv.stride + 1 for side in (height, width))
+        height, width = conv.output_side(height), conv.output_side(width)
     return stack, (chw[0], chw[1], chw[2]), stack[-1].channels * height * width
 
 

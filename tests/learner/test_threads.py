@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -10,13 +12,17 @@ import gymnasium
 import pytest
 import threadpoolctl
 import torch
+from msgspec.structs import replace
 
 import millrace
 from learner import torch_setup
+from learner.between_updates.crowded_cores import CrowdedCores
 from learner.config.layers import resolve
 from learner.run_folder.run_format import POLICY_ARRAYS
-from learner.torch_setup import one_thread, threads
+from learner.torch_setup import minibatch_rows, one_thread, threads
 from millrace.launch.local_worker_options import worker_cores
+from protocol.machine.waiting_threads import VARIABLE as WAIT
+from protocol.policy.encoder import describe_encoder
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CORES = {2, 3}
@@ -72,33 +78,104 @@ FEATURES = PolicySpec((Leaf("", "discrete", (), "int64", (500,), (0,)),), ACTION
 IMAGES = PolicySpec((Leaf("", "box", (84, 84, 4), "uint8", divisor=255),), ACTION)
 
 
+SMALL_IMAGES = PolicySpec((Leaf("", "box", (7, 7, 3), "uint8"),), ACTION)
+
+
 @pytest.mark.parametrize(
-    ("policy", "max_lag", "workers", "count"),
+    ("policy", "rows", "max_lag", "workers", "count"),
     [
-        (SMALL, 0, 2, 1),
-        (RECURRENT, 0, 2, 1),
-        (FEATURES, 0, 2, 1),
-        (WIDE, 0, 2, 1),
-        (LARGE, 0, 2, 8),  # workers wait while it learns
-        (IMAGES, 0, 2, 8),
-        (IMAGES, 1, 2, 6),
-        (IMAGES, 1, 0, 8),  # they are elsewhere
-        (IMAGES, 1, 3, 5),
-        (
-            IMAGES,
-            1,
-            4,
-            8,
-        ),  # workers wait most of the time: the learner on half of the cores would be slower than without lag
-        (IMAGES, 1, 8, 8),
-        (IMAGES, 1, 20, 8),
+        (SMALL, 1 << 20, 0, 2, 1),
+        (RECURRENT, 64, 0, 2, 1),
+        (FEATURES, 64, 0, 2, 1),
+        (WIDE, 4096, 0, 2, 1),
+        (LARGE, 64, 0, 2, 1),
+        (LARGE, 256, 0, 2, 4),
+        (LARGE, 4096, 0, 2, 8),  # workers wait while it learns
+        (LARGE, 256, 1, 2, 4),
+        (SMALL_IMAGES, 64, 0, 2, 1),
+        (IMAGES, 32, 0, 2, 7),
+        (IMAGES, 64, 0, 2, 8),
+        (IMAGES, 64, 1, 2, 6),
+        (IMAGES, 64, 1, 0, 8),  # they are elsewhere
+        (IMAGES, 64, 1, 3, 5),
+        # Workers wait most of the time: the learner on half of the cores would be slower than without lag.
+        (IMAGES, 64, 1, 4, 8),
+        (IMAGES, 64, 1, 8, 8),
+        (IMAGES, 64, 1, 20, 8),
     ],
 )
-def test_the_learner_takes_the_cores_that_workers_leave(
-    monkeypatch: pytest.MonkeyPatch, policy: PolicySpec, max_lag: int, workers: int, count: int
+def test_each_thread_has_work_and_the_learner_takes_the_cores_that_workers_leave(
+    monkeypatch: pytest.MonkeyPatch, policy: PolicySpec, rows: int, max_lag: int, workers: int, count: int
 ) -> None:
     monkeypatch.setattr(torch_setup, "usable_cores", lambda: 8)
-    assert threads(policy, max_lag, workers) == count
+    assert threads(policy, rows, max_lag, workers).number == count
+
+
+def small_encoder(features: int, images: list[tuple[int, ...]]) -> torch.nn.Module:
+    return torch.nn.Sequential(torch.nn.Linear(features, 64), torch.nn.ReLU(), torch.nn.Linear(64, 64))
+
+
+def large_encoder(features: int, images: list[tuple[int, ...]]) -> torch.nn.Module:
+    return torch.nn.Sequential(torch.nn.Linear(features, 1024), torch.nn.ReLU(), torch.nn.Linear(1024, 1024))
+
+
+@pytest.mark.parametrize(("encoder", "count"), [("small_encoder", 1), ("large_encoder", 2)])
+def test_an_encoder_has_the_threads_that_its_work_is_worth(
+    monkeypatch: pytest.MonkeyPatch, encoder: str, count: int
+) -> None:
+    monkeypatch.setattr(torch_setup, "usable_cores", lambda: 8)
+    described = describe_encoder(f"{__name__}:{encoder}", SMALL.observation, ACTION)
+    chosen = threads(replace(SMALL, encoder=described), 64, 0, 2)
+    assert chosen.number == count
+    assert chosen.line.startswith(f"PyTorch uses {count} of 8 cores: a pass of 64 rows has ")
+    assert not threads(SMALL, 64, 0, 2).line
+
+
+def test_the_rows_of_a_minibatch_follow_from_the_settings() -> None:
+    settings: dict[str, Any] = {"envs": 8, "rollout_steps": 16, "preset": "none"}
+    assert minibatch_rows(resolve("CartPole-v1", algo="ppo", batch_size=32, **settings)) == 32
+    assert minibatch_rows(resolve("CartPole-v1", algo="a2c", **settings)) == 8 * 16
+    assert minibatch_rows(resolve("CartPole-v1", algo="impala", minibatches=4, **settings)) == 8 * 4
+    assert minibatch_rows(resolve("CartPole-v1", algo="dqn", batch_size=128, **settings)) == 128
+
+
+@pytest.mark.parametrize(
+    ("threads", "took_s", "computed_s", "says"),
+    [(2, 62.0, 1.6, True), (1, 62.0, 1.6, False), (0, 62.0, 1.6, False), (2, 9.0, 0.1, False), (8, 62.0, 40.0, False)],
+)
+def test_an_update_whose_threads_wait_for_cores_is_said_once(
+    threads: int, took_s: float, computed_s: float, says: bool
+) -> None:
+    cores = CrowdedCores(threads)
+    line = cores.updated(took_s, computed_s)
+    assert bool(line) is says
+    if says:
+        assert line.startswith("an update took 62 s and computed for 2 s of them: PyTorch's 2 threads wait for cores")
+        assert line.endswith("compare --torch-threads 1")
+    assert not cores.updated(took_s, computed_s)
+
+
+@pytest.mark.parametrize(
+    ("imports", "variable", "spin"),
+    [
+        ("millrace; import torch", "", False),
+        ("torch; import millrace", "", True),
+        ("torch; import millrace", "PASSIVE", False),
+    ],
+)
+def test_threads_sleep_while_they_wait_if_millrace_is_imported_before_torch(
+    imports: str, variable: str, spin: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "torch.py").touch()
+    program = (
+        f"import {imports}; import os; from protocol.machine.waiting_threads import SPIN; print(SPIN, os.environ[{WAIT!r}])"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != WAIT} | (
+        {WAIT: variable} if variable else {}
+    )
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=60)
+    assert said.stdout.split() == [str(spin), "PASSIVE"], said.stderr
 
 
 def test_a_run_keeps_the_number_of_threads_that_it_began_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,6 +186,7 @@ def test_a_run_keeps_the_number_of_threads_that_it_began_with(tmp_path: Path, mo
         "eval_episodes": 1,
         "transport": "inproc",
         "net": (512, 512),
+        "batch_size": 512,
     }
     used: list[int] = []
     monkeypatch.setattr(torch, "set_num_threads", used.append)

@@ -1,0 +1,41 @@
+"""The work of a policy: multiply-adds of a forward pass of one row. Each weight counts once for each place where it is used.
+
+An activation, a normalization or an addition costs little beside them, and a backward pass costs twice as much as a forward
+pass, so this number alone says how much work a pass is.
+"""
+
+from __future__ import annotations
+
+import math
+
+from protocol.policy.layout import convolutions, parameter_layout
+from protocol.specs import PolicySpec
+
+
+def multiply_adds(spec: PolicySpec) -> int:
+    """Multiply-adds of a pass of one row through all networks of a policy. Makes the encoder, if there is one."""
+    total = 0
+    places = _places(spec)
+    for field in (field for part in parameter_layout(spec) for field in part):
+        if len(field.shape) > 1 and not (spec.encoder is not None and field.name.startswith("encoder.")):
+            total += math.prod(field.shape) * places.get(field.name, 1)
+    if spec.encoder is None or spec.own is not None:
+        return total
+    from protocol.policy.encoder import multiply_adds_of_encoder
+
+    return total + multiply_adds_of_encoder(spec)
+
+
+def _places(spec: PolicySpec) -> dict[str, int]:
+    """At how many places of its image the weight of a convolution is used."""
+    places: dict[str, int] = {}
+    if not spec.convolves:
+        return places
+    for i, leaf in enumerate(spec.observation):
+        if leaf.is_image:
+            stack, (_, height, width), _ = convolutions(leaf)
+            for j, conv in enumerate(stack):
+                height = conv.output_side(height)
+                width = conv.output_side(width)
+                places[f"image{i}.{j}.weight"] = height * width
+    return places
