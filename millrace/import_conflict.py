@@ -61,7 +61,7 @@ def _gymnasium_too_old() -> str:
     """
     folder = _location("gymnasium")
     try:
-        text = "" if folder is None else (folder / "__init__.py").read_text(encoding="utf-8")
+        text = "" if folder is None else (folder / "__init__.py").read_text("utf-8", "replace")
     except OSError:
         text = ""
     found = VERSION.search(text)

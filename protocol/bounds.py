@@ -10,7 +10,13 @@ import re
 from textwrap import indent
 from typing import Annotated, Literal
 
+import msgspec
 from msgspec import Meta
+
+INVALID = (msgspec.MsgspecError, ValueError, RecursionError)
+"""What decoding raises: ValueError for bytes that are not UTF-8 and for too many digits, RecursionError for lists in lists.
+Whoever decodes what another program wrote catches all of them.
+"""
 
 MAX_NAME, MAX_LINE, MAX_TEXT = 200, 1_000, 64_000  # characters
 LARGEST = 2**53  # every whole number up to here is exact as a float64 too

@@ -56,6 +56,7 @@ def validate(config: Config, where: str = "") -> Config:
     config = convert(msgspec.to_builtins(config), where)
     if not config.env:
         raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
+    _check_texts(config, at)
     check_rollout_settings(config, at)
     _check_numbers(config.algorithm, at)
     _check_env_arguments(config, at)
@@ -72,6 +73,14 @@ def validate(config: Config, where: str = "") -> Config:
     if encoder is not None and not is_name(encoder):
         raise UsageError(f"{at}encoder {encoder}: expected module:factory, as in my_package.networks:encoder")
     return config
+
+
+def _check_texts(config: Config, at: str) -> None:
+    """Raise `UsageError` for a text that no file and no message can hold: words of a command line may be any bytes."""
+    for name, value in {**msgspec.structs.asdict(config), **msgspec.structs.asdict(config.algorithm)}.items():
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
+                raise UsageError(f"{at}{name}: expected text in UTF-8, got {text!r:.60}")
 
 
 def check_copies(config: Config, limit: str, most: int) -> None:

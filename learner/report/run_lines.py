@@ -15,8 +15,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import msgspec
-
 from learner.config.presets import environment_name
 from learner.report.metrics_tail import newest_row
 from learner.report.sentences import ending
@@ -26,7 +24,7 @@ from learner.run_folder.regular_files import reason
 from learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
 from learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
 from learner.run_folder.run_lock import living_owner
-from protocol.bounds import LARGEST, MAX_NAME, one_line
+from protocol.bounds import INVALID, LARGEST, MAX_NAME, one_line
 from protocol.errors import UsageError
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
@@ -106,7 +104,7 @@ def read_line(path: Path, now: float) -> RunLine:
     if owner is None:
         try:
             summary = read_summary(path)
-        except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        except (OSError, *INVALID):
             summary = None
     steps = config.get("steps")
     line = RunLine(

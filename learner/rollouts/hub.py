@@ -367,7 +367,8 @@ class Hub:
 
     def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
         if isinstance(message, Evaluated):
-            self._failures.evaluated(worker_name(peer).decode() if self.coordinator.evaluation.beside else None)
+            worker = worker_name(peer).decode(errors="replace")
+            self._failures.evaluated(worker if self.coordinator.evaluation.beside else None)
         if not isinstance(message, Rollout):
             return self.coordinator.receive(peer, message, now)
         try:

@@ -26,7 +26,7 @@ from msgspec.structs import replace
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import NOT_SHOWN, Progress
 from learner.run_folder.regular_files import open_regular
-from protocol.bounds import escaped_json
+from protocol.bounds import INVALID, escaped_json
 from protocol.logs.notices import is_notice
 
 RUN_LOG_FILE = "log.jsonl"
@@ -90,7 +90,7 @@ def newest_lines(folder: Path) -> list[LoggedLine]:
         return []
     found = []
     for line in lines:
-        with suppress(msgspec.MsgspecError, UnicodeError, RecursionError, OverflowError, ValueError):
+        with suppress(*INVALID, OverflowError):
             logged = msgspec.json.decode(line, type=LoggedLine)
             found.append(replace(logged, time=logged.time.astimezone()))
     return found

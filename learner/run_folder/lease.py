@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from protocol.bounds import Line, Natural
+from protocol.bounds import INVALID, Line, Natural
 
 WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them replaces the whole
 HIGHEST_COUNT = 10**12
@@ -83,7 +83,7 @@ def decoded(content: bytes) -> Owner | None:
     """The owner that this content names. None if it names none: it was cut, or is being written."""
     try:
         return msgspec.json.decode(content.strip(), type=Owner)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+    except INVALID:
         return None
 
 

@@ -24,7 +24,7 @@ import msgspec
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
 from learner.run_folder.regular_files import MOST_BYTES, open_regular, read, subfolder
-from protocol.bounds import Natural
+from protocol.bounds import INVALID, Natural
 from protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
@@ -211,7 +211,7 @@ def decoded_row(line: bytes) -> dict[str, Any] | None:
         msgspec.convert(row[ENV_STEPS_KEY], Natural)
         if not all(number is None or math.isfinite(number) for number in row.values()):
             return None
-    except (msgspec.MsgspecError, UnicodeError, KeyError, OverflowError, RecursionError):
+    except (*INVALID, KeyError, OverflowError):
         return None
     return row
 

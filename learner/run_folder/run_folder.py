@@ -54,7 +54,7 @@ from learner.run_folder.run_format import (
 )
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
-from protocol.bounds import MAX_FACTS, Line, Name, Natural, one_line
+from protocol.bounds import INVALID, MAX_FACTS, Line, Name, Natural, one_line
 from protocol.env_spec import Scalar
 from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
@@ -65,7 +65,7 @@ from protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
 
 POLICY_FORMAT = 2
 Which = Literal["final", "best"]
-UNREADABLE = (OSError, msgspec.MsgspecError, ValueError, RecursionError)  # what reading a damaged file raises
+UNREADABLE = (OSError, *INVALID)  # what reading a damaged file raises
 
 log = logging.getLogger("millrace.learner")
 
@@ -312,7 +312,7 @@ class RunFolder:
             arrays = load(content)
             if not _checksum_matches(content):
                 raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
-        except (*UNREADABLE, SafetensorError) as error:
+        except (*UNREADABLE, SafetensorError, KeyError) as error:  # KeyError: a dtype that numpy does not have
             raise UsageError(f"policy of run {self.path} cannot be read: {one_line(reason(error))}") from error
         if (encoder := description.policy.encoder) is not None:
             refuse_modules_in(self.path, [encoder.factory])

@@ -21,7 +21,7 @@ import msgspec
 
 from learner.run_folder.atomic_write import write_file
 from learner.run_folder.regular_files import read, reason
-from protocol.bounds import one_line
+from protocol.bounds import INVALID, one_line
 from protocol.errors import UsageError
 from protocol.own_module import refuse_modules_in
 
@@ -148,7 +148,7 @@ def check_format(folder: Path) -> RunFormat:
         found = msgspec.json.decode(read(folder / RUN_FILE), type=RunFormat)
     except FileNotFoundError:
         raise UsageError(f"run {folder}: expected a run folder, got one without {RUN_FILE}") from None
-    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+    except (OSError, *INVALID) as error:
         raise UsageError(
             f"run {folder}: {RUN_FILE} cannot be read: {reason(error)}; restore it, or start a new run"
         ) from error

@@ -26,7 +26,8 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
     match get_origin(field.kind):
         case origin if origin is dict:
             if len(words) % 2:
-                raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}")
+                hint = f"; a text that begins with a dash is written in quotes: {shlex.quote(words[-1])} '\"-x\"'"
+                raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}{hint}")
             return {name: _entry(field, name, word) for name, word in zip(words[::2], words[1::2], strict=True)}
         case origin if origin in (tuple, list):
             value: object = list(words)
@@ -71,6 +72,8 @@ def _converted(field: FlagField, value: Any, given: str, *, strict: bool) -> Any
         return msgspec.convert(value, field.hint, strict=strict, dec_hook=lambda kind, plain: kind(plain))
     except msgspec.ValidationError as error:
         raise UsageError(f"{field.name}: {what_was_expected(str(error), field.hint)}, got {given}") from None
+    except UnicodeEncodeError:  # a word of the command line, or a name of a file, may be any bytes
+        raise UsageError(f"{field.name}: expected text in UTF-8, got {given}") from None
 
 
 def what_was_expected(message: str, hint: Any) -> str:

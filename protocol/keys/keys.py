@@ -19,6 +19,7 @@ import msgspec
 import zmq
 import zmq.utils.z85
 
+from protocol.bounds import INVALID
 from protocol.errors import UsageError
 
 KEY_BYTES = 32
@@ -170,7 +171,7 @@ class ClientList:
         try:
             table: dict[str, Any] = tomllib.loads(text)
             clients = msgspec.convert(table.pop("client", []), tuple[Client, ...])
-        except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        except INVALID as error:
             raise UsageError(f"{where} cannot be understood: {error}") from error
         if table:
             raise UsageError(f"{where}: expected tables [[client]] alone, got {min(table)}")

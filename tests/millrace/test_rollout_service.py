@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import re
 import threading
@@ -236,7 +237,9 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
             with pytest.raises(UsageError, match=f"save: {name}: expected an array of numbers, not called "):
                 made.save(file, **{name: np.ones(3)})
     whole = file.read_bytes()
-    for damaged in (b"", whole[: len(whole) // 2], b"rubbish"):
+    nested = io.BytesIO()
+    np.savez(nested, millrace=np.frombuffer(b'{"normalizer":' + b'{"a":' * 100_000, np.uint8))
+    for damaged in (b"", whole[: len(whole) // 2], b"rubbish", nested.getvalue()):
         file.write_bytes(damaged)
         with pytest.raises(CheckpointError, match=r"state\.npz"):
             millrace.RolloutService("CartPole-v1", restore=file, **SMALL)

@@ -91,7 +91,13 @@ def test_words_become_values(words: str, expected: dict[str, Any] | None) -> Non
         ("--sizes 3,x", "sizes: expected int, got 3,x"),
         ("--sizes 3 0", "sizes: expected int >= 1, got 3 0"),
         ("--level 3", "level: expected one of 1, 2, none, got 3"),
-        ("--table a", "table: expected NAME VALUE NAME VALUE ..., got a"),
+        (
+            "--table a",
+            "table: expected NAME VALUE NAME VALUE ..., got a; "
+            "a text that begins with a dash is written in quotes: a '\"-x\"'",
+        ),
+        ("--inner \udce9", "inner: expected text in UTF-8, got '\\udce9'"),
+        ("--sizes 3 \udce9", "sizes: expected text in UTF-8, got 3 '\\udce9'"),
         ("--gentle=yes", "do: --gentle=yes: expected --gentle or --no-gentle"),
         ("a b", "do: unexpected argument b"),
     ],

@@ -23,7 +23,7 @@ import msgspec
 import zmq
 
 from protocol.alive import Alive, WorkerActivity, WorkerExit
-from protocol.bounds import MAX_NAME, MAX_WORKERS
+from protocol.bounds import INVALID, MAX_NAME, MAX_WORKERS
 from protocol.keys.keys import Token
 from protocol.keys.zap import connect_with
 from protocol.wire.socket_options import RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
@@ -86,8 +86,8 @@ class AliveSender:
             self._socket.close(linger=200)
 
     def _take(self, frames: Sequence[zmq.Frame]) -> bool:
-        """Take a message. Whether it says that the run is over."""
-        with suppress(msgspec.MsgspecError):
+        """Take a message. Whether it says that the run is over. One that cannot be read is ignored."""
+        with suppress(*INVALID):
             match msgspec.msgpack.decode(frames[0].bytes):
                 case ["Drain", *_]:
                     return True

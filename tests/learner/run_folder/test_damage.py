@@ -362,6 +362,19 @@ def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(
         assert "\n" not in str(why.value)
 
 
+@pytest.mark.parametrize("dtype", ["BF16", "F8_E5M2", "I64", "C64"])
+def test_numbers_of_a_dtype_that_no_policy_has_are_one_line(whole: Path, tmp_path: Path, dtype: str) -> None:
+    """The package safetensors raises KeyError for those that numpy lacks."""
+    run = tmp_path / "runs" / whole.name
+    shutil.copytree(whole, run)
+    sizes = {"BF16": 2, "F8_E5M2": 1, "I64": 8, "C64": 8}
+    head = msgspec.json.encode({"a": {"dtype": dtype, "shape": [1], "data_offsets": [0, sizes[dtype]]}})
+    (run / "policy.safetensors").write_bytes(len(head).to_bytes(8, "little") + head + bytes(sizes[dtype]))
+    for reader in ("evaluate", "load"):
+        with pytest.raises(UsageError, match=f"policy of run {run}"):
+            READERS[reader](run)
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_a_sample_of_damages(whole: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     counts = check(whole, tmp_path, name, cuts=3, flips=3, caplog=caplog, count=4)

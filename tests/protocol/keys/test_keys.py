@@ -161,6 +161,8 @@ def test_the_list_is_text_and_back() -> None:
         "[[client]]\nname = 'a'\npublic = '" + "00" * 32 + "'\nmade = 2026-11-21T10:00:00Z\nrevokd = 1",
         "[[clients]]\nname = 'a'",
         "not toml",
+        "client = " + "[" * 10_000,
+        "client = 1" + "0" * 10_000,
     ],
 )
 def test_a_list_that_is_not_understood_is_no_list(text: str) -> None:

@@ -35,7 +35,11 @@ class Notices:
 
     def hears(self, head: object, *frames: bytes) -> None:
         """The learner says this; it has arrived."""
-        self.learner.send_multipart([self.peer, msgspec.msgpack.encode(head), *frames])
+        self.hears_bytes(msgspec.msgpack.encode(head), *frames)
+
+    def hears_bytes(self, *frames: bytes) -> None:
+        """The same, of frames that may be anything."""
+        self.learner.send_multipart([self.peer, *frames])
         assert self.sender._socket is not None
         assert self.sender._socket.poll(SOON_MS)
 
@@ -130,3 +134,18 @@ def test_a_supervisor_that_cannot_share_says_so_and_goes_on(tmp_path: Path) -> N
     finally:
         notices.close()
         shared.close()
+
+
+@pytest.mark.parametrize(
+    "head",
+    [b"", b"\xc1", b"\x92\xa5Drain\xa1\xff", b"\x91" * 100_000, b"\x92\xa5Drain\x81\x80\x01", b"\x91\xd9\x7fDrain"],
+    ids=["empty", "no type", "no UTF-8", "nested", "dict as a key", "cut"],
+)
+def test_a_message_that_cannot_be_read_is_ignored(notices: Notices, head: bytes) -> None:
+    """Its workers would end with the supervisor."""
+    notices.sender.send([WAITING], [], 0.0)
+    notices.said()
+    notices.hears_bytes(head)
+    assert not notices.sender.listen(0.0)
+    notices.hears(["Drain", "done"])
+    assert notices.sender.listen(0.0)
