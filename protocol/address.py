@@ -40,7 +40,7 @@ def _check_host(address: str, host: str) -> None:
             raise UsageError(f"address {address}: expected an IPv6 address in brackets, as in tcp://[::1]:5555") from None
     elif ":" in host:
         raise UsageError(f"address {address}: expected an IPv6 address in brackets, as in tcp://[{host}]:5555")
-    elif any(character.isspace() or character in "/;@?#[]" for character in host):
+    elif not all(character.isalnum() or character in "._-*" for character in host):
         raise UsageError(f"address {address}: expected a host name or an IP address, got {host}")
 
 

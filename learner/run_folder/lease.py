@@ -13,7 +13,9 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
+from protocol.address import check_address
 from protocol.bounds import INVALID, Line, Natural
+from protocol.errors import UsageError
 
 WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them replaces the whole
 HIGHEST_COUNT = 10**12
@@ -80,11 +82,20 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decoded(content: bytes) -> Owner | None:
-    """The owner that this content names. None if it names none: it was cut, or is being written."""
+    """The owner that this content names. None if it names none: it was cut, or is being written.
+
+    It has an address only if that is one: a command connects to it, and a page shows it as a word to type.
+    """
     try:
-        return msgspec.json.decode(content.strip(), type=Owner)
+        owner = msgspec.json.decode(content.strip(), type=Owner)
     except INVALID:
         return None
+    try:
+        for address in filter(None, (owner.address, owner.here)):
+            check_address(address)
+    except UsageError:
+        return replace(owner, address="", here="", keys="")
+    return owner
 
 
 class Verdict(Enum):

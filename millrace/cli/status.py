@@ -32,7 +32,7 @@ from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
 from protocol.keys.keys import Token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
-from protocol.wire.worker_link import WorkerLink
+from protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 from workers.conversation.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
@@ -69,7 +69,7 @@ def status(argv: list[str], out: TextIO) -> None:
         out.write(f"{last_in_json(last) if values.json else in_sentences(last)}\n")
         return
     address, token = whom_to_ask(values.address, read_token(values.token), insecure=values.insecure)
-    link = WorkerLink(address, observer_name(), token=token)
+    link = WorkerLink(address, observer_name(), token=token, limits=OF_OBSERVER)
     try:
         while True:
             answer = ask(link, values.timeout_s)

@@ -22,11 +22,12 @@ from protocol.errors import UserFacingError
 from protocol.keys.keys import Token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
-from protocol.wire.worker_link import WorkerLink
+from protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 
 ASK_EVERY_S = 0.5
 LOOKED_AT_S = 10.0  # a page that is open asks each second
 FORGOTTEN_S = 300.0
+SILENT_S, PAUSE_S = 5.0, 10.0  # who sends a message without an end fills our memory until we close the connection
 SAMPLES = 400
 MOST_LANES = 64  # that are shown
 ANSWER_WITHIN_S = 0.5
@@ -79,6 +80,9 @@ class _Watched:
     whom: tuple[str, Token | None] | None = None
     status: Status | None = None
     answered_s: float = 0.0
+    silent_since_s: float = 0.0
+    """since its newest answer, or since we connected"""
+    ask_again_s: float = 0.0
     problem: str = ""
     samples: deque[LaneSample] = field(default_factory=lambda: deque(maxlen=SAMPLES))
 
@@ -139,11 +143,15 @@ class Lookout:
             _close(watched)
 
     def _ask(self, run: Path, watched: _Watched) -> None:
+        if self._clock() < watched.ask_again_s:
+            return
         try:
             whom = whom_to_ask(str(run), None, insecure=False)
             if watched.link is None or whom != watched.whom:
                 _close(watched)
-                watched.whom, watched.link = whom, WorkerLink(whom[0], observer_name(), token=whom[1])
+                watched.whom = whom
+                watched.link = WorkerLink(whom[0], observer_name(), token=whom[1], limits=OF_OBSERVER)
+                watched.silent_since_s = self._clock()
             watched.link.send(encode(Inquire()))
         except UserFacingError as error:
             _close(watched)
@@ -161,11 +169,15 @@ class Lookout:
         with self._lock:
             if newest is not None:
                 watched.status, watched.answered_s, watched.problem = newest, now, ""
+                watched.silent_since_s = now
                 watched.samples.append(sample(newest, now))
             elif now - watched.answered_s > LOOKED_AT_S:
                 watched.status = None
                 problem = watched.link.problem
                 watched.problem = one_line(problem.line) if problem else "its learner does not answer"
+        if now - watched.silent_since_s > SILENT_S:
+            _close(watched)
+            watched.ask_again_s = now + PAUSE_S
 
 
 def _close(watched: _Watched) -> None:

@@ -7,6 +7,7 @@ names of fields stand beside them where a reader may look for them elsewhere.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple
@@ -294,7 +295,7 @@ def join(line: RunLine) -> str:
         about = "Only its own machine reaches this learner. With --bind tcp://0.0.0.0:5555, workers of others can join."
         return section("One more worker", about, "", "join")
     token = " --token default.token" if line.owner.keys else " --insecure"
-    command = f"millrace worker {line.owner.address}{token}"
+    command = f"millrace worker {shlex.quote(line.owner.address)}{token}"
     about = "Type this on another machine."
     if line.owner.keys:
         about += f" It needs a join token from {line.owner.keys} of {line.owner.host}."

@@ -9,6 +9,7 @@ queues short.
 from __future__ import annotations
 
 import hashlib
+from typing import NamedTuple
 
 import zmq
 
@@ -25,18 +26,27 @@ CURVE_BYTES = 33  # what encryption adds to a frame
 TAG_CHARACTERS = 32
 
 
-def set_options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
-    """Set the options that both sides need, before the socket binds or connects."""
+class Limits(NamedTuple):
+    """What the other end may have us keep."""
+
+    frame_bytes: int
+    messages: int
+    """that wait to be read or sent"""
+
+
+def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Limits | None = None) -> None:
+    """Set the options that both sides need, before the socket binds or connects. `limits`: if not those of a worker."""
+    limits = limits or Limits(MAX_FRAME_BYTES, QUEUE)
     socket.linger = LINGER_MS
-    socket.maxmsgsize = MAX_FRAME_BYTES + (CURVE_BYTES if curve else 0)
+    socket.maxmsgsize = limits.frame_bytes + (CURVE_BYTES if curve else 0)
     socket.handshake_ivl = HANDSHAKE_MS
     socket.connect_timeout = 2000
     socket.tcp_maxrt = UNACKNOWLEDGED_MS
     # Without keepalive, the connection to a host that vanished while idle would stay forever.
     socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
     socket.ipv6 = needs_ipv6(address)
-    # These limits are never reached: at most one Weights message, a few tickets and their rollouts are on their way.
-    socket.sndhwm = socket.rcvhwm = QUEUE
+    # A worker never reaches its limit: at most one Weights message, a few tickets and their rollouts are on their way.
+    socket.sndhwm = socket.rcvhwm = limits.messages
 
 
 def routing_id(name: str, token: Token | None) -> bytes:

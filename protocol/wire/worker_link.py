@@ -19,12 +19,15 @@ from protocol.keys.keys import Token
 from protocol.keys.zap import connect_with
 from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from protocol.messages import ToObserver, ToWorker
-from protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
+from protocol.wire.codec import MAX_HEAD_BYTES, Buffer, decode_to_observer, decode_to_worker
 from protocol.wire.compression import Packing, has_zstd
-from protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
+from protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, Limits, routing_id, set_options
 from protocol.wire.sockets import receive_frames, send_frames
 
 Decoded = TypeVar("Decoded")
+
+OF_OBSERVER = Limits(frame_bytes=MAX_HEAD_BYTES, messages=8)
+"""An observer's limits: an answer to it has no arrays. The address may be one that a stranger's run folder names."""
 
 log = logging.getLogger("millrace.link")
 
@@ -38,8 +41,9 @@ class WorkerLink:
         name: str,
         context: zmq.Context[zmq.Socket[bytes]] | None = None,
         token: Token | None = None,
+        limits: Limits | None = None,
     ) -> None:
-        """With a token (only over tcp) the link connects only to the learner of that token."""
+        """With a token (only over tcp) the link connects only to the learner of that token. `limits`: if not a worker's."""
         check_address(address)
         check_worker_name(name)
         self.address, self.token = address, token
@@ -53,7 +57,7 @@ class WorkerLink:
         self._log_limiter = LogRateLimiter()
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)
-        set_options(self._socket, address, token is not None)
+        set_options(self._socket, address, token is not None, limits)
         self._socket.routing_id = routing_id(name, token)
         self._socket.reconnect_ivl = RECONNECT_MS
         self._socket.reconnect_ivl_max = RECONNECT_MOST_MS

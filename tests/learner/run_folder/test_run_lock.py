@@ -287,6 +287,19 @@ def test_a_learner_that_cannot_be_asked_from_here_is_named(content: bytes, messa
         learner_of_run(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "address", ["tcp://far:5555; touch x", "tcp://$(id):5555", "http://far/", "far:5555", "tcp://far:0"]
+)
+@pytest.mark.parametrize("which", ["address", "here"])
+def test_an_owner_has_no_address_that_is_none(tmp_path: Path, address: str, which: str) -> None:
+    """A command connects to it, and the dashboard shows it as a word to type."""
+    named = replace(ELSEWHERE, **{"address": "tcp://far:5555", "here": "tcp://far:5555", "keys": "/k", which: address})
+    (tmp_path / LOCK_FILE).write_bytes(named.encoded())
+    assert owner_of(tmp_path) == ELSEWHERE
+    with pytest.raises(UsageError, match="cannot be asked"):
+        learner_of_run(tmp_path)
+
+
 def test_a_learner_elsewhere_is_asked_at_its_address(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).write_bytes(replace(ELSEWHERE, address="tcp://far:5555").encoded())
     assert learner_of_run(tmp_path) == LearnerOfRun("tcp://far:5555", None, is_here=False)

@@ -15,6 +15,7 @@ from millrace.dashboard import live
 from millrace.dashboard.live import Lookout, Seen
 from protocol.messages import Status
 from protocol.wire.codec import encode
+from protocol.wire.worker_link import OF_OBSERVER
 from tests.millrace.dashboard.test_site import status, worker
 
 WITHIN_S = 20.0
@@ -123,3 +124,51 @@ def test_what_is_remembered_is_bounded(tmp_path: Path, address: str, monkeypatch
             assert len(seen.samples[0].lanes) == live.MOST_LANES
     finally:
         learner.close()
+
+
+class SilentLearner:
+    """Accepts a connection, and sends parts of a message that never ends."""
+
+    problem = None
+
+    def __init__(self, *args: object, **limits: object) -> None:
+        self.closed = False
+        self.limits = limits
+        MADE.append(self)
+
+    def send(self, frames: object) -> None:
+        pass
+
+    def poll(self, timeout_s: float) -> None:
+        pass
+
+    def answers(self) -> Iterator[Status]:
+        return iter(())
+
+    def close(self, linger_s: float) -> None:
+        self.closed = True
+
+
+MADE: list[SilentLearner] = []
+
+
+def test_a_learner_that_is_silent_is_asked_anew_after_a_pause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it has sent of a message fills our memory as long as the connection is open."""
+    MADE.clear()
+    monkeypatch.setattr(live, "WorkerLink", SilentLearner)
+    now = 100.0
+    lookout, watched = Lookout(lambda: now), live._Watched(now)
+    with RunLock(tmp_path) as lock:
+        lock.announce(Listens("tcp://127.0.0.1:9", "tcp://127.0.0.1:9"))
+        for now, made, closed in (
+            (100.0, 1, False),
+            (100.0 + live.SILENT_S, 1, False),
+            (100.1 + live.SILENT_S, 1, True),
+            (100.1 + live.SILENT_S + live.PAUSE_S / 2, 1, True),
+            (100.2 + live.SILENT_S + live.PAUSE_S, 2, False),
+        ):
+            lookout._ask(tmp_path, watched)
+            lookout._listen(watched, 0.0)
+            assert (len(MADE), MADE[-1].closed) == (made, closed), now
+    assert MADE[0].limits["limits"] == OF_OBSERVER
+    assert watched.problem

@@ -4,13 +4,16 @@ import json
 import logging
 import os
 import re
+import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from learner.metric_names import METRICS, described, label
 from learner.run_folder.json_log import kept_log
+from learner.run_folder.lease import Owner
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
@@ -126,6 +129,15 @@ def test_a_finished_run_shows_its_last_state_and_no_learner_is_asked(tmp_path: P
     assert "Final policy, 100 greedy episodes −1,233.6 ± 7.5" in said
     assert "What happened" in said
     assert pages.looked == []
+
+
+@pytest.mark.parametrize("address", ["tcp://*:5555", "tcp://box:5555;touch x", "tcp://$(id):1", "tcp://box:1' x"])
+def test_the_command_for_one_more_worker_is_words_that_a_shell_leaves_alone(address: str) -> None:
+    owner = Owner(host="box", pid=1, boot="", token="t", address=address)
+    page = Reader(run_page.join(SimpleNamespace(owner=owner)))  # type: ignore[arg-type]
+    (command,) = re.findall("millrace worker .*", page.text)
+    assert shlex.split(command) == ["millrace", "worker", address, "--insecure"]
+    assert command.split("worker ")[1].startswith("'")
 
 
 def test_the_newest_evaluations_are_a_table_that_marks_the_best() -> None:

@@ -35,7 +35,7 @@ from protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
 from protocol.wire.compression import Packing, has_zstd
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.sockets import COPY_BELOW_BYTES
-from protocol.wire.worker_link import WorkerLink
+from protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 from tests.support.conversation.every_message import to_learner, to_worker
 from tests.support.conversation.fake_ends import fake_rollout
 
@@ -514,3 +514,25 @@ def test_the_worker_reads_what_the_learners_codec_wrote() -> None:
     """The two ends share one codec; this is what the round trips above rest on."""
     for message in TO_WORKER:
         assert same(message, decode_to_worker(encode(message)))
+
+
+def test_who_only_asks_keeps_little_of_what_is_sent(tcp: Ends) -> None:
+    """The address may be one that a stranger's run folder names, and what answers there may be anything."""
+    learner = tcp.context.socket(zmq.ROUTER)
+    tcp.sockets.append(learner)
+    port = learner.bind_to_random_port("tcp://127.0.0.1")
+    link = WorkerLink(f"tcp://127.0.0.1:{port}", "asks", tcp.context, limits=OF_OBSERVER)
+    tcp.links.append(link)
+    link.send(encode(Inquire()))
+    assert learner.poll(int(1000 * DEADLINE_S))
+    peer, *_ = learner.recv_multipart()
+    learner.send_multipart([peer, bytes(OF_OBSERVER.frame_bytes)])
+    assert link.poll(DEADLINE_S), "the largest one arrives"
+    assert len(list(link.answers())) == 1
+    learner.send_multipart([peer, bytes(OF_OBSERVER.frame_bytes + 1)])
+    deadline_s = time.monotonic() + DEADLINE_S
+    while link.connected and time.monotonic() < deadline_s:
+        link.poll(0.01)
+    assert not link.connected, "a larger one ends the connection"
+    assert not list(link.answers())
+    assert link._socket.rcvhwm == OF_OBSERVER.messages
