@@ -5,7 +5,8 @@ Only valid rows count. The learner alone updates these; workers act with the flo
 Rule: no single observation may hide the others. A value that is more than `FAR` standard deviations from the mean counts as
 one that is `CLIP` from it, which is what the policy sees of it. So failures of a sensor, below one row in a hundred, change
 the standard deviation little. A feature whose scale grows for good soon sets a new one, because its many far values count.
-Values that are not far count as they are, bit for bit.
+Values that are not far count as they are, bit for bit. What is far among the first rows is known only when there are enough
+of them: until then they are kept.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from protocol.specs import PolicySpec
 
 TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
 FAR = 100.0  # standard deviations
-FEW = 100  # rows: before there are so many, the scale is not known, and no value is far
+FEW = 100  # rows: before there are so many, the scale is not known
 ROUNDING_32, ROUNDING_64 = 1e-6, 1e-12  # of float32 and float64: the same, as a fraction of the mean
 
 
@@ -80,8 +81,12 @@ class ObservationNormalizer:
         leaves = leaf_of_features(spec)
         self._box_features = np.array([leaf.kind == "box" for leaf in leaves], bool)
         self._is_float64 = np.array([leaf.dtype == "float64" for leaf in leaves], bool)
-        self._moments = RunningMoments((len(leaves),), np.where(self._is_float64, ROUNDING_64, ROUNDING_32))
+        self._moments = self._no_moments()
+        self._first: Doubles = np.empty((0, len(leaves)))  # [K, D] the rows counted so far, while they are few
         assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
+
+    def _no_moments(self) -> RunningMoments:
+        return RunningMoments((len(self._is_float64),), np.where(self._is_float64, ROUNDING_64, ROUNDING_32))
 
     def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
         """Features [..., D] of leaves [..., *leaf], the same as a network takes them, and the images among the leaves.
@@ -102,24 +107,29 @@ class ObservationNormalizer:
 
     def update(self, raw: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
-        if self._enabled:
-            self._moments.update(self._bounded(raw[valid]))
-
-    def _bounded(self, rows: Floats | Doubles) -> Floats | Doubles:
-        """The rows [B, D], with far values replaced. In the first batch, 99 in 100 rows set the scale."""
+        if not self._enabled:
+            return
+        rows = raw[valid]
         if self._moments.count >= FEW:
-            center, spread = self._moments.mean, self._moments.std
-        elif len(rows) >= FEW:
-            center = np.median(rows, 0)
-            spread = np.quantile(abs(rows - center), 0.99, axis=0, method="lower")
-            spread = np.where(spread > 0, spread, 1)
+            self._moments.update(_bounded(rows, self._moments.mean, self._moments.std))
+        elif self._moments.count + len(rows) < FEW:
+            self._moments.update(rows)
+            self._first = np.concatenate([self._first, rows])
         else:
-            return rows
-        distance = rows - center.astype(rows.dtype)
-        if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
-            return rows  # most batches: the squares of all rows together are less than that of one far value
-        far = abs(distance) > FAR * spread
-        return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
+            self._update_with_first(rows)
+
+    def _update_with_first(self, rows: Floats | Doubles) -> None:
+        """Count the rows [B, D] after which there are no longer few. 99 in 100 of all rows so far set the scale."""
+        so_far = np.concatenate([self._first, rows]) if len(self._first) else rows
+        center = np.median(so_far, 0)
+        spread = np.quantile(abs(so_far - center), 0.99, axis=0, method="lower")
+        bounded = _bounded(so_far, center, np.where(spread > 0, spread, 1))
+        if bounded is so_far:
+            self._moments.update(rows)
+        else:
+            self._moments = self._no_moments()
+            self._moments.update(bounded)
+        self._first = self._first[:0]
 
     def buffers(self) -> Floats:
         """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.
@@ -136,11 +146,24 @@ class ObservationNormalizer:
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""
-        return self._moments.state_dict()
+        return self._moments.state_dict() | {"first": torch.tensor(self._first)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state)
+        first, D = state.get("first", torch.empty(0)), len(self._is_float64)  # a policy alone has none
+        if len(first) and (len(first) >= FEW or first.shape[1:] != (D,)):
+            raise ValueError(f"observations: expected fewer than {FEW} first rows of {D} numbers, got {list(first.shape)}")
+        self._first = first.numpy().astype(np.float64).reshape(len(first), D)
+
+
+def _bounded(rows: Floats | Doubles, center: Doubles, spread: Doubles) -> Floats | Doubles:
+    """The rows [B, D], with values that are far from the center [D] replaced; the same array if none is."""
+    distance = rows - center.astype(rows.dtype)
+    if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
+        return rows  # most batches: the squares of all rows together are less than that of one far value
+    far = abs(distance) > FAR * spread
+    return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 
 
 class RewardScaler:

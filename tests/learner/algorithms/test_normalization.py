@@ -105,7 +105,10 @@ def test_values_that_are_not_far_count_as_they_are(rows: int) -> None:
         assert found.tobytes() == exact.tobytes()
 
 
-@pytest.mark.parametrize(("batch", "rows"), [(0, 500), (1, 500), (30, 500), (30, 8)])
+@pytest.mark.parametrize(
+    ("batch", "rows"),
+    [(0, 500), (1, 500), (30, 500), (30, 8), (0, 40), (1, 40), (2, 40), (3, 40), (0, 64), (1, 64), (0, 99), (1, 99), (0, 8)],
+)
 def test_one_value_does_not_hide_the_others(batch: int, rows: int) -> None:
     batches = noise(20_000 // rows, rows)
     batches[batch][3] = 1e6
@@ -113,6 +116,39 @@ def test_one_value_does_not_hide_the_others(batch: int, rows: int) -> None:
     assert exact[1] > 5_000
     assert abs(mean) < 0.05
     assert 0.95 < std < 1.05
+
+
+@pytest.mark.parametrize("rows", [1, 40, 64, 99])
+def test_one_value_of_the_first_rows_is_forgotten(rows: int) -> None:
+    """However few an update has: A2C's presets, SAC, TD3 and DQN, and the episodes of a dataset."""
+    batches = noise(20_000 // rows, rows)
+    batches[0][0] = 1e6
+    (mean, std), exact = counted(batches)
+    assert exact[1] > 5_000
+    assert abs(mean) < 0.05
+    assert 0.95 < std < 1.05
+
+
+def test_a_normalizer_that_was_saved_among_its_first_rows_goes_on_to_the_bit() -> None:
+    batches = noise(6, 30)
+    batches[0][3] = -1e6
+    whole, normalizer = ObservationNormalizer(NUMBER), ObservationNormalizer(NUMBER)
+    for rows in batches:
+        restored = ObservationNormalizer(NUMBER)
+        restored.load_state_dict(through_a_file(normalizer.state_dict()))
+        normalizer = restored
+        for each in (whole, normalizer):
+            each.update(rows.astype(np.float32)[:, None, None], np.ones((30, 1), bool))
+        assert normalizer.buffers().tobytes() == whole.buffers().tobytes()
+    assert whole.buffers()[1] < 3
+
+
+@pytest.mark.parametrize("shape", [(100, 1), (5, 2), (5,)])
+def test_first_rows_that_cannot_be_are_refused(shape: tuple[int, ...]) -> None:
+    normalizer = ObservationNormalizer(NUMBER)
+    wrong = normalizer.state_dict() | {"first": torch.zeros(shape)}
+    with pytest.raises(ValueError, match="observations: expected fewer than 100 first rows of 1 numbers"):
+        normalizer.load_state_dict(wrong)
 
 
 def test_nor_do_values_that_come_once_in_two_hundred_rows() -> None:
