@@ -140,7 +140,8 @@ class ActorCritic(Clones):
         Raises `RunError` when a loss, a logged number or the norm of a gradient is not finite, before the step; and when
         actions of the new weights would not be finite.
         """
-        if not batch.valid.any():
+        if not batch.valid.any():  # all seats wait
+            self.env_steps += batch.env_steps
             return {}
         self.set_schedules()
         observations = self.observations(batch)

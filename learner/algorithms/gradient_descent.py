@@ -46,7 +46,7 @@ class GradientDescent(Algorithm):
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int) -> None:
         self.config = config
         self.policy = policy
-        self.env_steps = 0  # valid rows used so far; schedules depend on it
+        self.env_steps = 0  # of all batches so far; schedules depend on it
         self.version = 0  # updates made
         self._total_steps = total_steps
         # What exploration needs also stands in the policy's buffers, so the normalizer gets the policy with another head.

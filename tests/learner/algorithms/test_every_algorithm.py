@@ -120,6 +120,19 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_env_step_counts_also_where_all_seats_wait(name: str) -> None:
+    """Schedules depend on it. In a game of two, one copy and one step a rollout, every second batch has no whole row."""
+    algorithm: Any = small(name)
+    whole = batch(algorithm, 0)
+    resets = np.zeros((T + 1, whole.valid.shape[1]), bool)
+    waits = np.zeros_like(whole.valid)
+    algorithm.update(
+        msgspec.structs.replace(whole, valid=waits, terminated=waits, truncated=waits, resets=resets), no_pulse
+    )
+    assert algorithm.env_steps == whole.valid.size
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_weights_that_a_step_makes_infinite_are_noticed(name: str) -> None:
     """The loss and the gradient are finite, but the step is not. The next step notices, or `is_finite` after the update."""
     largest = 1e38 if name in ("a2c", "impala") else 1e300  # RMSprop takes no number that is too large for float32
