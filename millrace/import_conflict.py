@@ -18,7 +18,7 @@ from typing import NoReturn
 PACKAGES = ("learner", "workers", "protocol")
 INSTALLED_IN = Path(__file__).parents[1]
 """The folder that holds `millrace` and the packages that belong to it."""
-OLDEST_GYMNASIUM = (1, 3)
+OLDEST_GYMNASIUM = (1, 1)
 VERSION = re.compile(r"""^__version__ *= *["'](\d+\.\d+[\d.]*)""", re.MULTILINE)
 
 

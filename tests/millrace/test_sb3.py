@@ -14,6 +14,7 @@ from gymnasium.envs.classic_control import CartPoleEnv
 import millrace
 from protocol.envs.seats import seated
 from protocol.errors import UsageError
+from tests.support.gymnasium_versions import TAXI
 from tests.support.numbers.bit_equality import bit_equal
 from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame, RandomTeam
 
@@ -35,7 +36,7 @@ def dummy(env: str, copies: int, **kwargs: Any) -> Any:
         return DummyVecEnv([lambda: gymnasium.make(env, disable_env_checker=True, **kwargs) for _ in range(copies)])
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", "Taxi-v4"])
+@pytest.mark.parametrize("env", ["CartPole-v1", TAXI])
 def test_it_is_the_dummy_vec_env_to_the_bit(env: str) -> None:
     theirs = dummy(env, 3, max_episode_steps=15)
     ours = make_vec_env(env, 3, monitor=False, workers=2, env_kwargs={"max_episode_steps": 15})

@@ -24,6 +24,7 @@ from learner.vector_env.settings import VectorEnvSettings
 from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.worker_link import WorkerLink
+from tests.support.gymnasium_versions import TAXI, needs_listed_episodes
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
 from tests.support.numbers.bit_equality import bit_equal
 
@@ -37,7 +38,7 @@ TRANSPORTS: dict[str, dict[str, Any]] = {
 CASES: dict[str, dict[str, Any]] = {
     "CartPole-v1": {},
     "Pendulum-v1": {"max_episode_steps": 30},
-    "Taxi-v4": {"max_episode_steps": 20},
+    TAXI: {"max_episode_steps": 20},
     "workers.envs.toy:Informs-v0": {},
     "workers.envs.toy:Spaces-v0": {"observation": "nested", "action": "table"},
 }
@@ -187,6 +188,7 @@ def test_observations_are_copies_unless_copy_is_false() -> None:
         assert (first != kept).any()
 
 
+@needs_listed_episodes
 def test_gymnasium_vector_wrappers_work_on_it() -> None:
     def wrapped(env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
         env = wrappers.RecordEpisodeStatistics(env)

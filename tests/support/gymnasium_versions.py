@@ -1,0 +1,14 @@
+"""What differs between the versions of gymnasium that millrace works with."""
+
+from __future__ import annotations
+
+import gymnasium
+import pytest
+from packaging.version import Version
+
+TAXI = next(env_id for env_id in gymnasium.registry if env_id.startswith("Taxi-"))
+"""Taxi-v4; Taxi-v3 before gymnasium 1.3."""
+needs_listed_episodes = pytest.mark.skipif(
+    Version(gymnasium.__version__) < Version("1.2"),
+    reason="DictInfoToList of gymnasium 1.1 raises KeyError for the infos of its own RecordEpisodeStatistics",
+)
