@@ -104,7 +104,19 @@ def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
             low, high = (tuple(float(x) for x in bound.ravel()) for bound in (space.low, space.high))
             return ActionSpec("box", space.shape, space.dtype.name, low=low, high=high)
         case _:
-            raise UsageError(f"action space {space} is not supported; supported are {ACTIONS} (of floats)")
+            raise UsageError(
+                f"action space {space} is not supported; supported are {ACTIONS} (of floats){_about_tuples(space)}"
+            )
+
+
+def _about_tuples(space: gymnasium.Space[Any]) -> str:
+    """What to do about a Tuple of actions, as the end of a line; empty for other spaces."""
+    if not isinstance(space, spaces.Tuple):
+        return ""
+    return (
+        "; if its parts are the actions of several agents, see 'A Tuple of actions' in docs/how-to/several_agents.md; "
+        "if they are of one agent, 'Tuple actions' in docs/how-to/third_party_environments.md"
+    )
 
 
 def _ints(array: Array) -> tuple[int, ...]:

@@ -21,6 +21,7 @@ from protocol.specs import RunSpec
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
+ROOT = Path(__file__).parents[3]
 SEEN = sorted(OBSERVATIONS.keys() - UNSUPPORTED_OBSERVATIONS)
 DONE = sorted(ACTIONS.keys() - UNSUPPORTED_ACTIONS)
 
@@ -133,6 +134,15 @@ def test_an_action_space_that_is_not_supported_is_one_line(name: str) -> None:
     ) as caught:
         spaces_run(action=name)
     assert "\n" not in str(caught.value)
+
+
+def test_a_tuple_of_actions_is_answered_with_the_recipes_that_make_agents_or_one_array_of_it() -> None:
+    pages = {"several_agents.md": "A Tuple of actions", "third_party_environments.md": "Tuple actions"}
+    with pytest.raises(UsageError) as caught:
+        action_spec(spaces.Tuple([spaces.Discrete(5), spaces.Discrete(5)]))
+    for page, heading in pages.items():
+        assert f"'{heading}' in docs/how-to/{page}" in str(caught.value)
+        assert f"\n## {heading}\n" in (ROOT / "docs" / "how-to" / page).read_text()
 
 
 @pytest.mark.parametrize(
