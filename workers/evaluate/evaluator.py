@@ -72,7 +72,7 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
             )
         else:
             copies = LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
-    modes = copies.envs[0].metadata.get("render_modes", [])
+    modes = (copies.envs[0].metadata or {}).get("render_modes", [])  # None: as some environments of the old package gym
     if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
         copies.close()
         raise UsageError(f"environment {run.env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")

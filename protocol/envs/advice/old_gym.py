@@ -11,19 +11,27 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
+
 from protocol.envs.found_names import attribute
 
 INSTALL = "pip install gym==0.26.2 shimmy"
 
 
 def is_of_old_gym(made: object) -> bool:
-    """Whether this is an environment of gym."""
-    return any(kind.__module__.partition(".")[0] == "gym" for kind in type(made).__mro__)
+    """Whether this is an environment of gym: by its classes, or, as if it does without gym, by its methods and spaces."""
+    if any(kind.__module__.partition(".")[0] == "gym" for kind in type(made).__mro__):
+        return True
+    space = getattr(made, "action_space", None)
+    methods = (getattr(made, name, None) for name in ("reset", "step"))
+    return all(map(callable, methods)) and not (space is None or callable(space) or isinstance(space, gymnasium.Space))
 
 
 def instead_of_object(made: Any) -> str:
     """What a callable should return instead of an environment of gym."""
-    return f"it is of the old package gym: `{INSTALL}`, and return shimmy.Gym{_version(made.reset)}CompatibilityV0(env=it)"
+    version = _version(made.reset)
+    wrap = f"`{INSTALL}`, and return shimmy.Gym{version}CompatibilityV0(env=it)"
+    return f"it has the interface of the old package gym: {wrap}{_about_seed(made, version)}"
 
 
 def instead_of_id(env_id: str) -> str:
@@ -40,7 +48,15 @@ def instead_of_id(env_id: str) -> str:
         version = _version(point.reset)
     except Exception:  # another package's code, or a function that makes the environment
         version = "V26"
-    return f"`{INSTALL}`, then write shimmy:Gym{version}Environment-v0 --env-kwargs env_id {env_id}"
+    write = f"`{INSTALL}`, then write shimmy:Gym{version}Environment-v0 --env-kwargs env_id {env_id}"
+    return f"{write}{_about_seed(point, version)}"
+
+
+def _about_seed(of: object, version: str) -> str:
+    """What to do about an environment, or its class, that shimmy cannot seed, as the end of a line; else nothing."""
+    if version != "V21" or hasattr(of, "seed"):
+        return ""
+    return "; it also needs a method seed(seed), as under 'Old gym environments' in docs/how-to/third_party_environments.md"
 
 
 def _version(reset: Callable[..., object]) -> str:

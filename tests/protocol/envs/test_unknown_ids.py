@@ -5,6 +5,7 @@ The packages are made here, and nothing is downloaded.
 
 from __future__ import annotations
 
+import re
 import sys
 import types
 from collections.abc import Iterator
@@ -226,6 +227,8 @@ def old_env(monkeypatch: pytest.MonkeyPatch, *, seeded: bool) -> Any:
     class OldEnv:
         __module__ = "gym.core"
 
+        def seed(self, seed: int) -> None: ...
+
     OldEnv.reset = (lambda self, *, seed=None: 0) if seeded else (lambda self: 0)  # type: ignore[attr-defined]
     gym = types.SimpleNamespace(envs=types.SimpleNamespace(registration=types.SimpleNamespace(registry={})))
     gym.envs.registration.registry["Old-v0"] = types.SimpleNamespace(entry_point=OldEnv)
@@ -244,6 +247,41 @@ def test_an_environment_of_the_old_gym_is_answered_with_what_wraps_it(
     assert refusal("fake_old:Old-v0").endswith(f"is of the old package gym; {write}")
     with pytest.raises(UsageError, match=f"{install}, and return shimmy.Gym{version}CompatibilityV0\\(env=it\\)"):
         EnvSpec.of(made).make()
+
+
+def test_an_environment_of_the_old_gym_without_seed_is_told_that_shimmy_calls_it(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = old_env(monkeypatch, seeded=False)
+    del made.seed
+    site.install("fake_old", "")
+    advice = (
+        "; it also needs a method seed(seed), as under 'Old gym environments' in docs/how-to/third_party_environments.md"
+    )
+    assert refusal("fake_old:Old-v0").endswith(f"--env-kwargs env_id fake_old:Old-v0{advice}")
+    with pytest.raises(UsageError, match=f"CompatibilityV0\\(env=it\\){re.escape(advice)}$"):
+        EnvSpec.of(made).make()
+    page = Path(__file__).parents[3] / "docs" / "how-to" / "third_party_environments.md"
+    assert "\n## Old gym environments\n" in page.read_text()
+
+
+class WithoutGym:
+    """As crafter's environment where gym is not installed: its spaces are tuples with names."""
+
+    action_space = types.SimpleNamespace(n=17)
+
+    def seed(self, seed: int) -> None: ...
+
+    def reset(self) -> int:
+        return 0
+
+    def step(self, action: int) -> tuple[int, float, bool, dict[str, Any]]:
+        return 0, 0.0, False, {}
+
+
+def test_what_does_without_gym_but_has_its_interface_is_answered_as_one_of_gym() -> None:
+    with pytest.raises(UsageError, match=r"got WithoutGym; it has the interface of the old package gym: .*GymV21Compat"):
+        EnvSpec.of(WithoutGym).make()
 
 
 # ------------------------------------------------------------------------------- observations that no policy takes

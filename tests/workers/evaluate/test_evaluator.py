@@ -356,6 +356,12 @@ def test_a_frame_is_sent_of_every_observation_up_to_a_limit(monkeypatch: pytest.
         assert sum(len(rows.reward) for rows in chunks) == answer.episodes[n].length
 
 
+def test_an_environment_without_metadata_is_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As environments of the old package gym, which shimmy wraps."""
+    monkeypatch.setattr(Echo, "metadata", None)
+    assert figures(play(Evaluator(echo_run(), Repeats()), order(5))) == [(8.0, 8)]
+
+
 def test_an_environment_that_cannot_be_filmed_is_refused() -> None:
     run = msgspec.structs.replace(echo_run(), env=EnvSpec("millrace-tests/Unseen-v0"))
     with pytest.raises(UsageError, match=r"Unseen-v0 cannot be filmed: expected it to render rgb_array, got \[\]"):
