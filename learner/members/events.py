@@ -43,6 +43,20 @@ class WorkerRefused:
 
 
 @dataclass(frozen=True)
+class NamelessHello:
+    """A Hello came over a connection without a routing id, and was refused.
+
+    Mostly nothing is wrong: a worker that was not answered for a while, or its successor of the same name, has connected
+    again, and ZeroMQ takes the routing id from the older connection, with what it had sent still unread. The newer one says
+    Hello itself. If a client sets no routing id, it learns that by the refusal.
+    """
+
+    json_name: ClassVar[str] = "nameless_hello"
+    worker: str
+    why: str
+
+
+@dataclass(frozen=True)
 class Failed:
     """A worker failed in code of the user. It may come back."""
 
@@ -105,7 +119,7 @@ class RejoinRequested:
     late: int
 
 
-Event = WorkerJoined | WorkerLeft | WorkerRefused | WorkerNotStarted | Failed | RejoinRequested
+Event = WorkerJoined | WorkerLeft | WorkerRefused | WorkerNotStarted | NamelessHello | Failed | RejoinRequested
 
 
 def describe(event: Event) -> str:
@@ -128,6 +142,11 @@ def _line(event: Event) -> str:
             return f"worker {worker} {why}{_dealt_again(tickets)}"
         case WorkerRefused(worker, why, tickets):
             return f"worker {worker} was refused: {why}{_dealt_again(tickets)}"
+        case NamelessHello(worker, why):
+            return (
+                f"worker {worker} said Hello over a connection that has no routing id: nothing is wrong if it has connected "
+                f"again; a client that sets none is refused: {why}"
+            )
         case Failed(worker, host, error, spare=spare):
             died = isinstance(event, WorkerProcessFailed) and not spare
             return f"worker {worker} ({host}): {error}" + ("; this counts as a failure of the environment" if died else "")

@@ -24,6 +24,7 @@ from learner.members.events import (
     EnvironmentRaised,
     Event,
     Failed,
+    NamelessHello,
     PolicyRaised,
     RejoinRequested,
     WorkerJoined,
@@ -305,9 +306,9 @@ class MemberServer:
     def _log_events(self, cause: bytes | None) -> None:
         told = ""  # the worker of whose failure the log has just told
         for event in self._membership.take_events():
-            line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested)
+            line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested | NamelessHello)
             match event:
-                case WorkerRefused(_, why):
+                case WorkerRefused(_, why) | NamelessHello(_, why):
                     self._last_turned_away = f"was refused: {one_line(why)}"
                 case WorkerNotStarted(_, why):
                     self._last_turned_away = why

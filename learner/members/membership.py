@@ -21,6 +21,7 @@ import msgspec
 from learner.members.events import (
     Event,
     Failed,
+    NamelessHello,
     RejoinRequested,
     WorkerJoined,
     WorkerLeft,
@@ -57,6 +58,7 @@ REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer wit
 MAX_MEMBERS = 4_096
 MOST_TAKEOVERS = 3  # of one name, by one live process from another
 MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
+NAMELESS = "its connection has no routing id: expected the worker's name, set as the socket's routing id before it connects"
 SUPERVISOR_WORD_S = 5.0  # what a supervisor said holds for this long
 
 Outgoing = tuple[bytes, ToWorker]
@@ -326,13 +328,12 @@ class Membership(Generic[M]):
 
     def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:
         """Answer a Hello. Returns the answer, and the member if one has joined by it."""
+        if not worker_name(peer):
+            self.events.append(NamelessHello(hello.worker, NAMELESS))
+            return [(peer, Refuse(NAMELESS))], None
         why = ""
         if hello.protocol != PROTOCOL_VERSION:
             why = f"protocol: expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
-        elif not worker_name(peer):  # where a newer connection takes a routing id, ZeroMQ takes it from the older one
-            why = (
-                "its connection has no routing id: the worker has connected again and needs nothing, or its client sets none"
-            )
         elif hello.worker.encode() != worker_name(peer):
             why = f"name: expected {name_for_people(peer)!r}, as in its routing id, got {hello.worker[:40]!r}"
         if why:

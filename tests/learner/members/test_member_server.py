@@ -243,6 +243,19 @@ def test_how_workers_come_and_go_is_a_warning_only_if_somebody_should_look(caplo
     assert caplog.messages == ["worker w1 (host): boom", "worker w1 failed"], "whoever raises the error shows its traceback"
 
 
+def test_what_a_connection_had_sent_that_a_newer_one_replaced_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """ZeroMQ takes the routing id from the older connection, so its Hellos are read from one without a name."""
+    caplog.set_level(logging.INFO)
+    served, hello = Served(), Hello(PROTOCOL_VERSION, "w1", "host", 1, 1, "fake", 1)
+    caplog.clear()
+    served.says(b"\0\0\0\0\1", hello)
+    assert "(the last one was refused: its connection has no routing id" in str(served.server.no_workers(2, 1.0))
+    served.says(b"w1", hello)
+    assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
+    assert "nothing is wrong if it has connected again" in caplog.messages[0]
+    assert len(served.coordinator.members) == 2
+
+
 def test_what_became_of_workers_is_said_where_one_is_missing() -> None:
     served = Served()
     served.link.keyring, served.link.refused = SimpleNamespace(allowed=()), 3

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from learner.config.validation import MOST_TICKETS
-from learner.members.events import EnvironmentRaised, Failed, PolicyRaised, WorkerJoined, WorkerLeft, WorkerRefused
+from learner.members.events import (
+    EnvironmentRaised,
+    Failed,
+    NamelessHello,
+    PolicyRaised,
+    WorkerJoined,
+    WorkerLeft,
+    WorkerRefused,
+)
 from learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_dealer import EvaluationPlan
@@ -250,11 +258,11 @@ def test_a_name_that_is_not_the_routing_id_is_refused() -> None:
     assert learner.coordinator.members == {}
 
 
-def test_what_comes_over_a_connection_that_a_newer_one_has_replaced_is_explained() -> None:
-    """ZeroMQ takes the routing id from the older connection: what it had sent is read from one without a name."""
+def test_a_hello_over_a_connection_without_a_routing_id_is_refused_with_what_a_client_must_set() -> None:
     learner = Learner()
     (refuse,) = of(learner.says(b"\0\0\0\0\1", Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
-    assert refuse.reason.startswith("its connection has no routing id: the worker has connected again and needs nothing, or")
+    assert refuse.reason.startswith("its connection has no routing id: expected the worker's name, set as the socket's")
+    assert [type(event) for event in learner.coordinator.events] == [NamelessHello]
 
 
 def test_another_protocol_is_refused_and_says_what_to_do() -> None:

@@ -48,6 +48,7 @@ EVENTS = (
     "joined",
     "left",
     "refused",
+    "nameless_hello",
     "environment_raised",
     "policy_raised",
     "asked_to_rejoin",
