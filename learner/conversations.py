@@ -21,11 +21,18 @@ from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats
+from protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, Vector, facts_of_all_seats
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import has_zstd
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.socket_options import MAX_FRAME_BYTES
+
+
+def describe_spec(
+    config: RolloutConfig, env: EnvSpec, vector: Vector = "loop", render_mode: str | None = None
+) -> DescribeSpec:
+    """What `Welcome` carries while the learner does not know its environment."""
+    return DescribeSpec(env, vector, render_mode, config.call_timeouts(), config.heartbeat_s())
 
 
 def rollout_spec(
@@ -68,6 +75,7 @@ def rollout_spec(
         takes_turns=spaces.takes_turns,
         teams=teams,
         scripted=scripted,
+        call_timeouts=config.call_timeouts(),
         heartbeat_s=config.heartbeat_s(),
     )
     _check_weights_can_be_sent(env.id, policy, config)
@@ -119,7 +127,6 @@ def open_hub(
         config.stall_timeout_s(),
         config.max_env_failures,
         config.acting_dtype,
-        config.call_timeouts(),
     )
     return Hub(link, coordinator, settings, processes, check_interrupt, observer)
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from learner.config.rollout_config import RolloutConfig
-from learner.conversations import describe_settings, open_hub
+from learner.conversations import describe_settings, describe_spec, open_hub
 from learner.members.describe import described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
@@ -29,7 +29,7 @@ from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
 from protocol.own_module import refuse_modules_in
-from protocol.specs import SCORE, ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
 RIVAL, POLICY = 0, 1
@@ -115,7 +115,7 @@ class PolicyPlayer:
         """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""
         if self._described is not None:
             return self._described
-        spec = DescribeSpec(self.policy.env.for_evaluation(), render_mode=render_mode)
+        spec = describe_spec(self._settings, self.policy.env.for_evaluation(), render_mode=render_mode)
         settings = describe_settings(self._settings)
         return described_by_workers(self._link, spec, settings, self._processes, self._check_interrupt)
 
@@ -161,6 +161,7 @@ class PolicyPlayer:
             masked=policy.masked,
             seats=policy.seats,
             takes_turns=bool(policy.seats),  # perhaps
+            call_timeouts=settings.call_timeouts(),
             heartbeat_s=settings.heartbeat_s(),
         )
         if (against := policy.against) is None:

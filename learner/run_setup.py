@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from learner.config.config import Config
-from learner.conversations import describe_settings
+from learner.conversations import describe_settings, describe_spec
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
@@ -143,10 +143,10 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
             if resume is not None and saved is not None:
                 check_spaces(resume.run, EnvSpaces.of_policy(saved.policy, saved.seats), _spaces(config, found))
 
-        described = describe(DescribeSpec(env, config.vector, heartbeat_s=config.heartbeat_s()), check_interrupt, accept)
+        described = describe(describe_spec(config, env, config.vector), check_interrupt, accept)
         evaluation = described
         if env.eval_kwargs:
-            spec = DescribeSpec(env.for_evaluation(), heartbeat_s=config.heartbeat_s())
+            spec = describe_spec(config, env.for_evaluation())
             evaluation = describe(spec, check_interrupt, lambda found: None)
             check_evaluation_spaces(config, described, evaluation)
         imports.wait(check_interrupt)

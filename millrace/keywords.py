@@ -101,11 +101,13 @@ class RolloutKeywords(TypedDict, total=False):
     local ends at once when none is left.
     """
     start_timeout_s: float
-    """A local worker process is restarted if making or resetting one env copy, or making the policy with all that it
-    imports, takes longer than this many seconds. 0: never.
+    """A worker process, wherever it was started, is restarted if making or resetting one env copy, or making the policy
+    with all that it imports, takes longer than this many seconds. 0: never.
     """
     step_timeout_s: float
-    """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
+    """A worker process, wherever it was started, is restarted if one step of an env copy takes longer than this many
+    seconds. 0: never.
+    """
     max_env_failures: int
     """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
     between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this ×

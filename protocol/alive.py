@@ -81,13 +81,16 @@ class Alive(Message, frozen=True):
     they do not"""
 
 
-@dataclass(frozen=True)
-class CallTimeouts:
-    """How many seconds one call of an env copy may take. 0: any time. The fields are named as the flags are."""
+class CallTimeouts(msgspec.Struct, frozen=True):
+    """How many seconds one call of an env copy may take before the supervisor ends its worker. 0: any time.
+
+    The fields are named as the flags are.
+    """
 
     start_s: float = 600.0
     """making or resetting it"""
     step_s: float = 600.0
+    """stepping it"""
 
     def limit_s(self, doing: Doing) -> float:
         """The limit of what a worker does; infinite if it has none."""
@@ -111,6 +114,3 @@ class CallTimeouts:
         flag = "step" if doing in ("stepping", "evaluating") else "start"
         named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
         return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"
-
-
-NO_TIMEOUTS = CallTimeouts(0.0, 0.0)

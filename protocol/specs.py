@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from protocol.alive import CallTimeouts
 from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
 from protocol.space_spec import Shape
@@ -191,6 +192,8 @@ class DescribeSpec(msgspec.Struct, frozen=True, tag=True):
     """the form that must have the same spaces as one env copy, which the worker checks"""
     render_mode: str | None = None
     """passed to the copy"""
+    call_timeouts: CallTimeouts = CallTimeouts()
+    """how long a call of the environment may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
@@ -236,6 +239,8 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """opponents that are no weights: each is a callable that makes a policy (`protocol/policy/called_policy.py`)"""
     opponent: PolicySpec | None = None
     """the policy of opponents, if it is not `policy`"""
+    call_timeouts: CallTimeouts = CallTimeouts()
+    """how long a call of the environment may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
@@ -338,6 +343,8 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     place of N, those of a copy side by side, and three more follow the observation's: `acts` and `complete` (bool), and
     `outside` (float64)
     """
+    call_timeouts: CallTimeouts = CallTimeouts()
+    """how long a call of the environment may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The caller may

@@ -23,7 +23,7 @@ from workers.conversation.connection_rules import checked_token
 from workers.flags import WorkerFlags
 from workers.shared_weights import SUPPORTED, SharedWeights
 from workers.supervise.learner_notice import AliveSender
-from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
+from workers.supervise.supervisor import Supervisor, core_flags
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 log = logging.getLogger("millrace.worker")
@@ -61,9 +61,8 @@ def _check(flags: WorkerFlags) -> None:
 
 def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
     """Run workers, each in a process of its own, and watch them here. Returns the exit code."""
-    timeouts = flags.timeouts()
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
-    passed = ["--join-timeout-s", str(flags.join_timeout_s), *timeout_flags(timeouts)]
+    passed = ["--join-timeout-s", str(flags.join_timeout_s)]
     passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "evaluate", "insecure", "no_code") if getattr(flags, flag)]
     passed += [] if flags.core is None else ["--core", str(flags.core)]
 
@@ -80,7 +79,7 @@ def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> i
     weights = SharedWeights() if SUPPORTED and flags.processes > 1 else None
     notice = AliveSender(flags.address, token, weights)
     try:
-        supervisor = Supervisor(start, flags.processes, timeouts=timeouts, stay=flags.stay)
+        supervisor = Supervisor(start, flags.processes, stay=flags.stay)
         return supervisor.run(lambda: len(signals), lambda line: log.warning("%s", line), notice)
     finally:
         notice.close()

@@ -1,9 +1,10 @@
 """What a worker does, in a page of memory that it shares with its supervisor.
 
 Rule: each number has one writer. The worker writes what it does, since when, and how many calls of the environment have
-returned; before it leaves on purpose, it writes its exit code. The supervisor only reads. So it sees what a worker does also
-while a C extension holds the worker's interpreter lock. The memory is an unlinked file that a child process inherits. Behind
-the page, the worker's stacks are written when the supervisor asks for them by a signal.
+returned; when a learner welcomes it, how long the run lets a call take; before it leaves on purpose, its exit code. The
+supervisor only reads. So it sees what a worker does also while a C extension holds the worker's interpreter lock. The memory
+is an unlinked file that a child process inherits. Behind the page, the worker's stacks are written when the supervisor asks
+for them by a signal.
 
 A worker in a thread has a page of its own that nobody shares.
 """
@@ -22,7 +23,7 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import NamedTuple, get_args
 
-from protocol.alive import Doing
+from protocol.alive import CallTimeouts, Doing
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000
@@ -30,7 +31,7 @@ STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention: write the stac
 DOINGS: tuple[Doing, ...] = get_args(Doing)
 STARTING, WAITING, DESCRIBING, MAKING, RESETTING, STEPPING, EVALUATING, CLOSING = range(len(DOINGS))
 # Places of the numbers in the page.
-DOING, SINCE_S, ENV_CALLS, LEAVES, LEAVES_SINCE_S = range(5)
+DOING, SINCE_S, ENV_CALLS, LEAVES, LEAVES_SINCE_S, START_TIMEOUT_S, STEP_TIMEOUT_S = range(7)
 MOST_CALLS = 2**53
 
 
@@ -67,6 +68,10 @@ class Activity:
         finally:
             self.end()
 
+    def limit(self, timeouts: CallTimeouts) -> None:
+        """From now on, a call of the environment may take so long. Before, it may take any time."""
+        self.seconds[START_TIMEOUT_S], self.seconds[STEP_TIMEOUT_S] = timeouts.start_s, timeouts.step_s
+
     def leave(self, exit_code: int) -> None:
         """The worker is about to leave on purpose, with this exit code."""
         self.seconds[LEAVES_SINCE_S] = perf_counter()
@@ -99,6 +104,8 @@ class Reading(NamedTuple):
     """with which the worker leaves on purpose; None if it does not"""
     leaves_for_s: float
     """seconds since it began to leave"""
+    timeouts: CallTimeouts
+    """of its run"""
 
 
 class ActivityReader:
@@ -117,6 +124,7 @@ class ActivityReader:
 
     def read(self, now: float) -> Reading:
         """What the worker does. Environment code can write to the page, so every value is made to fit its bounds."""
+        timeouts = self.timeouts()  # before what it does: a call never counts by the limits of a later run
         code = self._numbers[DOING]  # before the time: see `Activity.begin`
         doing = DOINGS[code] if 0 <= code < len(DOINGS) else "waiting"
         leaves = self._numbers[LEAVES]
@@ -126,7 +134,12 @@ class ActivityReader:
             env_calls=min(max(0, self._numbers[ENV_CALLS]), MOST_CALLS),
             exit_code=leaves - 1 if 0 < leaves <= 256 else None,
             leaves_for_s=_since(self._seconds[LEAVES_SINCE_S], now),
+            timeouts=timeouts,
         )
+
+    def timeouts(self) -> CallTimeouts:
+        """How long a call may take in the worker's run; any time before it is welcomed to one."""
+        return CallTimeouts(_limit_s(self._seconds[START_TIMEOUT_S]), _limit_s(self._seconds[STEP_TIMEOUT_S]))
 
     def stacks(self) -> str:
         """The stacks of the worker's threads, if it has written them."""
@@ -141,6 +154,10 @@ class ActivityReader:
 
 def _since(then: float, now: float) -> float:
     return min(max(0.0, now - then), 1e9) if math.isfinite(then) else 0.0
+
+
+def _limit_s(seconds: float) -> float:
+    return seconds if 0.0 < seconds < math.inf else 0.0
 
 
 def _anonymous_file() -> int:

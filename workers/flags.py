@@ -9,7 +9,6 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from protocol.alive import CallTimeouts
 from protocol.flags.fields import Flag, NotNegative
 
 SecondsFlag = Annotated[NotNegative, Flag("S")]
@@ -43,12 +42,6 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     """leave when no learner has answered for S seconds (with --stay: never); a worker that had joined waits for its learner
     to come back, 600 s or S if that is longer
     """
-    start_timeout_s: SecondsFlag = 600.0
-    """end and restart a worker if making or resetting one env copy, or making the policy, takes longer than S seconds; 0: no
-    limit
-    """
-    step_timeout_s: SecondsFlag = 600.0
-    """end and restart a worker if a step takes longer than S seconds; 0: no limit"""
 
     parent: Annotated[int, HIDDEN] = 0
     """be a worker; leave when it is not the parent"""
@@ -67,7 +60,3 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     def called(self) -> str:
         """The name of this worker."""
         return self.name or f"{socket.gethostname()}-{os.getpid()}"
-
-    def timeouts(self) -> CallTimeouts:
-        """How long a call of an env copy may take."""
-        return CallTimeouts(self.start_timeout_s, self.step_timeout_s)

@@ -8,7 +8,6 @@ supervisor reads: an end without that is a failure.
 from __future__ import annotations
 
 import errno
-import math
 import os
 import signal
 import socket
@@ -23,7 +22,7 @@ from protocol.errors import UserFacingError
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.worker_link import WorkerLink
-from workers.activity import Activity, activity, share_activity
+from workers.activity import Activity, ActivityReader, activity, share_activity
 from workers.conversation.connection_rules import wait_limits_s
 from workers.conversation.session import NO_LEARNER, Session
 from workers.exit_codes import EXIT_NO_LEARNER
@@ -56,8 +55,8 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
         raise
     if flags.core is not None:
         os.sched_setaffinity(0, {flags.core})
-    longest_s = flags.timeouts().longest_s()
-    watchdog = Watchdog(longest_s + AFTER_SUPERVISOR_S) if math.isfinite(longest_s) else None
+    page = ActivityReader(activity())
+    watchdog = Watchdog(lambda: page.timeouts().longest_s() + AFTER_SUPERVISOR_S)
     threading.Thread(target=_end_after_supervisor, args=(flags.parent, flags.address), daemon=True).start()
     join_timeout_s, rejoin_timeout_s = wait_limits_s(flags.join_timeout_s, stay=flags.stay)
     session = Session(
@@ -69,14 +68,13 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
     options = WorkerOptions(
         code=AllowedCode.REGISTERED if flags.no_code else allowed_code(flags.address, token),
         stop_requests=lambda: LEAVE_AT_ONCE if parent_is_gone(flags.parent) else len(signals),
-        feed_watchdog=watchdog.feed if watchdog else lambda now: None,
+        feed_watchdog=watchdog.feed,
         shared_memory=InheritedDescriptors(*map(int, flags.handed.split(","))) if flags.handed else None,
         shared_weights=SharedWeightsReader(*map(int, flags.weights.split(","))) if flags.weights else None,
         exit_code=_exit_code,
     )
     left = Worker(link, session, options).run()
-    if watchdog:
-        watchdog.stop()
+    watchdog.stop()
     if left.exit_code:
         sys.stderr.write(f"worker {flags.called}: {_explained(left.reason, link)}\n")
     if parent_is_gone(flags.parent):

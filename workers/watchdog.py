@@ -1,16 +1,18 @@
 """Ends a process whose environment hangs, even if it hangs in C code and holds the interpreter's lock.
 
-Rule: when nobody calls `feed` for `timeout_s`, the process writes the stack of each of its threads to stderr and exits at
-once with exit code 1. Its supervisor ends it before that, unless the supervisor is dead or the worker hangs in our own code.
-The timer is a C thread of Python's faulthandler, which does not need the interpreter's lock. Setting it takes about 50 µs,
-so `feed` does so only now and then.
+Rule: when nobody calls `feed` for as long as the run allows, the process writes the stack of each of its threads to stderr
+and exits at once with exit code 1. Its supervisor ends it before that, unless the supervisor is dead or the worker hangs in
+our own code. The timer is a C thread of Python's faulthandler, which does not need the interpreter's lock. Setting it takes
+about 50 µs, so `feed` does so only now and then.
 """
 
 from __future__ import annotations
 
 import faulthandler
+import math
 import re
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
 
 FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
@@ -24,16 +26,23 @@ INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-p
 class Watchdog:
     """A watchdog timer. One for each process, because faulthandler has only one timer."""
 
-    def __init__(self, timeout_s: float) -> None:
-        self._timeout_s = min(timeout_s, LONGEST_S)
-        self._interval_s = min(1.0, timeout_s / 4)
-        self._due_s = -self._interval_s
+    def __init__(self, timeout_s: Callable[[], float]) -> None:
+        """`timeout_s`: after how long it ends the process, which is another time in another run; infinity: never."""
+        self._timeout_s = timeout_s
+        self._set_to_s = math.inf
+        self._due_s = -math.inf
 
     def feed(self, now: float) -> None:
-        """Restart the timer: an env step has ended, messages were read, or there was nothing to do."""
-        if now >= self._due_s:
-            self._due_s = now + self._interval_s
-            faulthandler.dump_traceback_later(self._timeout_s + self._interval_s, exit=True)
+        """Restart the timer: a run or an env step begins, messages were read, or there was nothing to do."""
+        timeout_s = self._timeout_s()
+        if now < self._due_s and timeout_s == self._set_to_s:
+            return
+        interval_s = min(1.0, timeout_s / 4)
+        self._set_to_s, self._due_s = timeout_s, now + interval_s
+        if timeout_s == math.inf:
+            self.stop()
+        else:
+            faulthandler.dump_traceback_later(min(timeout_s, LONGEST_S) + interval_s, exit=True)
 
     def stop(self) -> None:
         """Stop the timer."""

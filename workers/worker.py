@@ -342,6 +342,8 @@ class Worker:
     def _start_session(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
         """Make a new collector or stepper; nothing of the old one is kept."""
         activity().begin(WAITING)
+        activity().limit(run.call_timeouts)
+        self._options.feed_watchdog(self._clock())
         self._close_all()
         self._update_statistics()
         self._earlier = self._statistics

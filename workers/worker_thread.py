@@ -9,7 +9,7 @@ from typing import Any
 
 import zmq
 
-from protocol.alive import CallTimeouts, WorkerActivity
+from protocol.alive import WorkerActivity
 from protocol.bounds import one_line
 from protocol.env_spec import AllowedCode
 from protocol.wire.worker_link import WorkerLink
@@ -71,7 +71,7 @@ class WorkerThread:
         """Nothing: a thread writes to this process's stderr."""
         return ""
 
-    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
+    def enforce(self, now: float) -> None:
         """Nothing: a thread cannot be ended from outside."""
 
     def lower_priority(self) -> None:

@@ -32,7 +32,6 @@ from learner.rollouts.waiting import LearnerTime
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
 from protocol.address import name_for_people, worker_name
-from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array, Floats
 from protocol.bounds import Stages, one_line
 from protocol.errors import BadRollout, Stalled
@@ -61,8 +60,6 @@ class HubSettings:
     """How many failures the run survives, as `FailureCount` counts them."""
     acting_dtype: ActingDtype = "float32"
     """Dtype in which parameters are sent."""
-    call_timeouts: CallTimeouts = NO_TIMEOUTS
-    """How long a call of the environment may take; its supervisor ends a worker that exceeds it."""
 
 
 class HubSnapshot(NamedTuple):
@@ -133,7 +130,7 @@ class Hub:
         self._progress = Progress()
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
-        self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
+        self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, run.call_timeouts)
         callbacks = ServerCallbacks(self._answer, self.status, self._count_failure)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)

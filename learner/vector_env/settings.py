@@ -13,6 +13,7 @@ from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
 from learner.members.bind_settings import BindSettings
+from protocol.alive import CallTimeouts
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
@@ -40,6 +41,8 @@ class VectorEnvSettings:
     timeout_s: float = 60.0
     worker_timeout_s: float = 5.0
     """A worker elsewhere is lost if it is silent for this long while the learner listens."""
+    call_timeouts: CallTimeouts = field(default_factory=CallTimeouts)
+    """How long a call of the environment may take before its worker is ended."""
     max_env_failures: int = 3
     """Number of deaths of workers in the environment's code that `make_vec` survives, as `FailureCount` counts them."""
     copy: bool = True

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_differing_spaces, batch_space
 
 from learner.vector_env.settings import ObservationMode, VectorEnvSettings
+from protocol.alive import CallTimeouts
 from protocol.env_spec import EnvSpec, PickledCallable
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import leaves_with_own_dtype
@@ -50,6 +51,7 @@ class RequestedCopies:
     """how many copies each lane has"""
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     render_mode: str | None
+    call_timeouts: CallTimeouts
     learner_timeout_s: float
     evaluation_copies: int
     """so many of the last copies play evaluations"""
@@ -57,7 +59,12 @@ class RequestedCopies:
     @property
     def to_describe(self) -> DescribeSpec:
         """The environment that a worker describes: that of the first copy. All copies must have the same spaces."""
-        return DescribeSpec(self.envs[0], render_mode=self.render_mode, learner_timeout_s=self.learner_timeout_s)
+        return DescribeSpec(
+            self.envs[0],
+            render_mode=self.render_mode,
+            call_timeouts=self.call_timeouts,
+            learner_timeout_s=self.learner_timeout_s,
+        )
 
     def description(self, env: DescribedEnv) -> VectorEnvDescription:
         """The vector environment of these copies. Raises `UsageError` for spaces that are not supported."""
@@ -69,6 +76,7 @@ class RequestedCopies:
             action=_action_leaves(env.action_space),
             autoreset=self.autoreset,
             render_mode=self.render_mode,
+            call_timeouts=self.call_timeouts,
             learner_timeout_s=self.learner_timeout_s,
             evaluation_copies=self.evaluation_copies,
             seats=env.seats,
@@ -109,6 +117,7 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
         lanes=settings.lane_sizes,
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,
+        call_timeouts=settings.call_timeouts,
         learner_timeout_s=learner_timeout_s,
         evaluation_copies=N if settings.evaluates else settings.single_lanes,
     )

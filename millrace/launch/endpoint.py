@@ -15,7 +15,6 @@ from learner.members.bind_settings import BindSettings
 from learner.members.bound import Bound, bind, listen
 from learner.members.process_callbacks import ProcessCallbacks
 from millrace.launch.local_worker_options import FlagsOfWorker, private_address, temporary_keys
-from protocol.alive import CallTimeouts
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
 from workers.slots import copies_per_machine
@@ -45,7 +44,6 @@ class Endpoint(Bound):
         self,
         count: int,
         flags: FlagsOfWorker,
-        timeouts: CallTimeouts,
         stop_within_s: float = STOP_WITHIN_S,
         handed: Callable[[str], InheritedDescriptors | None] = lambda name: None,
         evaluating: int = 0,
@@ -55,8 +53,8 @@ class Endpoint(Bound):
         The last `evaluating` of them only evaluate.
 
         A worker is a thread if the address is inproc, else a process. `flags` and `handed`: its flags and log, and the file
-        descriptors that it inherits, by its name. `timeouts`: of a call of the environment. At the end, workers that still
-        run are asked to leave, and killed after `stop_within_s`.
+        descriptors that it inherits, by its name. At the end, workers that still run are asked to leave, and killed after
+        `stop_within_s`.
         """
 
         def evaluates(name: str) -> bool:
@@ -79,7 +77,7 @@ class Endpoint(Bound):
         if self.where.bind:
             count = 0
             self.announce(self.where.advertise)
-        supervisor = Supervisor(start, count, timeouts=timeouts)
+        supervisor = Supervisor(start, count)
         processes = ProcessCallbacks(
             supervisor.poll,
             supervisor.activities,

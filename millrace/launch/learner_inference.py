@@ -55,7 +55,7 @@ def train(
         listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
         folder = opened_folder(config, resume, stack)
-        started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
+        started = listening.start(worker_flags(config, folder.path))
 
         def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:
             return started.describe(describe_settings(config, config.steps), check_interrupt, accept, spec.env)
@@ -92,6 +92,7 @@ def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSett
         transport=config.transport,
         timeout_s=_longest_order_s(config),
         worker_timeout_s=config.worker_timeout_s,
+        call_timeouts=config.call_timeouts(),
         copy=False,
         single_lanes=config.eval_copies,
     )

@@ -21,7 +21,7 @@ from learner.run_folder.regular_files import open_regular, reason, subfolder
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
-from workers.supervise.supervisor import Supervisor, core_flags, timeout_flags
+from workers.supervise.supervisor import Supervisor, core_flags
 
 LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing
@@ -76,10 +76,10 @@ def worker_flags(config: Config, run: Path) -> FlagsOfWorker:
             os.close(open_regular(log))
     except OSError as error:
         raise UsageError(f"{error.filename}: {reason(error)}; the workers' logs go there: remove it") from error
-    cores, timeouts = [] if config.eval_workers else worker_cores(config), timeout_flags(config.call_timeouts())
+    cores = [] if config.eval_workers else worker_cores(config)
 
     def flags(name: str) -> tuple[list[str], Path]:
-        return [*timeouts, *core_flags(cores, name)], logs / f"{name}.log"
+        return core_flags(cores, name), logs / f"{name}.log"
 
     return flags
 

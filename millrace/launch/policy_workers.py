@@ -77,7 +77,7 @@ def _player(
 ) -> PolicyPlayer:
     """A player whose workers act."""
     endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
-    started = endpoint.workers(which.workers, _own_logs(which, stack), which.settings.call_timeouts(), 2.0)
+    started = endpoint.workers(which.workers, _own_logs(which, stack), 2.0)
     _, processes = stack.enter_context(started)
     return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
 
@@ -101,10 +101,11 @@ def _acting_player(
         which.transport,
         timeout_s=NEVER_S,
         worker_timeout_s=settings.worker_timeout_s,
+        call_timeouts=settings.call_timeouts(),
         copy=False,
         evaluates=True,
     )
-    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(which, stack), settings.call_timeouts())
+    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(which, stack))
     described = started.describe(describe_settings(settings), check_interrupt)
     env = started.vector_env(described)
     stack.callback(env.close)

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import workers_to_wait_for
-from learner.conversations import describe_settings, open_hub, rollout_spec
+from learner.conversations import describe_settings, describe_spec, open_hub, rollout_spec
 from learner.env_spaces import EnvSpaces
 from learner.members.bind_settings import BindSettings
 from learner.members.describe import described_by_workers
@@ -22,8 +22,8 @@ from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
-from protocol.specs import DescribeSpec, RunSpec
-from workers.supervise.supervisor import core_flags, timeout_flags
+from protocol.specs import RunSpec
+from workers.supervise.supervisor import core_flags
 
 
 def start(
@@ -46,14 +46,14 @@ def start(
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
     link = endpoint.link
-    cores, timeouts = [] if listens else worker_cores(config), config.call_timeouts()
+    cores = [] if listens else worker_cores(config)
 
     def flags(name: str) -> tuple[list[str], None]:
-        return [*timeout_flags(timeouts), *core_flags(cores, name)], None
+        return core_flags(cores, name), None
 
-    supervisor, processes = resources.enter_context(endpoint.workers(config.workers, flags, timeouts))
+    supervisor, processes = resources.enter_context(endpoint.workers(config.workers, flags))
     with stopped_on_error(supervisor):
-        spec = DescribeSpec(env, config.vector, heartbeat_s=config.heartbeat_s())
+        spec = describe_spec(config, env, config.vector)
         described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
         spaces = EnvSpaces.of_description(described, config.action_masks)
         policy_spec = policy.spec(spaces.observation, spaces.action)

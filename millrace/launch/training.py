@@ -66,8 +66,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
             folder = folder or opened_folder(config, None, stack)
             if config.transport != "inproc":
                 flags = worker_flags(config, folder.path)
-        count, timeouts = config.workers + config.eval_workers, config.call_timeouts()
-        started = endpoint.workers(count, flags, timeouts, evaluating=config.eval_workers)
+        started = endpoint.workers(config.workers + config.eval_workers, flags, evaluating=config.eval_workers)
         supervisor, processes = stack.enter_context(started)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))

@@ -29,7 +29,7 @@ from learner.vector_env.spec import RequestedCopies, observation_spaces, request
 from learner.vector_env.step_hub import StepHub
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
-from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker
+from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker, no_flags
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
 from protocol.env_spec import EnvLike, EnvSpec
@@ -39,7 +39,6 @@ from protocol.errors import UsageError
 from protocol.machine.cpu_cores import usable_cores
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
-from workers.supervise.supervisor import timeout_flags
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
@@ -135,6 +134,7 @@ def make_vec(
         observation_mode=observation_mode,
         on_worker_loss=on_worker_loss,
         timeout_s=timeout,
+        call_timeouts=_call_timeouts(timeout),
         max_env_failures=max_env_failures,
         copy=copy,
         render_mode=render_mode,
@@ -149,8 +149,6 @@ def make_vec(
         if line := deaths.count(event, time.monotonic()):
             logging.getLogger("millrace.learner").warning("%s", line)
 
-    timeouts = _call_timeouts(settings.timeout_s)
-    flags = timeout_flags(timeouts)
     local_workers = settings.local_workers
     join_timeout_s = JOIN_TIMEOUT_S if local_workers else settings.timeout_s
     describe = DescribeSettings(
@@ -161,7 +159,7 @@ def make_vec(
     )
     resources = ExitStack()
     try:
-        started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
+        started = listen(settings, resources).start(no_flags)
         made = started.vector_env(started.describe(describe))
         made.hub.on_death = died
         made.hub.while_waiting = deaths.check
@@ -203,10 +201,10 @@ class ListeningVectorEnv:
     """For local workers only."""
     resources: ExitStack
 
-    def start(self, flags: FlagsOfWorker, timeouts: CallTimeouts) -> StartedVectorEnv:
-        """Start the local workers with these flags. `timeouts`: of a call of the environment. Call it once."""
+    def start(self, flags: FlagsOfWorker) -> StartedVectorEnv:
+        """Start the local workers with these flags. Call it once."""
         # They are stopped at once if there will be no hub to close.
-        started = self.endpoint.workers(self.settings.local_workers, flags, timeouts, LEAVE_AT_ONCE_S, self._handed)
+        started = self.endpoint.workers(self.settings.local_workers, flags, LEAVE_AT_ONCE_S, self._handed)
         return StartedVectorEnv(self, self.resources.enter_context(started))
 
     def _handed(self, worker: str) -> InheritedDescriptors | None:
@@ -287,10 +285,10 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
 
 
 def _call_timeouts(timeout_s: float) -> CallTimeouts:
-    """How long a call of the environment may take before its local worker is ended.
+    """How long a call of the environment may take before its worker is ended.
 
-    This is longer than `timeout_s`, after which the learner kills the worker. So it matters only if the learner does not
-    wait.
+    This is longer than `timeout_s`, after which the learner gives the worker up, and kills it if it is local. So it matters
+    only for a worker elsewhere, and if the learner does not wait.
     """
     seconds = max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
     return CallTimeouts(seconds, seconds)

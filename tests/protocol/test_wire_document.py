@@ -23,7 +23,7 @@ import pytest
 from learner.members import join_limiter, membership
 from learner.members import member_states as standing
 from learner.rollouts import ticket_coordinator
-from protocol import bounds, env_spec, messages, rollout, space_spec, specs
+from protocol import alive, bounds, env_spec, messages, rollout, space_spec, specs
 from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from protocol.wire import codec, socket_options
@@ -47,6 +47,7 @@ RECORDS: tuple[type, ...] = (
     specs.DescribeSpec,
     specs.RunSpec,
     specs.StepSpec,
+    alive.CallTimeouts,
     specs.ExtraArray,
     env_spec.EnvSpec,
     specs.PolicySpec,

@@ -9,7 +9,17 @@ import gymnasium
 import pytest
 
 from protocol.alive import CallTimeouts
-from workers.activity import DOING, ENV_CALLS, SINCE_S, Activity, ActivityReader, activity, share_activity
+from workers.activity import (
+    DOING,
+    ENV_CALLS,
+    SINCE_S,
+    START_TIMEOUT_S,
+    STEP_TIMEOUT_S,
+    Activity,
+    ActivityReader,
+    activity,
+    share_activity,
+)
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
@@ -87,6 +97,18 @@ def test_whatever_environment_code_writes_to_the_page_fits_the_message() -> None
         read = reader.read(1.0)
         assert (read.doing, read.for_s) == ("waiting", 0.0)
         assert 0 <= read.env_calls <= 2**53
+    for limit_s in (-1.0, math.nan, math.inf, -math.inf):
+        page.seconds[START_TIMEOUT_S] = page.seconds[STEP_TIMEOUT_S] = limit_s
+        assert reader.read(1.0).timeouts == CallTimeouts(0.0, 0.0)
+
+
+def test_calls_have_no_limit_until_a_run_says_one_and_then_that_of_the_last_run() -> None:
+    page = Activity()
+    reader = ActivityReader(page)
+    assert reader.read(1.0).timeouts == CallTimeouts(0.0, 0.0)
+    for timeouts in (CallTimeouts(2.0, 3.0), CallTimeouts(0.0, 0.5)):
+        page.limit(timeouts)
+        assert reader.read(1.0).timeouts == timeouts
 
 
 def test_only_a_worker_that_says_so_leaves_on_purpose() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import math
 import socket
 import subprocess
@@ -21,7 +22,7 @@ def step():
     {hang}
 
 threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
-watchdog = Watchdog({timeout_s})
+watchdog = Watchdog(lambda: {timeout_s})
 watchdog.feed(time.monotonic())
 step()
 watchdog.stop()
@@ -77,7 +78,21 @@ def test_the_line_is_the_newest_of_the_users_own_code(newest_first: list[str], w
     assert deepest_frame(f"{other}\nCurrent thread 0x2 (most recent call first):\n{stack}\n") == f"{where}:7, in call"
 
 
-def test_a_time_that_is_longer_than_any_timer_is_no_error() -> None:
-    watchdog = Watchdog(math.inf)
+@pytest.mark.parametrize("timeout_s", [math.inf, 1e300])
+def test_a_time_that_is_longer_than_any_timer_is_no_error(timeout_s: float) -> None:
+    watchdog = Watchdog(lambda: timeout_s)
     watchdog.feed(0.0)
     watchdog.stop()
+
+
+def test_the_timer_is_set_at_once_when_another_run_allows_another_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker that no run has welcomed may wait for ever; the first thing that a run asks for may hang."""
+    timers: list[float] = []
+    monkeypatch.setattr(faulthandler, "dump_traceback_later", lambda timeout_s, exit: timers.append(timeout_s))
+    monkeypatch.setattr(faulthandler, "cancel_dump_traceback_later", lambda: timers.append(math.inf))
+    allowed_s = [math.inf, 100.0, 100.0, 8.0, math.inf]
+    watchdog = Watchdog(lambda: allowed_s[0])
+    while allowed_s:
+        watchdog.feed(0.0)
+        allowed_s.pop(0)
+    assert timers == [math.inf, 101.0, 9.0, math.inf]

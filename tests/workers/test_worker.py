@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.alive import NO_ENVIRONMENT_CODE, NO_SLOT
+from protocol.alive import NO_ENVIRONMENT_CODE, NO_SLOT, CallTimeouts
 from protocol.arrays import Array
 from protocol.messages import (
     Collect,
@@ -23,6 +23,7 @@ from protocol.messages import (
     Inquire,
     Permit,
     Received,
+    Rejoin,
     Rollout,
     ToLearner,
     ToWorker,
@@ -216,6 +217,23 @@ def test_a_worker_that_makes_its_policy_is_not_silent() -> None:
     Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run()
     assert doing == ["making"]
     assert "making" not in NO_ENVIRONMENT_CODE
+
+
+def test_calls_may_take_as_long_as_the_newest_run_lets_them_before_any_of_its_environments_is_made() -> None:
+    """The learner was started again with other timeouts: the worker joins it again, in the same process."""
+    limits, watched = list[CallTimeouts](), list[CallTimeouts]()
+    page = ActivityReader(activity())
+
+    def note_limits(run: RunSpec) -> tuple[Collector, Evaluator]:
+        assert page.read(0.0).timeouts == watched[-1], "the watchdog does not know them yet"
+        limits.append(watched[-1])
+        return make_local_actors(run)
+
+    runs = [msgspec.structs.replace(RUN, call_timeouts=CallTimeouts(each, 2 * each)) for each in (7.0, 3.0)]
+    link = FakeLink([Welcome(1, 1, runs[0]), Rejoin(1), Welcome(2, 2, runs[1]), Drain("done")])
+    options = WorkerOptions(make_actors=note_limits, feed_watchdog=lambda now: watched.append(page.read(0.0).timeouts))
+    assert work(link, options).exit_code == 0
+    assert limits == [CallTimeouts(7.0, 14.0), CallTimeouts(3.0, 6.0)]
 
 
 def log_prob_under(parameters: Array, lane: int = 0) -> object:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from protocol.alive import NO_TIMEOUTS, CallTimeouts, StartFailed, WorkerActivity, WorkerExit
+from protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from protocol.bounds import one_line
 from protocol.errors import UsageError
 from workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
@@ -64,8 +64,8 @@ class Running(Protocol):
         """The last line that it wrote to a log of its own; empty if it has written nothing, or has no log."""
         ...
 
-    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
-        """End it if a call of its environment takes too long."""
+    def enforce(self, now: float) -> None:
+        """End it if a call of its environment takes longer than its run allows."""
         ...
 
     def lower_priority(self) -> None:
@@ -121,15 +121,13 @@ class Supervisor:
         clock: Callable[[], float] = time.monotonic,
         *,
         prefix: str = "w",
-        timeouts: CallTimeouts = NO_TIMEOUTS,
         stay: bool = False,
     ) -> None:
         """`start` starts the worker of a name; the names are `prefix` and a number.
 
-        `timeouts`: how long a call of the environment may take before the worker's process is killed. `stay`: they serve one
-        run after another.
+        `stay`: they serve one run after another.
         """
-        self._start, self._clock, self._timeouts, self._stay = start, clock, timeouts, stay
+        self._start, self._clock, self._stay = start, clock, stay
         self._stopping = False
         self._low_priority = False
         self._enforce_due_s = 0.0
@@ -155,7 +153,7 @@ class Supervisor:
             self._enforce_due_s = now + ENFORCE_EVERY_S
         for worker in self._workers:
             if worker.running is not None and enforce:
-                worker.running.enforce(self._timeouts, now)
+                worker.running.enforce(now)
             if worker.running is not None and (end := worker.running.ended()) is not None:
                 nonce = worker.running.process_nonce
                 self._record_end(worker, end, now)
@@ -301,8 +299,3 @@ class Supervisor:
 def core_flags(cores: Sequence[int], name: str) -> list[str]:
     """Flags of `python -m workers` that pin worker w0, w1, … to one of these cores, in turn. None if there are no cores."""
     return ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
-
-
-def timeout_flags(timeouts: CallTimeouts) -> list[str]:
-    """The flags that say these timeouts."""
-    return ["--start-timeout-s", str(timeouts.start_s), "--step-timeout-s", str(timeouts.step_s)]

@@ -2,8 +2,8 @@
 
 Rule: the worker has a session of its own. When the worker has ended, whatever its environment started in that session is
 killed; the slots of its env copies are free when all of it is gone, because this process holds them too. If a call of the
-environment takes too long, the worker writes its stacks and is killed. A worker that leaves on purpose says so beforehand:
-any other end is not on purpose, whatever the exit code.
+environment takes longer than its run allows, the worker writes its stacks and is killed. A worker that leaves on purpose
+says so beforehand: any other end is not on purpose, whatever the exit code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from protocol.alive import CALLS, NO_ENVIRONMENT_CODE, CallTimeouts, WorkerActivity
+from protocol.alive import CALLS, NO_ENVIRONMENT_CODE, WorkerActivity
 from protocol.bounds import escaped, one_line
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
@@ -138,8 +138,8 @@ class WorkerProcess:
         """The last line of its log that it wrote itself; empty if it has none."""
         return one_line("".join(self._output().strip().splitlines()[-1:]))
 
-    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
-        """End it if a call of its environment takes too long, or if it does not end although it leaves."""
+    def enforce(self, now: float) -> None:
+        """End it if a call of its environment takes longer than its run allows, or if it does not end although it leaves."""
         if not self._runs():
             return
         touch(self._slots)
@@ -150,8 +150,8 @@ class WorkerProcess:
             if page.exit_code is not None:
                 if page.leaves_for_s > CLOSE_WITHIN_S:
                     self.kill()
-            elif page.for_s > timeouts.limit_s(page.doing):
-                self._because, self._kill_at_s = timeouts.reason(page.doing), now + WRITE_STACKS_S
+            elif page.for_s > page.timeouts.limit_s(page.doing):
+                self._because, self._kill_at_s = page.timeouts.reason(page.doing), now + WRITE_STACKS_S
                 if STACK_SIGNAL is not None:
                     self._process.send_signal(STACK_SIGNAL)
 

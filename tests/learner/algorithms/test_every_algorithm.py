@@ -126,9 +126,7 @@ def test_every_env_step_counts_also_where_all_seats_wait(name: str) -> None:
     whole = batch(algorithm, 0)
     resets = np.zeros((T + 1, whole.valid.shape[1]), bool)
     waits = np.zeros_like(whole.valid)
-    algorithm.update(
-        msgspec.structs.replace(whole, valid=waits, terminated=waits, truncated=waits, resets=resets), no_pulse
-    )
+    algorithm.update(msgspec.structs.replace(whole, valid=waits, terminated=waits, truncated=waits, resets=resets), no_pulse)
     assert algorithm.env_steps == whole.valid.size
 
 

@@ -96,6 +96,6 @@ def test_the_record_of_settings_has_the_defaults_of_make_vec() -> None:
     public = {name: parameter.default for name, parameter in inspect.signature(millrace.make_vec).parameters.items()}
     record = {field.name: field.default for field in dataclasses.fields(VectorEnvSettings)}
     assert record.pop("timeout_s") == public["timeout"]
-    of_runs = {"single_lanes", "evaluates", "worker_timeout_s"}
+    of_runs = {"single_lanes", "evaluates", "worker_timeout_s", "call_timeouts"}
     for name in record.keys() - {"env", "listen", "kwargs"} - of_runs:
         assert record[name] == public[name], name

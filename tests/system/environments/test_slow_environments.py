@@ -88,7 +88,7 @@ def test_a_step_that_hangs_ends_by_the_step_timeout_and_is_named(stage: Stage, k
     else:
         address = f"tcp://127.0.0.1:{free_port()}"
         learner = stage.learner(address, {**SMALL, **settings}, env=env)
-        stage.worker(address, "w0", "--step-timeout-s", "3")
+        stage.worker(address, "w0")
     learner.until(lambda row: row["ledger/lost"] > 0, START_S, "an update with tickets dealt again")
     within(f"a step that hangs, {kind}", time.time() - once.stat().st_mtime, 3 + 1 + 1.5)  # + the restart of its worker
     learner.hears(

@@ -212,15 +212,17 @@ def test_training_goes_on_after_an_environment_raised(stage: Stage) -> None:
 
 
 def test_training_goes_on_after_an_environment_hung(stage: Stage) -> None:
-    """The worker's supervisor says that it is alive, and ends it when the step timeout has passed."""
+    """The worker's supervisor says that it is alive, and ends it when the run's step timeout has passed: the run's alone."""
     address = f"tcp://127.0.0.1:{free_port()}"
     began = stage.tmp_path / "hung"
-    settings = {"min-workers": 2, "env-kwargs": f"once {began} after 300"}
+    settings = {"min-workers": 2, "env-kwargs": f"once {began} after 300", "step-timeout-s": 1.5}
     learner = stage.learner(address, settings, env="workers.envs.toy:Hangs-v0")
-    workers = [stage.worker(address, f"w{number}", "--step-timeout-s", "3") for number in range(2)]
+    workers = [stage.worker(address, f"w{number}") for number in range(2)]
     learner.until(lambda row: row["ledger/lost"] > 0, START_S, "an update with tickets dealt again")
-    within("env.step hung, step timeout 3 s", time.time() - began.stat().st_mtime, 3 + 1)
-    learner.hears(r"its process was ended: a step of its environment took longer than 3 s \(--step-timeout-s\), at .*toy.py")
+    within("env.step hung, step timeout 1.5 s", time.time() - began.stat().st_mtime, 1.5 + 1)
+    learner.hears(
+        r"its process was ended: a step of its environment took longer than 1.5 s \(--step-timeout-s\), at .*toy.py"
+    )
     assert "silent" not in learner.said()
     assert any("toy.py" in worker.said() for worker in workers), "it does not say where it hung"
     learner.trains()

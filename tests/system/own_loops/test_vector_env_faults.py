@@ -24,6 +24,8 @@ from gymnasium.vector import AutoresetMode
 import millrace
 from learner.vector_env import settings
 from learner.vector_env.env import ZmqVectorEnv
+from millrace.launch import vector
+from protocol.alive import CallTimeouts
 from protocol.env_spec import EnvLike
 from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
@@ -481,8 +483,11 @@ def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -
     assert elsewhere.started[0].process.wait(10) == 2
 
 
-def test_a_worker_whose_step_hangs_ends_itself_and_another_gets_its_lane(elsewhere: Elsewhere, tmp_path: Path) -> None:
-    elsewhere.start("h", "--processes", "2", "--step-timeout-s", "3")
+def test_a_worker_whose_step_hangs_is_ended_and_another_gets_its_lane(
+    elsewhere: Elsewhere, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vector, "_call_timeouts", lambda timeout_s: CallTimeouts(60.0, 3.0))
+    elsewhere.start("h", "--processes", "2")
     with make("workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
               timeout=60.0) as env:  # fmt: skip
         env.reset(seed=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from protocol.alive import CallTimeouts, Doing, StartFailed, WorkerActivity, WorkerExit
+from protocol.alive import Doing, StartFailed, WorkerActivity, WorkerExit
 from workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
 from workers.supervise.ending import Ending
 from workers.supervise.supervisor import (
@@ -47,7 +47,7 @@ class FakeRunning:
     def activity(self, now: float) -> WorkerActivity | None:
         return WorkerActivity(self.name, NONCE, self.doing, now - self.since_s, 0) if self.end is None else None
 
-    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
+    def enforce(self, now: float) -> None:
         self.enforced.append(now)
 
     def lower_priority(self) -> None:

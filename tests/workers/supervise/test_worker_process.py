@@ -16,9 +16,10 @@ from typing import Any
 
 import pytest
 
+from protocol.alive import CallTimeouts
 from protocol.keys.key_folder import TOKEN_VARIABLE
-from workers import program
-from workers.activity import ENV_CALLS, ActivityReader
+from workers import activity, program
+from workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
 from workers.supervise import worker_process
 from workers.supervise.ending import Ending
 from workers.supervise.worker_process import MOST_LAST_LINES, WorkerCommand, WorkerProcess
@@ -128,6 +129,32 @@ def test_a_worker_gets_the_token_that_its_supervisor_gives_it_and_no_other(monke
     ending = ending_of(f"exit ${{#{TOKEN_VARIABLE}}}", monkeypatch)
     assert ending is not None
     assert ending.code == 0, "the length of the token"
+
+
+def test_a_call_is_ended_by_the_timeout_that_the_run_of_its_worker_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page is all that the supervisor knows of the run."""
+    monkeypatch.setattr(
+        worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", "exec sleep 60"], **how)
+    )
+    monkeypatch.setattr(worker_process, "WRITE_STACKS_S", 0.0)
+    for module in (worker_process, activity):  # this process writes to the page as the worker would
+        monkeypatch.setattr(module, "STACK_SIGNAL", None)
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    try:
+        page = Activity(os.dup(worker._page.fd))
+        page.begin(STEPPING)
+        began_s = page.seconds[SINCE_S]
+        for limit_s, after_s, ends in ((0.0, 1e6, False), (30.0, 29.0, False), (30.0, 31.0, True)):
+            page.limit(CallTimeouts(1.0, limit_s))
+            for _ in range(2):
+                worker.enforce(began_s + after_s)
+            assert (worker._because != "") == ends
+    finally:
+        worker.wait(0.0 if not worker._because else WITHIN_S)
+    ending = worker.ended()
+    assert ending is not None
+    assert ending.reason == "was ended: a step of its environment took longer than 30 s (--step-timeout-s)"
+    assert ending.failed
 
 
 def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatch: pytest.MonkeyPatch) -> None:
