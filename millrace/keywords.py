@@ -94,7 +94,7 @@ class RolloutKeywords(TypedDict, total=False):
     """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
     worker_timeout_s: float
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
-    is not silent while its supervisor says that its environment is busy, however long that takes.
+    is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
     """
     no_workers_timeout_s: float
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
@@ -105,8 +105,8 @@ class RolloutKeywords(TypedDict, total=False):
     with all that it imports, takes longer than this many seconds. 0: never.
     """
     step_timeout_s: float
-    """A worker process, wherever it was started, is restarted if one step of an env copy takes longer than this many
-    seconds. 0: never.
+    """A worker process, wherever it was started, is restarted if one step of an env copy, or one call of a policy that
+    you wrote (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
     """
     max_env_failures: int
     """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in

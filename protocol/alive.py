@@ -11,20 +11,25 @@ from msgspec import Meta
 from protocol.bounds import MAX_WORKERS, Line, Name, Natural, Seconds
 from protocol.message_base import Message
 
-Doing = Literal["starting", "waiting", "describing", "making", "resetting", "stepping", "evaluating", "closing"]
+Doing = Literal[
+    "starting", "waiting", "describing", "making", "preparing", "resetting", "stepping", "acting", "evaluating", "closing"
+]
 """What a worker does, as its supervisor sees it. Code of the user runs in all of these except `starting` and `waiting`.
 
-`making`: an env copy, or the policy with all that it imports.
+`making`: an env copy. `preparing`: a policy, with all that it imports. `acting`: a call of a policy that is the user's code.
 """
 SHARED_VERSIONS = 4  # so many of the last weights that came to it, a supervisor keeps for its workers
 NO_SLOT = "no slot is free"  # the beginning of the reason of a worker that leaves, and comes back when there is room
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
-NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
+OUR_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
+OF_POLICY: frozenset[Doing] = frozenset({"preparing", "acting"})
 CALLS: dict[Doing, str] = {
     "describing": "the construction of its environment",
-    "making": "the construction of its environment or policy",
+    "making": "the construction of its environment",
+    "preparing": "the construction of the policy",
     "resetting": "a reset of its environment",
     "stepping": "a step of its environment",
+    "acting": "a call of the policy",
     "evaluating": "a step of an evaluation",
     "closing": "close() of its environment",
 }
@@ -51,7 +56,9 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     reason: Line
     """how it ended: an exit code, a signal, or a timeout that its supervisor enforced, by the name of its flag"""
     failed: bool
-    """whether the environment, or the worker, is to blame: it did not leave on purpose"""
+    """whether the environment, the policy, or the worker is to blame: it did not leave on purpose"""
+    of_policy: bool = False
+    """it failed in a call of a policy that the user wrote; no environment is to blame"""
 
 
 @dataclass(frozen=True)
@@ -82,22 +89,22 @@ class Alive(Message, frozen=True):
 
 
 class CallTimeouts(msgspec.Struct, frozen=True):
-    """How many seconds one call of an env copy may take before the supervisor ends its worker. 0: any time.
+    """How many seconds one call of the user's code may take before the supervisor ends its worker. 0: any time.
 
     The fields are named as the flags are.
     """
 
     start_s: float = 600.0
-    """making or resetting it"""
+    """making or resetting an env copy, or making the policy"""
     step_s: float = 600.0
-    """stepping it"""
+    """a step of an env copy, or a call of a policy that the user wrote"""
 
     def limit_s(self, doing: Doing) -> float:
         """The limit of what a worker does; infinite if it has none."""
         match doing:
-            case "describing" | "making" | "resetting":
+            case "describing" | "making" | "preparing" | "resetting":
                 limit = self.start_s
-            case "stepping" | "evaluating":
+            case "stepping" | "acting" | "evaluating":
                 limit = self.step_s
             case "closing":
                 limit = CLOSE_S
@@ -111,6 +118,6 @@ class CallTimeouts(msgspec.Struct, frozen=True):
 
     def reason(self, doing: Doing) -> str:
         """Why a worker is ended that exceeds its limit. The line names the flag."""
-        flag = "step" if doing in ("stepping", "evaluating") else "start"
+        flag = "step" if doing in ("stepping", "acting", "evaluating") else "start"
         named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
         return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"

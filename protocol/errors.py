@@ -10,7 +10,7 @@
     │       ├── NoWorkers         1   no worker is left, or none ever joined
     │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
-    │       ├── PolicyFailed      1   a policy that the user wrote raised in a worker, or returned something unusable
+    │       ├── PolicyFailed      1   a policy that the user wrote raised in a worker, hung, or returned something unusable
     │       └── EnvironmentFailed 1   the environment raised too often; the text carries its traceback
     └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
         ├── BadMessage            not a valid message: shape, size, type or version
@@ -249,7 +249,7 @@ class EnvironmentFailed(RunError):
 
 
 class PolicyFailed(RunError):
-    """A policy that the user wrote raised in a worker, or returned what no rollout can hold.
+    """A policy that the user wrote raised in a worker, did not return in time, or returned what no rollout can hold.
 
     The line names the worker and the policy. `detail` is the traceback of the worker, if the policy raised, and `__cause__`
     its exception, as that of `EnvironmentFailed`.

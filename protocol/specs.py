@@ -193,7 +193,7 @@ class DescribeSpec(msgspec.Struct, frozen=True, tag=True):
     render_mode: str | None = None
     """passed to the copy"""
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of the environment may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
@@ -240,7 +240,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     opponent: PolicySpec | None = None
     """the policy of opponents, if it is not `policy`"""
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of the environment may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
@@ -290,13 +290,18 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         """Those of the rows that are sent. With teams, a column is of one seat in one copy and of another in the next."""
         return ("step", "column") if self.teams else self.row_axes
 
-    def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot take part; empty if it can."""
+    @property
+    def policy_code(self) -> tuple[str, ...]:
+        """The user's callables that make policies, or parts of them, in the workers: as errors name them."""
         called = [("encoder", self.policy.encoder), ("policy", self.policy.own)]
         if self.opponent is not None:
             called.append(("encoder", self.opponent.encoder))
         factories = [f"{what} {each.factory}" for what, each in called if each is not None]
-        for what in (*factories, *(f"opponent {factory}" for factory in self.scripted)):
+        return (*factories, *(f"opponent {factory}" for factory in self.scripted))
+
+    def rejection_reason(self, code: AllowedCode) -> str:
+        """Why a worker that allows only this code cannot take part; empty if it can."""
+        for what in self.policy_code:
             if why := code.refuses_to_call(what):
                 return why
         return self.env.rejection_reason(code)
@@ -344,7 +349,7 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     `outside` (float64)
     """
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of the environment may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The caller may

@@ -1,22 +1,26 @@
 """How the actions of a rollout are chosen: by a policy of ours, for all lanes in one pass, or by the user's own.
 
-Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes.
+Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes. A call of the
+user's code is named on the worker's page (`workers/activity.py`), so that it has a timeout; policies of ours are not slowed.
 In a masked run, the last array of an observation is the mask of the allowed actions (`protocol.policy.masks`).
 """
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Floats
-from protocol.policy.called_policy import CalledPolicy
+from protocol.arrays import Array, Floats
+from protocol.errors import PolicyFailed, first_line
+from protocol.policy.called_policy import Acted, CalledPolicy
 from protocol.policy.distributions import distribution
 from protocol.policy.masks import forbid, masked_distribution
 from protocol.policy.policy import Policy
 from protocol.specs import RunSpec
+from workers.activity import ACTING, activity
 
 
 class ActedRows(NamedTuple):
@@ -64,7 +68,27 @@ class Acting(Protocol):
 
 def acting_of(run: RunSpec, policy: Policy | CalledPolicy) -> Acting:
     """How this policy acts in this run."""
-    return _OwnActing(run, policy) if isinstance(policy, CalledPolicy) else _BuiltInActing(run, policy)
+    if isinstance(policy, CalledPolicy):
+        return _OwnActing(run, policy)
+    return _BuiltInActing(run, policy if run.policy.encoder is None else _EncodingPolicy(run.policy.encoder.factory, policy))
+
+
+class _EncodingPolicy:
+    """A policy of ours whose encoder is the user's: a call is named on the page, and what it raises is the policy's."""
+
+    def __init__(self, encoder: str, policy: Policy) -> None:
+        self._encoder, self._policy, self._page = encoder, policy, activity()
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        self._policy.load(parameters, buffers)
+
+    def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
+        try:
+            with self._page.during(ACTING):
+                return self._policy(leaves, state)
+        except Exception as error:
+            line = f"encoder {self._encoder}: a pass through it raised {type(error).__name__}: {first_line(error)}"
+            raise PolicyFailed(line, traceback.format_exc()) from error
 
 
 class _BuiltInActing:
@@ -121,25 +145,30 @@ class _OwnActing:
     """A policy of the user's, called once for each lane."""
 
     def __init__(self, run: RunSpec, policy: CalledPolicy) -> None:
-        self.run, self.policy = run, policy
+        self.run, self._policy, self._page = run, policy, activity()
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        self.policy.load(parameters, buffers)
+        with self._page.during(ACTING):
+            self._policy.load(parameters, buffers)
+
+    def act(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool = False) -> Acted:
+        """What the policy returns for the copies of one lane: obs [N, *leaf], state [N, S]."""
+        mask = obs[-1] if self.run.masked else None
+        with self._page.during(ACTING):
+            return self._policy.act(obs[: len(self.run.policy.observation)], state, generator, mask=mask, greedy=greedy)
 
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
         return _OwnActions(self, generators)
 
     def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
-        leaves, mask = _split([leaf[0] for leaf in obs], self.run)
-        acted = self.policy.act(leaves, state[0], generator, mask=mask, greedy=greedy)
+        acted = self.act([leaf[0] for leaf in obs], state[0], generator, greedy=greedy)
         state[0] = acted.state
         return acted.action
 
 
 class _OwnActions:
     def __init__(self, acting: _OwnActing, generators: Sequence[np.random.Generator]) -> None:
-        run, self._policy, self._generators = acting.run, acting.policy, generators
-        self._run = run
+        run, self._acting, self._generators = acting.run, acting, generators
         lead, action = (len(generators), run.rollout_steps, run.columns), run.policy.action
         self._action = np.empty((*lead, *action.shape), action.stored_dtype)
         self._extras = [np.empty((*lead, *extra.shape), extra.dtype) for extra in run.extras]
@@ -148,8 +177,7 @@ class _OwnActions:
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
         for i, generator in enumerate(self._generators):
-            leaves, mask = _split([leaf[i] for leaf in obs], self._run)
-            acted = self._policy.act(leaves, state[i], generator, mask=mask)
+            acted = self._acting.act([leaf[i] for leaf in obs], state[i], generator)
             self._action[i, t], state[i] = acted.action, acted.state
             for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
                 array[i, t] = extra
@@ -160,8 +188,3 @@ class _OwnActions:
 
     def written(self, i: int) -> list[Array]:
         return [self._action[i], *(array[i] for array in self._written)]
-
-
-def _split(obs: list[Array], run: RunSpec) -> tuple[list[Array], Bools | None]:
-    """The arrays of an observation that the actor sees, and its mask."""
-    return obs[: len(run.policy.observation)], obs[-1] if run.masked else None

@@ -23,13 +23,13 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import NamedTuple, get_args
 
-from protocol.alive import CallTimeouts, Doing
+from protocol.alive import OF_POLICY, CallTimeouts, Doing
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000
 STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention: write the stack of each thread
 DOINGS: tuple[Doing, ...] = get_args(Doing)
-STARTING, WAITING, DESCRIBING, MAKING, RESETTING, STEPPING, EVALUATING, CLOSING = range(len(DOINGS))
+STARTING, WAITING, DESCRIBING, MAKING, PREPARING, RESETTING, STEPPING, ACTING, EVALUATING, CLOSING = range(len(DOINGS))
 # Places of the numbers in the page.
 DOING, SINCE_S, ENV_CALLS, LEAVES, LEAVES_SINCE_S, START_TIMEOUT_S, STEP_TIMEOUT_S = range(7)
 MOST_CALLS = 2**53
@@ -61,15 +61,15 @@ class Activity:
 
     @contextmanager
     def during(self, doing: int) -> Iterator[None]:
-        """Within it, the worker makes one call of the environment."""
+        """Within it, the worker makes one call of the environment, or of a policy."""
         self.begin(doing)
         try:
             yield
         finally:
-            self.end()
+            self.end(calls=0 if DOINGS[doing] in OF_POLICY else 1)
 
     def limit(self, timeouts: CallTimeouts) -> None:
-        """From now on, a call of the environment may take so long. Before, it may take any time."""
+        """From now on, a call of the user's code may take so long. Before, it may take any time."""
         self.seconds[START_TIMEOUT_S], self.seconds[STEP_TIMEOUT_S] = timeouts.start_s, timeouts.step_s
 
     def leave(self, exit_code: int) -> None:

@@ -24,6 +24,7 @@ from protocol.rollout import Episode
 from protocol.specs import OwnPolicySpec, RunSpec
 from protocol.wire.weight_dtypes import to_float32
 from workers.acting import acting_of
+from workers.activity import PREPARING, activity
 
 
 class Opponent:
@@ -61,7 +62,9 @@ class KnownOpponents:
 
         def find(number: int) -> Opponent:
             if (found := self._known.get(number)) is None:
-                found = self._known[number] = Opponent(self._run, number, weights[number] if number >= 0 else None)
+                with activity().during(PREPARING):
+                    found = Opponent(self._run, number, weights[number] if number >= 0 else None)
+                self._known[number] = found
                 if number < 0:
                     self._programs.append(found)
             return found

@@ -31,7 +31,7 @@ from protocol.wire.codec import decode_to_worker, encode
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.weight_dtypes import to_float32
 from protocol.wire.worker_link import WorkerLink
-from workers.activity import MAKING, WAITING, activity
+from workers.activity import PREPARING, WAITING, activity
 from workers.collect.collector import Collector
 from workers.conversation.heartbeat_thread import HeartbeatThread
 from workers.conversation.session import (
@@ -357,9 +357,8 @@ class Worker:
         try:
             match run:
                 case RunSpec():
-                    activity().begin(MAKING)  # the policy may import torch and the user's modules, which takes long
-                    self._collector, self._evaluator = self._options.make_actors(run)
-                    activity().begin(WAITING)
+                    with activity().during(PREPARING):  # it may import torch and the user's modules, which takes long
+                        self._collector, self._evaluator = self._options.make_actors(run)
                     self._packing = replace(self._link.packing, zstd=run.zstd and self._link.packing.zstd)
                 case StepSpec():
                     self._stepper = Stepper(

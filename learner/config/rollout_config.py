@@ -127,7 +127,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     worker_timeout_s: Free[Positive] = 5.0
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
-    is not silent while its supervisor says that its environment is busy, however long that takes.
+    is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
     """
     no_workers_timeout_s: Free[Positive] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
@@ -138,8 +138,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     all that it imports, takes longer than this many seconds. 0: never.
     """
     step_timeout_s: Free[NotNegative] = 600.0
-    """A worker process, wherever it was started, is restarted if one step of an env copy takes longer than this many
-    seconds. 0: never.
+    """A worker process, wherever it was started, is restarted if one step of an env copy, or one call of a policy that you
+    wrote (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
     """
     max_env_failures: Free[Natural] = 3
     """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in

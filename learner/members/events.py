@@ -83,7 +83,9 @@ class EnvironmentRaised(Failed):
 
 @dataclass(frozen=True)
 class PolicyRaised(Failed):
-    """A policy that the user wrote raised in a worker, or returned what no rollout can hold."""
+    """A policy that the user wrote raised in a worker, returned what no rollout can hold, or ended the worker's process: it
+    crashed, or did not return in time.
+    """
 
     json_name: ClassVar[str] = "policy_raised"
 

@@ -1,6 +1,6 @@
 """What a member does, and what holds it up, in words for people. Pure.
 
-Rule: a member is held up by one call of the environment, or by its own silence. Many short calls hold it up by their number,
+Rule: a member is held up by one call of the user's code, or by its own silence. Many short calls hold it up by their number,
 so its env steps per second are said instead.
 """
 
@@ -14,8 +14,10 @@ from protocol.messages import WorkerActivity
 DOING = {
     "describing": "in construction",
     "making": "in construction",
+    "preparing": "in the policy's construction",
     "resetting": "in reset",
     "stepping": "in step",
+    "acting": "in the policy",
     "evaluating": "in evaluation",
     "closing": "in close",
 }

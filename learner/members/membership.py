@@ -22,6 +22,7 @@ from learner.members.events import (
     Event,
     Failed,
     NamelessHello,
+    PolicyRaised,
     RejoinRequested,
     WorkerJoined,
     WorkerLeft,
@@ -30,7 +31,7 @@ from learner.members.events import (
 )
 from learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import key_of_peer, name_for_people, worker_name
-from protocol.alive import NO_ENVIRONMENT_CODE
+from protocol.alive import OUR_CODE
 from protocol.bounds import Stage, Stages, escaped, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -140,7 +141,7 @@ class Member:
     activity_s: float = 0.0
     """Time when the supervisor said that."""
     in_env_code_s: float = -math.inf
-    """Time when the supervisor said last that the worker is in environment code: until then the worker was not silent."""
+    """Time when the supervisor said last that the worker is in the user's code: until then the worker was not silent."""
     supervisor: SharingSupervisor | None = None
     """Its supervisor, if it shares weights."""
 
@@ -178,7 +179,7 @@ class Member:
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
         """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
         before, self.activity, self.activity_s = self.activity, activity, now
-        if activity.doing not in NO_ENVIRONMENT_CODE:
+        if activity.doing not in OUR_CODE:
             self.in_env_code_s = now
         return activity.env_calls > (0 if before is None else before.env_calls)
 
@@ -275,6 +276,8 @@ class Membership(Generic[M]):
         """how often a member has reported more env steps, or more calls of the environment that have returned: by whether it
         only evaluates
         """
+        self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
+        """whether a policy of the user's acts in the workers: no worker can blame one that is ours"""
         self._run, self._member_class, self._on_removed, self.is_spare = run, member_class, on_removed, is_spare
         self._first_session = self._next_session = first_session
         self._joins = 0
@@ -420,7 +423,8 @@ class Membership(Generic[M]):
         if member is not None and (key is None or key == key_of_peer(member.peer)):
             if worker_exit.failed:
                 spare = self.is_spare(member)
-                self.events.append(member.failed(WorkerProcessFailed, f"its process {reason}", spare=spare))
+                kind = PolicyRaised if worker_exit.of_policy and self.has_policy_code else WorkerProcessFailed
+                self.events.append(member.failed(kind, f"its process {reason}", spare=spare))
             self.remove(member, TimedOut, reason)
             return True
         if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # now it is known why it was silent

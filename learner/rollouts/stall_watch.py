@@ -115,4 +115,8 @@ class StallWatch:
     def _longest_s(self, copies: int, steps: int) -> float:
         limit_s = self._timeouts.limit_s
         opening_s = limit_s("making") + limit_s("resetting")
-        return copies * (opening_s + steps * max(limit_s("stepping"), limit_s("resetting")))
+        step_s = max(limit_s("stepping"), limit_s("resetting"))
+        if self._coordinator.membership.has_policy_code:
+            opening_s += limit_s("preparing") + limit_s("acting")  # it is made, and gets its weights
+            step_s += 2 * limit_s("acting")  # the policy, and this copy's opponent
+        return copies * (opening_s + steps * step_s)

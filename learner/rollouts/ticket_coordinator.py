@@ -208,9 +208,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super()._unusable(member, why) if member.strikes >= STRIKES else []
 
     def _kind(self, failure: Failure) -> type[Failed]:
-        # No worker can blame a policy that is not the user's.
-        has_code = self.run.policy.own is not None or self.run.scripted
-        return PolicyRaised if failure.of_policy and has_code else super()._kind(failure)
+        return PolicyRaised if failure.of_policy and self.membership.has_policy_code else super()._kind(failure)
 
 
 def _by_joining(member: Member) -> int:

@@ -44,6 +44,8 @@ WORKER = {
     "stepping": "collecting",
     "resetting": "resetting",
     "making": "resetting",
+    "preparing": "starting",
+    "acting": "collecting",
     "describing": "resetting",
     "evaluating": "evaluating",
     "starting": "starting",

@@ -100,7 +100,7 @@ WORDS: Mapping[str, str] = {
     "start": "the smallest value",
     "worker": "the worker's name",
     "process_nonce": "`process_nonce` of the worker's Hello",
-    "doing": "what it does; environment code runs in all of these except `starting` and `waiting`",
+    "doing": "what it does; code of the user runs in all of these except `starting` and `waiting`",
     "running": "its workers that run",
     "description": "the environment",
     "keys": "the keys, in the order of the space",

@@ -123,6 +123,9 @@ def test_each_call_has_its_own_timeout_and_zero_is_never() -> None:
     timeouts = CallTimeouts(start_s=2.0, step_s=0.0)
     limits = [timeouts.limit_s(doing) for doing in ("making", "resetting", "stepping", "waiting")]
     assert limits == [2, 2, math.inf, math.inf]
+    assert CallTimeouts(start_s=2.0, step_s=1.0).limit_s("preparing") == 2
+    assert CallTimeouts(start_s=2.0, step_s=1.0).limit_s("acting") == 1
+    assert CallTimeouts(2.0, 1.0).reason("acting").endswith("a call of the policy took longer than 1 s (--step-timeout-s)")
     assert "a reset of its environment took longer than 2 s (--start-timeout-s)" in timeouts.reason("resetting")
     assert CallTimeouts(start_s=2.0, step_s=1.0).longest_s() == 2
     assert timeouts.longest_s() == math.inf

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.alive import NO_ENVIRONMENT_CODE, NO_SLOT, CallTimeouts
+from protocol.alive import NO_SLOT, OUR_CODE, CallTimeouts
 from protocol.arrays import Array
 from protocol.messages import (
     Collect,
@@ -215,8 +215,8 @@ def test_a_worker_that_makes_its_policy_is_not_silent() -> None:
     options = WorkerOptions(make_actors=slow_imports)
     session = Session(replace(identity("w0"), process_nonce=0), 0.0)
     Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run()
-    assert doing == ["making"]
-    assert "making" not in NO_ENVIRONMENT_CODE
+    assert doing == ["preparing"]
+    assert "preparing" not in OUR_CODE
 
 
 def test_calls_may_take_as_long_as_the_newest_run_lets_them_before_any_of_its_environments_is_made() -> None:

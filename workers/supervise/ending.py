@@ -16,7 +16,9 @@ class Ending:
     on_purpose: bool = False
     """The worker has said beforehand that it leaves with this code."""
     failed: bool = False
-    """Its environment, or the worker, is to blame: it ended neither on purpose nor before it ran environment code."""
+    """Its environment, the policy, or the worker is to blame: it ended neither on purpose nor before it ran their code."""
+    of_policy: bool = False
+    """It failed in a call of the policy."""
     worked: bool = False
     """Calls of its environment have returned."""
     last_lines: str | None = None

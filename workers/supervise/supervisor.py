@@ -65,7 +65,7 @@ class Running(Protocol):
         ...
 
     def enforce(self, now: float) -> None:
-        """End it if a call of its environment takes longer than its run allows."""
+        """End it if a call of the user's code takes longer than its run allows."""
         ...
 
     def lower_priority(self) -> None:
@@ -158,7 +158,7 @@ class Supervisor:
                 nonce = worker.running.process_nonce
                 self._record_end(worker, end, now)
                 reason = end.reason + (GIVEN_UP if worker.failed_starts == MOST_FAILED_STARTS else "")
-                ended.append((WorkerExit(worker.name, nonce, one_line(reason), end.failed), end))
+                ended.append((WorkerExit(worker.name, nonce, one_line(reason), end.failed, end.of_policy), end))
             if worker.restart_s is not None and now >= worker.restart_s and not self._stopping:
                 self._restart(worker, now)
         return ended

@@ -2,7 +2,7 @@
 
 Rule: the worker has a session of its own. When the worker has ended, whatever its environment started in that session is
 killed; the slots of its env copies are free when all of it is gone, because this process holds them too. If a call of the
-environment takes longer than its run allows, the worker writes its stacks and is killed. A worker that leaves on purpose
+user's code takes longer than its run allows, the worker writes its stacks and is killed. A worker that leaves on purpose
 says so beforehand: any other end is not on purpose, whatever the exit code.
 """
 
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from protocol.alive import CALLS, NO_ENVIRONMENT_CODE, WorkerActivity
+from protocol.alive import CALLS, OF_POLICY, OUR_CODE, WorkerActivity
 from protocol.bounds import escaped, one_line
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
@@ -139,7 +139,7 @@ class WorkerProcess:
         return one_line("".join(self._output().strip().splitlines()[-1:]))
 
     def enforce(self, now: float) -> None:
-        """End it if a call of its environment takes longer than its run allows, or if it does not end although it leaves."""
+        """End it if a call of the user's code takes longer than its run allows, or if it does not end although it leaves."""
         if not self._runs():
             return
         touch(self._slots)
@@ -244,9 +244,10 @@ class WorkerProcess:
         else:
             line = f"ended with exit code {code}{meanwhile}{last if code else ''}"
         # In `close`, an environment has done its work: that its process ends there does not count against the run.
-        failed = page.doing != "closing" and (worked or page.doing not in NO_ENVIRONMENT_CODE)
+        failed = page.doing != "closing" and (worked or page.doing not in OUR_CODE)
+        of_policy = failed and page.doing in OF_POLICY
         last_lines = _end_of(output) if page.doing == "starting" else None
-        return Ending(code, one_line(line), failed=failed, worked=worked, last_lines=last_lines)
+        return Ending(code, one_line(line), failed=failed, of_policy=of_policy, worked=worked, last_lines=last_lines)
 
     def _output(self) -> str:
         """What it has written to its log, the end of it if that is long: a simulator may write without a limit."""

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import cast
+from typing import cast, get_args
 
 import pytest
 
 from learner.config.rollout_config import RolloutConfig
 from learner.conversations import open_hub
-from learner.members.events import WorkerLeft, WorkerProcessFailed
+from learner.members.events import Failed, PolicyRaised, WorkerLeft, WorkerProcessFailed
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
-from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
+from protocol.alive import OUR_CODE, Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
 from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
@@ -39,8 +39,8 @@ def is_member_after(learner: Learner, seconds: float) -> bool:
     return A in learner.coordinator.members
 
 
-@pytest.mark.parametrize("doing", ["describing", "making", "resetting", "stepping", "evaluating", "closing"])
-def test_a_worker_in_environment_code_is_not_silent(doing: Doing) -> None:
+@pytest.mark.parametrize("doing", sorted(set(get_args(Doing)) - OUR_CODE))
+def test_a_worker_in_the_users_code_is_not_silent(doing: Doing) -> None:
     learner = Learner()
     learner.joins(A)
     for _ in range(5):
@@ -116,6 +116,20 @@ def test_an_exit_is_counted_once_and_its_tickets_are_dealt_again() -> None:
         WorkerProcessFailed("a", "host", f"its process {why}", lanes=(0, 1)),
         WorkerLeft("a", why, held, False),
     ]
+
+
+@pytest.mark.parametrize(("code", "kind"), [(("mine:rock",), PolicyRaised), ((), WorkerProcessFailed)])
+def test_a_process_that_ended_in_a_call_of_the_users_policy_is_the_policys_failure(
+    code: tuple[str, ...], kind: type[Failed]
+) -> None:
+    """No worker can blame a policy that is not the user's."""
+    learner = Learner(lanes=1, scripted=code)
+    learner.joins(A)
+    learner.coordinator.membership.take_events()
+    why = "was ended: a call of the policy took longer than 3 s (--step-timeout-s), at mine.py:7, in act"
+    learner.says(SUPERVISOR, Alive((), (WorkerExit("a", NONCE, why, failed=True, of_policy=True),)))
+    failed, _ = learner.coordinator.membership.take_events()
+    assert failed == kind("a", "host", f"its process {why}", lanes=(0,))
 
 
 def test_an_exit_on_purpose_and_that_of_a_spare_count_as_no_failure() -> None:
@@ -288,6 +302,13 @@ def test_each_step_may_be_a_reset_that_takes_longer() -> None:
     learner = Learner()
     learner.joins(A)
     assert watch(learner, CallTimeouts(10 * STEP_S, STEP_S))._longest_s(copies=1, steps=7) > 7 * 10 * STEP_S
+
+
+def test_each_step_may_have_a_call_of_the_policy_and_of_an_opponent() -> None:
+    learner = Learner(scripted=("mine:rock",))
+    learner.joins(A)
+    steps = 7
+    assert watch(learner, TIMEOUTS)._longest_s(copies=2, steps=steps) > 2 * steps * 3 * STEP_S
 
 
 def test_without_timeouts_there_is_no_budget() -> None:

@@ -923,9 +923,7 @@ def test_a_failure_belongs_to_its_lane_or_to_all_of_the_workers_lanes(lane: int 
 
 @pytest.mark.parametrize("kind", [PolicyRaised, EnvironmentRaised])
 def test_a_failure_of_the_users_policy_is_told_as_one(kind: type) -> None:
-    learner = Learner(lanes=1)
-    policy = msgspec.structs.replace(learner.coordinator.run.policy, own=OwnPolicySpec("mine:make", ()))
-    learner.coordinator.run = msgspec.structs.replace(learner.coordinator.run, policy=policy)
+    learner = Learner(lanes=1, policy=msgspec.structs.replace(run_spec().policy, own=OwnPolicySpec("mine:make", ())))
     learner.joins(A)
     learner.says(A, Failure(learner.session(A), "KeyError", "", None, of_policy=kind is PolicyRaised))
     (failed,) = [event for event in learner.coordinator.events if isinstance(event, Failed)]

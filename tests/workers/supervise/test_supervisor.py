@@ -86,7 +86,7 @@ class Machine:
     ) -> list[WorkerExit | StartFailed]:
         self.now += after_s
         failed = not on_purpose and last_lines is None
-        self.started[-1][1].end = Ending(code, "why", on_purpose, failed, worked, last_lines)
+        self.started[-1][1].end = Ending(code, "why", on_purpose, failed, worked=worked, last_lines=last_lines)
         return self.host.poll()
 
     def pause_s(self) -> float:
@@ -257,6 +257,12 @@ def test_a_lower_priority_is_also_that_of_workers_that_are_started_again() -> No
     machine.die(1)
     machine.pause_s()
     assert [worker.requests for _, worker in machine.started] == [["lower_priority"], ["lower_priority"]]
+
+
+def test_the_end_of_a_worker_in_a_call_of_the_policy_is_told_as_such() -> None:
+    machine = Machine()
+    machine.started[-1][1].end = Ending(-9, "why", failed=True, of_policy=True)
+    assert machine.host.poll() == [WorkerExit("w0", NONCE, "why", failed=True, of_policy=True)]
 
 
 def test_each_end_is_reported_once() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from protocol.alive import CallTimeouts
+from protocol.alive import CallTimeouts, Doing
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from workers import activity, program
 from workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
@@ -129,6 +129,23 @@ def test_a_worker_gets_the_token_that_its_supervisor_gives_it_and_no_other(monke
     ending = ending_of(f"exit ${{#{TOKEN_VARIABLE}}}", monkeypatch)
     assert ending is not None
     assert ending.code == 0, "the length of the token"
+
+
+@pytest.mark.parametrize(
+    ("doing", "of_policy"),
+    [("acting", True), ("preparing", True), ("stepping", False), ("closing", False), ("waiting", False)],
+)
+def test_the_end_says_whether_the_policy_is_to_blame(
+    monkeypatch: pytest.MonkeyPatch, doing: Doing, *, of_policy: bool
+) -> None:
+    monkeypatch.setattr(worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", "exit 3"], **how))
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    os.pwrite(worker._page.fd, activity.DOINGS.index(doing).to_bytes(8, sys.byteorder), 8 * activity.DOING)
+    worker.wait(10.0)
+    ending = worker.ended()
+    assert ending is not None
+    assert ending.of_policy == of_policy
+    assert ending.failed == (doing not in ("closing", "waiting"))
 
 
 def test_a_call_is_ended_by_the_timeout_that_the_run_of_its_worker_has(monkeypatch: pytest.MonkeyPatch) -> None:
