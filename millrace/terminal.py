@@ -23,7 +23,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from learner.report.sentences import bottleneck, ending, went_wrong
+from learner.report.sentences import bottleneck, ending, lag_in_words, per_second, went_wrong
 from learner.rollouts.opponent_pool import ELO_KEY
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
@@ -297,8 +297,8 @@ class LiveBlock(ProgressView):
 def main_figures(progress: Progress) -> str:
     """The most important figures in one line."""
     figures = [
-        f"{progress.env_steps:,} of {progress.total_steps:,} env steps",
-        f"{progress.steps_per_s:,.0f} steps/s",
+        f"{progress.env_steps_made:,} of {progress.total_steps:,} env steps",
+        f"{per_second(progress.steps_per_s)} steps/s",
         f"return {_return(progress)}",
         _strength(progress),
         _lag(progress),
@@ -311,13 +311,13 @@ def main_figures(progress: Progress) -> str:
 def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
     """What a block shows below its head, as text by name. `returns`: of the run so far."""
     best = progress.best
-    steps = f"{progress.env_steps:,} of {progress.total_steps:,}"
+    steps = f"{progress.env_steps_made:,} of {progress.total_steps:,}"
     evaluated = "" if best is None else f"best evaluation {best[0]:,.1f} at {best[1]:,} env steps"
     rows = {
-        "env steps": GAP.join((steps, f"{progress.steps_per_s:,.0f} a second", f"update {progress.updates:,}")),
+        "env steps": GAP.join((steps, f"{per_second(progress.steps_per_s)} a second", f"update {progress.updates:,}")),
         "return": GAP.join(filter(None, (_return(progress), str(returns), evaluated))),
         "opponents": _strength(progress),
-        "workers": GAP.join((_workers(progress), _lag(progress))),
+        "workers": GAP.join(filter(None, (_workers(progress), _lag(progress)))),
         "time": bottleneck("" if progress.stop_reason else progress.waiting, progress.stages),
         "lost": went_wrong(progress.ledger),
         "run": progress.run,
@@ -332,8 +332,9 @@ def how_far(progress: Progress) -> tuple[float | None, str]:
         return 1.0, f"100%  done in {took}"
     if progress.stop_reason:
         return None, ending(one_line(progress.stop_reason, MOST_REASON), f" after {took}", cut_short=progress.cut_short)
-    share = min(1.0, progress.env_steps / progress.total_steps) if progress.total_steps else 0.0
-    left_s = (progress.total_steps - progress.env_steps) / progress.steps_per_s if progress.steps_per_s else 0.0
+    made = progress.env_steps_made
+    share = min(1.0, made / progress.total_steps) if progress.total_steps else 0.0
+    left_s = (progress.total_steps - made) / progress.steps_per_s if progress.steps_per_s else 0.0
     return share, f"{math.floor(100 * share)}%  {took}" + (f", {_clock_time(left_s)} left" if left_s >= 1 else "")
 
 
@@ -367,7 +368,7 @@ def _strength(progress: Progress) -> str:
 
 
 def _lag(progress: Progress) -> str:
-    return f"lag {progress.lag_mean:.1f} (max {progress.lag_max})"
+    return lag_in_words(progress.lag_mean, progress.lag_max, progress.ledger.get("used", 0))
 
 
 def _workers(progress: Progress) -> str:

@@ -171,8 +171,8 @@ class Heartbeat(Message, frozen=True):
     tickets: Tickets
     """tickets that are held and not finished: those that wait, and those of the work in progress"""
     steps: Natural
-    """env steps since the worker started, in all sessions: valid rows of rollouts, steps of evaluations, and with `StepSpec`
-    those of each copy that a Step steps; a copy that it only resets may count too
+    """env steps since the worker started, in all sessions: of rollouts and evaluations, best counted as they are made, and
+    with `StepSpec` those of each copy that a Step steps; a copy that it only resets may count too
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""
@@ -425,11 +425,11 @@ class Status(Message, frozen=True):
     version: int = -1
     """how many updates the learner has made; -1 before the first weights"""
     env_steps: int = 0
-    """env steps used by updates since the run began"""
+    """env steps used by updates since the run began, and those of the rollouts that the next update waits for"""
     total_steps: int = 0
     """env steps at which the run ends; 0 for one without an end: a learner of one's own, or a vector environment"""
     steps_per_s: float = 0.0
-    """env steps used per second, since this learner started"""
+    """these env steps per second, since this learner started"""
     return_mean: float | None = None
     """mean return of the last 100 episodes, in raw rewards"""
     lag_mean: float = 0.0

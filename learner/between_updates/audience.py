@@ -53,6 +53,7 @@ class Audience:
 
     def start(self) -> None:
         """The run begins, or goes on, and workers have joined."""
+        self._workers_alive = self._hub.workers_alive()
         self._callbacks.on_start(self.progress())
 
     def cloned(self, metrics: Mapping[str, float]) -> None:
@@ -67,7 +68,11 @@ class Audience:
         now = time.monotonic()
         if now - self._shown_s >= SHOW_EVERY_S:
             self._shown_s = now
-            self._callbacks.meanwhile(self.progress())
+            self._workers_alive = self._hub.workers_alive()
+            snapshot = self._hub.snapshot()
+            progress = self._progress(snapshot, snapshot.collected)
+            self._hub.report_progress(progress)
+            self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
         """These rollouts have come. True if an update is to be made of them: no callback ends the run.
@@ -143,15 +148,17 @@ class Audience:
 
     # ---------------------------------------------------------------- inside
 
-    def _progress(self, snapshot: HubSnapshot) -> Progress:
+    def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
+        """`collected`: env steps that wait for the next update, if that is awaited."""
         state, tally, wall_s, lags = self._state, self._tally, self._tally.wall_s(snapshot), snapshot.lags or [0]
         return Progress(
             run=self._files.path,
             env_steps=state.env_steps,
+            collected=collected,
             total_steps=self._config.steps,
             updates=state.version,
             wall_s=wall_s,
-            steps_per_s=steps_per_second(state.env_steps - tally.steps_before, wall_s - tally.wall_before_s),
+            steps_per_s=steps_per_second(state.env_steps + collected - tally.steps_before, wall_s - tally.wall_before_s),
             return_mean=tally.window.return_mean,
             length_mean=tally.window.length_mean,
             facts=tally.window.facts,

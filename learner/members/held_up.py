@@ -38,7 +38,9 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
     The largest is that of the member that is held up longest, or else of the slowest.
     """
     row, seconds, silent_s = member.status(now), 0.0, now - member.alive_s
-    what = f"{row.steps_per_s:,.1f} steps/s"
+    # Its speed is measured between two heartbeats with more steps, so a worker that has made none has no speed.
+    unmeasured = "has begun to step" if row.steps else "no env step yet"
+    what = f"{row.steps_per_s:,.1f} steps/s" if row.steps_per_s else unmeasured
     if silent_s >= LONG_S:
         seconds, what = silent_s, f"silent for {silent_s:.0f} s"
     elif row.doing_s >= LONG_S and row.doing in DOING:

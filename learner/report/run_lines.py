@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from learner.config.presets import environment_name
 from learner.report.metrics_tail import newest_row
-from learner.report.sentences import ending
+from learner.report.sentences import ending, per_second
 from learner.run_folder.lease import Owner
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
 from learner.run_folder.regular_files import reason
@@ -140,7 +140,7 @@ def headline(line: RunLine) -> str:
     match line.state:
         case "training":
             left = "" if line.left_s is None else f", about {duration(line.left_s)} left"
-            return f"Training: {line.done} done, {line.steps_per_s:,.0f} env steps per second{left}."
+            return f"Training: {line.done} done, {per_second(line.steps_per_s)} env steps per second{left}."
         case "unreadable":
             return f"It cannot be read: {line.problem}."
         case "dead":

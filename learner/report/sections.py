@@ -15,6 +15,7 @@ from learner.report.html_parts import return_text, section
 from learner.report.panels import WHAT_IS_DRAWN, how_it_is_drawn, panels
 from learner.report.reported_runs import ReportData, RunGroup, differing_settings
 from learner.report.run_lines import duration
+from learner.report.sentences import per_second
 from learner.run_folder.episode_window import WINDOW_EPISODES
 from learner.run_folder.regular_files import read
 from learner.run_folder.results import FactMean
@@ -69,7 +70,7 @@ def _rows_of_group(group: RunGroup) -> str:
             greedy,
             mean,
             f"{results.env_steps:,}",
-            f"{results.env_steps_per_s:,.0f}",
+            per_second(results.env_steps_per_s),
             duration(results.wall_s),
             f"{results.updates:,}",
         ]

@@ -53,6 +53,18 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
     return f"{what} the slowest part: the learner {did} for {of_time}."
 
 
+def per_second(steps: float) -> str:
+    """Env steps per second. Few of them have digits after the point, so that a slow simulator does not look dead."""
+    return f"{steps:,.0f}" if steps >= 9.95 or not steps else f"{steps:.2g}"
+
+
+def lag_in_words(mean: float, largest: int, used: int) -> str:
+    """The lag of the rollouts of the last update. Empty before the first. `used`: number of rollouts used so far."""
+    if not used:
+        return ""
+    return f"lag {mean:.1f}" + (f", largest {largest}" if largest > mean else "")
+
+
 def ending(reason: str, after: str = "", *, cut_short: bool) -> str:
     """How a run ended, and why. `after`: after how long."""
     how = "Interrupted" if cut_short else "Finished"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from learner.members.membership import Member
-from protocol.messages import WorkerStatus
+from protocol.messages import Heartbeat, WorkerStatus
 
 
 @dataclass
@@ -18,6 +18,20 @@ class CollectingMember(Member):
     """Versions that were sent to the worker, unless it is known to lack them; for each, `replies` when it was sent last."""
     strikes: int = 0
     """Number of the worker's rollouts and messages that could not be used."""
+    ended_steps: int = 0
+    """Env steps that its process has made before this session, and of its rollouts and evaluations that have come."""
+
+    @property
+    def steps_under_way(self) -> int:
+        """Env steps of what it works on, as of its newest heartbeat."""
+        return 0 if self.heartbeat is None else max(0, self.heartbeat.steps - self.ended_steps)
+
+    def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
+        """Keep the heartbeat. Returns the tickets that were lost on the way."""
+        is_first_of_session = self.heartbeat is None and not self.hello.is_first_attempt
+        if is_first_of_session or not heartbeat.tickets:  # it works on nothing that was asked for in this session
+            self.ended_steps = heartbeat.steps
+        return super().record_heartbeat(heartbeat)
 
     def status(self, now: float) -> WorkerStatus:
         """The worker's row of `millrace status`."""

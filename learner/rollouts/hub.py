@@ -68,7 +68,7 @@ class HubSnapshot(NamedTuple):
     taken_s: float
     """That moment, by the hub's clock."""
     progress: Progress
-    """Progress as of the last update."""
+    """Progress as it was reported last."""
     version: int
     """Version of the newest weights; -1 before the first."""
     ledger: Ledger
@@ -77,6 +77,8 @@ class HubSnapshot(NamedTuple):
     """Next incarnation of each lane."""
     lags: list[int]
     """Lag of each rollout of the last `gather`."""
+    collected: int
+    """Env steps of the next update's rollouts that are made, as workers report them."""
     lag_counts: Mapping[int, int]
     """Number of rollouts used since this learner started, by lag."""
     wait_s: float
@@ -294,6 +296,7 @@ class Hub:
             ledger=coordinator.rollouts.ledger.copy(),
             incarnations=coordinator.rollouts.incarnations(),
             lags=self._lags,
+            collected=coordinator.collected(),
             lag_counts=dict(self.weight_age.lags),
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],

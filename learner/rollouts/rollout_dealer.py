@@ -73,6 +73,10 @@ class RolloutDealer:
         """The tickets of the next update that workers hold."""
         return [ticket for ticket in self.held.values() if ticket.round == self.rounds.next]
 
+    def collected(self) -> int:
+        """Env steps of the next update's rollouts that have come."""
+        return sum(arrived.rollout.env_steps for arrived in self.ready.get(self.rounds.next, {}).values())
+
     def waiting(self) -> int:
         """Number of rollouts that have come and were not taken."""
         return sum(map(len, self.ready.values()))

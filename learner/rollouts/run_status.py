@@ -8,13 +8,13 @@ from protocol.messages import Status
 
 
 def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str, phase: str) -> Status:
-    """The status message of a run; `progress` is that of the last update, `waiting` says who waits for whom."""
+    """The status message of a run; `progress` is the newest that was reported, `waiting` says who waits for whom."""
     return Status(
         coordinator.run.env.id,
         coordinator.membership.status(now),
         len(coordinator.rollouts.lanes),
         version=coordinator.version,
-        env_steps=progress.env_steps,
+        env_steps=progress.env_steps_made,
         total_steps=progress.total_steps,
         steps_per_s=progress.steps_per_s,
         return_mean=progress.return_mean,

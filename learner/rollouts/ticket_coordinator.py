@@ -12,6 +12,7 @@ only evaluate play it, whatever the others do.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 
 from learner.members.coordinator import Coordinator
@@ -136,6 +137,17 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         """No answer of the evaluation has come for long: a second worker plays the oldest ticket as well, if one is free."""
         return self.weights.after(self.evaluation.share(self.membership.active()), self.members, self._named)
 
+    def collected(self) -> int:
+        """Env steps of the next update's rollouts: of those that have come, and of those under way, as workers report."""
+        rollouts, of_one = self.rollouts, self.run.rollout_steps * self.run.copies
+        awaited = Counter(ticket.peer for ticket in rollouts.awaited())
+        under_way = (min(self.members[peer].steps_under_way, count * of_one) for peer, count in awaited.items())
+        return rollouts.collected() + sum(under_way)
+
+    def steps_of_update(self) -> int:
+        """Env steps of an update's rollouts, if no step only resets a copy."""
+        return self.run.lanes * self.run.rollout_steps * self.run.copies
+
     # ---------------------------------------------------------------- inside
 
     def _deal(self) -> list[Outgoing]:
@@ -161,14 +173,18 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self.rollouts.versions(tickets) | self.evaluation.versions(tickets)
 
     def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
+        held = len(member.tickets)
         match message:
             case Rollout():
                 if why := self.rollouts.take_in(member, message):
                     return self.reject_rollout(member.peer, message, why, member.heard_s)
+                member.ended_steps += message.env_steps if len(member.tickets) < held else 0  # 0: it came before
                 self._placement.ticket_ended(member)
                 return self._deal()
             case Evaluated():
                 why = self.evaluation.take_in(member, message)
+                made = sum(episode.length for episode in message.episodes)
+                member.ended_steps += made if len(member.tickets) < held else 0
             case EpisodeRows():
                 why = self.evaluation.take_rows(member, message)
             case _:

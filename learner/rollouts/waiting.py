@@ -1,9 +1,9 @@
 """Who waits for whom in a run, and for what share of the time: one line. Pure: the state and `now` in, a sentence out.
 
 Rule: what takes less than `LONG_S` is not said. Between two long waits for rollouts, the line tells of the last one, so that
-it does not come and go. While the learner waits, the line names the lanes whose rollouts the next update lacks. While it
-learns, the workers that hold no ticket wait for weights. The shares are those of training since the learner started:
-evaluations do not count.
+it does not come and go. While the learner waits, the line names the lanes whose rollouts the next update lacks, and says how
+many of its env steps are made: with a slow simulator, the first update may be far away. While it learns, the workers that
+hold no ticket wait for weights. The shares are those of training since the learner started: evaluations do not count.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from protocol.bounds import one_line
 
 Phase = Literal["starting", "gathering", "learning", "evaluating"]
 SHARES_AFTER_S = 30.0
+SHORT_S = 180.0  # a longer time is told in minutes
 MOST_LANES = 4  # that are named by their numbers
 
 
@@ -70,7 +71,7 @@ class LearnerTime:
         elif not members:
             text = f"waiting {lasts_s:.0f} s for {self._no_worker()}"
         elif self.phase == "gathering" and self._coordinator.rollouts.awaited():
-            text = f"waiting {lasts_s:.0f} s for {self._awaited(now)}"
+            text = f"waiting {lasts_s:.0f} s for {self._awaited(now)}{self._collected(now)}"
         if text and (total_s := spent_s["gathering"] + spent_s["learning"]) >= SHARES_AFTER_S:
             gather, learn = spent_s["gathering"] / total_s, spent_s["learning"] / total_s
             text += f"; so far {gather:.0%} waiting for rollouts, {learn:.0%} learning"
@@ -94,6 +95,17 @@ class LearnerTime:
         who = self._held_up_longest([members[peer]], now)
         return f"lane{'s' * (len(mine) > 1)} {named} ({who})" + (f" and {more} more" if more else "")
 
+    def _collected(self, now: float) -> str:
+        """How much of the next update's rollouts is made, and how long the rest takes; empty before their first env step."""
+        coordinator = self._coordinator
+        made, of = coordinator.collected(), coordinator.steps_of_update()
+        if not made:
+            return ""
+        which = "next" if coordinator.rollouts.rounds.next else "first"
+        per_s = sum(member.status(now).steps_per_s for member in coordinator.membership.collectors())
+        left = f", about {_in_words((of - made) / per_s)} left" if per_s and made < of else ""
+        return f"; {which} rollouts: {made:,} of {of:,} env steps{left}"
+
     def _played(self, plan: EvaluationPlan, now: float) -> str:
         """How far an evaluation is, and who is held up longest of those that play it."""
         evaluation = self._coordinator.evaluation
@@ -104,3 +116,8 @@ class LearnerTime:
     def _held_up_longest(self, members: list[Member], now: float) -> str:
         """Who that is of the workers that step for these members, or of the members."""
         return max((held_up(member, now) for member in self._stepping() or members), default=("nobody plays",))[-1]
+
+
+def _in_words(seconds: float) -> str:
+    """A time that is not known exactly."""
+    return f"{seconds:.0f} s" if seconds < SHORT_S else f"{seconds / 60:,.0f} min"

@@ -48,7 +48,7 @@ class JsonLines(logging.Formatter):
 
 def progress_line(progress: Progress, now: float) -> str:
     """The progress of the run as one line of JSON. `now` is wall-clock time."""
-    message = f"{progress.env_steps} of {progress.total_steps} env steps"
+    message = f"{progress.env_steps_made} of {progress.total_steps} env steps"
     shown = (name for name in progress.__struct_fields__ if name not in NOT_SHOWN)
     fields = {name: msgspec.to_builtins(getattr(progress, name)) for name in shown}
     return _line(now, "info", "progress", message, fields)

@@ -43,6 +43,8 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """path of the run folder"""
     env_steps: int = 0
     """env steps that updates have used so far, those before a resume included"""
+    collected: int = 0
+    """env steps of the rollouts that the learner waits for, as workers report them; 0 while it waits for none"""
     total_steps: int = 0
     """env steps to train for"""
     updates: int = 0
@@ -50,7 +52,7 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float = 0.0
     """seconds of training, those before a resume included; evaluations do not count"""
     steps_per_s: float = 0.0
-    """env steps per second of training since this process started"""
+    """env steps per second of training since this process started, `collected` included"""
     return_mean: float | None = None
     """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
     length_mean: float | None = None
@@ -99,6 +101,11 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """in `Callback.on_end`: whether an error or an interrupt ended the run"""
     requests: Requests | None = None
     """what callbacks ask of the run"""
+
+    @property
+    def env_steps_made(self) -> int:
+        """Env steps that updates have used, and those that the next one waits for."""
+        return self.env_steps + self.collected
 
     def log(self, name: str, value: SupportsFloat) -> None:
         """Log a number with the metrics of this update. A name without a slash is logged as custom/NAME.

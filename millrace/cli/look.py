@@ -8,6 +8,7 @@ from pathlib import Path
 from learner.report.page import write_page
 from learner.report.picture import draw
 from learner.report.run_lines import RunLine, algorithm_label, find_runs, read_line
+from learner.report.sentences import per_second
 from millrace.cli.flags import ListFlags, PlotFlags, ReportFlags
 from millrace.cli.status import table
 from protocol.errors import UsageError
@@ -31,7 +32,7 @@ def _cells(line: RunLine) -> dict[str, str]:
         "return": "-" if line.return_mean is None else f"{line.return_mean:,.1f}",
         "env steps": f"{line.env_steps:,.0f}",
         "done": line.done,
-        "steps/s": f"{line.steps_per_s:,.0f}",
+        "steps/s": per_second(line.steps_per_s),
         "started": line.started,
     }
 

@@ -22,7 +22,7 @@ from msgspec import Meta
 
 from learner.members.held_up import in_words
 from learner.report.run_lines import RunLine, in_sentences, read_line
-from learner.report.sentences import bottleneck, went_wrong
+from learner.report.sentences import bottleneck, lag_in_words, per_second, went_wrong
 from learner.run_folder.run_format import is_run_folder
 from learner.run_folder.run_lock import learner_of_run
 from protocol.errors import Refused, RunError, UsageError
@@ -187,13 +187,14 @@ def redraw(text: str, out: TextIO) -> None:
 
 def _run_line(status: Status) -> str:
     env = _printable(status.env)
-    speed = f"{status.steps_per_s:,.0f} steps/s"
+    speed = f"{per_second(status.steps_per_s)} steps/s"
     if not (status.total_steps or status.ledger):
         return f"{env}, a vector environment: {status.env_steps:,} env steps, {speed}"
     done = f"{status.env_steps:,} of {status.total_steps:,}" if status.total_steps else f"{status.env_steps:,}"
     score = "none yet" if status.return_mean is None else f"{status.return_mean:,.1f}"
-    lag = f"lag {status.lag_mean:.1f} (max {status.lag_max})"
-    return f"{env}: {done} env steps, {speed}, return {score}, update {max(status.version, 0)}, {lag}"
+    figures = [f"{env}: {done} env steps", speed, f"return {score}", f"update {max(status.version, 0)}"]
+    lag = lag_in_words(status.lag_mean, status.lag_max, status.ledger.get("used", 0))
+    return ", ".join([*figures, lag] if lag else figures)
 
 
 def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
@@ -205,7 +206,7 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
         "pid": str(worker.pid),
         "lanes": ",".join(map(str, worker.lanes)) if worker.state == "active" else _printable(worker.state),
         "tickets": str(worker.tickets),
-        "steps/s": f"{worker.steps_per_s:,.0f}",
+        "steps/s": per_second(worker.steps_per_s),
         "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",
         "silent": f"{worker.silent_s:.1f} s",
         "doing": in_words(_printable(worker.doing), worker.doing_s),

@@ -22,7 +22,7 @@ from learner.report.history import clock_time
 from learner.report.html_parts import return_text, section
 from learner.report.reported_runs import ReportedRun, RunResults
 from learner.report.run_lines import RunLine, algorithm_label, duration, headline
-from learner.report.sentences import bottleneck, went_wrong
+from learner.report.sentences import bottleneck, per_second, went_wrong
 from learner.run_folder.json_log import LoggedLine
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY
@@ -71,6 +71,20 @@ class Choice(NamedTuple):
         return Choice(first("metric", RETURN_KEY), first("over", "") == "time", min(max(rows, 1), MOST_SMOOTHED))
 
 
+def as_of_now(line: RunLine, seen: Seen) -> RunLine:
+    """The line with what the learner says: its folder knows the last update alone, and nothing before the first."""
+    status = seen.status
+    if status is None or status.env_steps < line.env_steps:
+        return line
+    learner_s = sum(status.stages.get(f"learner_{stage}", 0.0) for stage in ("wait", "update", "other"))
+    return line._replace(
+        env_steps=status.env_steps,
+        steps_per_s=status.steps_per_s or line.steps_per_s,
+        updates=max(line.updates, status.version),
+        wall_s=line.wall_s or learner_s,
+    )
+
+
 def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
     """Which run it is, in one sentence what it does, or how it ended, and its newest warning.
 
@@ -94,7 +108,8 @@ def now_sentence(line: RunLine, seen: Seen, results: RunResults | None) -> str:
     if seen.problem:
         text.append(f"Who waits for whom is not known: {seen.problem}.")
     elif results is not None:
-        text.append(bottleneck(seen.status.waiting if seen.status is not None else "", results.stages))
+        status = seen.status or Status("", ())
+        text.append(bottleneck(status.waiting, status.stages or results.stages))
     if results is not None and (wrong := went_wrong(results.ledger)):
         text.append(f"{wrong}.")
     return " ".join(filter(None, text))
@@ -116,7 +131,7 @@ def facts(line: RunLine) -> str:
     cells = {
         "Return, last 100 episodes": "none yet" if line.return_mean is None else return_text(line.return_mean),
         f"Env steps of {line.total_steps:,.0f}": f"{line.env_steps:,.0f}",
-        "Env steps per second": f"{line.steps_per_s:,.0f}",
+        "Env steps per second": per_second(line.steps_per_s),
         "Updates": f"{line.updates:,.0f}",
         "Time of training": duration(line.wall_s),
         "Started": line.started,
@@ -200,7 +215,7 @@ def workers(seen: Seen) -> str:
     for host, members in hosts.items():
         speed = sum(worker.steps_per_s for worker in members)
         count = f"{len(members)} worker{'s' * (len(members) > 1)}"
-        title = f"<b>{escape(host)}</b><span>{count}, {speed:,.0f} env steps per second</span>"
+        title = f"<b>{escape(host)}</b><span>{count}, {per_second(speed)} env steps per second</span>"
         rows = "".join(_worker(worker, seen.status) for worker in members)
         bodies.append(
             f'<tbody><tr class="line"><th scope="rowgroup" colspan="{len(COLUMNS)}">{title}</th></tr>{rows}</tbody>'
@@ -220,7 +235,7 @@ def _worker(worker: WorkerStatus, status: Status) -> str:
     lanes = ", ".join(map(str, worker.lanes)) if worker.state == "active" else worker.state
     weights = "none yet" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind"
     numbers = (
-        f"{worker.steps_per_s:,.0f}",
+        per_second(worker.steps_per_s),
         f"{worker.silent_s:.0f} s ago",
         f"{worker.resident_bytes / MIB:,.0f} MB" if worker.resident_bytes else "–",
     )

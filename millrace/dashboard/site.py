@@ -21,6 +21,7 @@ from learner.report.html_parts import document, return_text, section
 from learner.report.page import STYLE
 from learner.report.reported_runs import ReportData, group_runs
 from learner.report.run_lines import RunLine, algorithm_label, duration
+from learner.report.sentences import per_second
 from learner.run_folder.regular_files import open_regular
 from millrace.dashboard import run_page
 from millrace.dashboard.http import PageAnswer, PageRequest, StoredBody, refusal
@@ -78,6 +79,7 @@ class Site:
     def _run(self, run: Path, request: PageRequest, home: str) -> str:
         line, back = self._runs.line(run), "" if self._runs.only else home
         seen = self._look(run) if line.state == "training" else Seen()
+        line = run_page.as_of_now(line, seen)
         try:
             content = self._runs.content(run)
         except UsageError as error:
@@ -191,7 +193,7 @@ def _run_row(line: RunLine, home: str) -> str:
         f'<td><b class="state {line.state}">{line.state}</b></td>',
         f'<td class="number">{score}</td>',
         f'<td class="number">{escape(line.done)}{left}</td>',
-        f'<td class="number late">{line.steps_per_s:,.0f}</td>',
+        f'<td class="number late">{per_second(line.steps_per_s)}</td>',
         f'<td class="late">{line.started}</td>',
     ]
     return f'<tr id="run-{key}">{choose}{name}{"".join(cells)}</tr>'

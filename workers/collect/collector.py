@@ -29,7 +29,7 @@ from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
 from workers.acting import RolloutActions, acting_of
-from workers.activity import MAKING, activity
+from workers.activity import ENV_CALLS, MAKING, activity
 from workers.collect.collected_lane import CollectedLane
 from workers.conversation.held import Assignment
 from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
@@ -80,6 +80,45 @@ class _CollectedRows(NamedTuple):
     step_end_s: list[float]  # [T] by perf_counter
 
 
+class _UnderWay:
+    """Counts the env steps of rollouts while they are collected, also those of a row that is not whole.
+
+    Rule: the count never falls, and only calls of the environment that have returned are in it.
+    """
+
+    def __init__(self, rows: _CollectedRows, lanes: Sequence[CollectedLane], copies: int) -> None:
+        self._rows, self._lanes, self._copies = rows, lanes, copies
+        self._calls = activity().numbers
+        self._calls_before_row = 0
+
+    def begin_row(self) -> None:
+        """The row before is whole, and the next one begins."""
+        self._calls_before_row = self._calls[ENV_CALLS]
+
+    def env_steps(self) -> int:
+        """Those made so far."""
+        whole = len(self._rows.step_end_s)
+        if whole == self._rows.reward.shape[1]:
+            return self._of_rows(whole)
+        before, after = self._of_rows(whole), self._of_rows(whole + 1)
+        # Calls in this row that have returned. At worst the copies that it resets were called first.
+        calls = self._calls[ENV_CALLS] - self._calls_before_row
+        resets = len(self._lanes) * self._copies - (after - before)
+        return min(after, before + max(0, calls - resets))
+
+    def _of_rows(self, rows: int) -> int:
+        """Of so many rows. It is known before a row is made which copies that row only resets."""
+        return sum(rows * self._copies - self._resets(i, lane, rows) for i, lane in enumerate(self._lanes))
+
+    def _resets(self, i: int, lane: CollectedLane, rows: int) -> int:
+        if lane.seats is not None:
+            return int(np.count_nonzero(lane.seats.resets[:rows]))
+        if not rows:
+            return 0
+        ended = self._rows.terminated[i, : rows - 1] | self._rows.truncated[i, : rows - 1]  # [rows - 1, N]
+        return int(np.count_nonzero(lane.ended) + np.count_nonzero(ended))
+
+
 class Collector:
     """Collects rollouts. It opens a lane when a rollout of it is first asked for."""
 
@@ -91,8 +130,8 @@ class Collector:
         step_all: StepAll = no_step_for_all,
     ) -> None:
         """`step_all`: steps the env copies of all lanes at once, if one vector environment holds them all."""
-        self.steps = 0
-        """number of env steps collected; rows that are not valid do not count"""
+        self._ended_steps = 0  # of rollouts that are whole or were dropped
+        self._under_way: _UnderWay | None = None
         self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""
         self.env_attributes = b""
@@ -105,6 +144,11 @@ class Collector:
         self._opponents = KnownOpponents(run)
         self.lanes = OpenLanes[CollectedLane]()
         """the lanes with a rollout, until they are closed"""
+
+    @property
+    def steps(self) -> int:
+        """Number of env steps made, also of rollouts that are under way. A step that only resets a copy is none."""
+        return self._ended_steps + (0 if self._under_way is None else self._under_way.env_steps())
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Use these weights from now on."""
@@ -142,6 +186,7 @@ class Collector:
             lane.begin(None if assignment.opponent is None else opponents(assignment.opponent))
         rows = self._new_rows(lanes)
         actions = self._acting.begin([lane.generator for lane in lanes])
+        under_way = self._under_way = _UnderWay(rows, lanes, self._run.copies)
         try:
             self._act_and_step(rows, actions, lanes, pulse)
         except (EnvironmentFailed, PolicyFailed, IndexError):
@@ -151,6 +196,9 @@ class Collector:
                 check_observed(lane.number, self._stored, [array[i, : done + 1] for array in rows.obs], self._run.row_axes)
                 check_rewards(lane.number, rows.reward[i, :done], self._run.row_axes)
             raise
+        finally:
+            self._ended_steps += under_way.env_steps()
+            self._under_way = None
         return [
             self._rollout(rows, actions, i, lane, assignment, version, session)
             for i, (lane, assignment) in enumerate(zip(lanes, assignments, strict=True))
@@ -201,12 +249,14 @@ class Collector:
         if not with_seats:
             resets[:] = [lane.ended for lane in lanes]
         lane_numbers = [lane.number for lane in lanes]
-        stages = self.stages
+        stages, under_way = self.stages, self._under_way
+        assert under_way is not None
         views = [  # of every lane
             (lane, (rows.reward[i], rows.terminated[i], rows.truncated[i]), lane.writer.joined(leaf[i] for leaf in rows.obs))
             for i, lane in enumerate(lanes)
         ]
         for t in range(self._run.rollout_steps):
+            under_way.begin_row()
             pulse()
             began = perf_counter()
             with np.errstate(all="ignore"):  # a NaN is reported once the rollout is complete
@@ -262,7 +312,6 @@ class Collector:
         lane.obs = tuple(array[-1].copy() for array in obs)
         lane.state = rows.state[i].copy()
         resets, sent = None if lane.seats is None else lane.seats.resets, lane.sent
-        self.steps += int(np.count_nonzero(valid if resets is None else ~resets[:-1]))
         return Rollout(
             session=session,
             lane=lane.number,

@@ -274,8 +274,8 @@ def test_a_worker_that_never_answers_stalls_the_start(caplog: pytest.LogCaptureF
         shell(link, processes=beat)
     lines = [record.getMessage() for record in caplog.records if "no env steps" in record.getMessage()]
     assert lines == [
-        "no env steps for 30 s: worker w0 on host: 0.0 steps/s",
-        "no env steps for 90 s: worker w0 on host: 0.0 steps/s",
+        "no env steps for 30 s: worker w0 on host: no env step yet",
+        "no env steps for 90 s: worker w0 on host: no env step yet",
     ]
 
 

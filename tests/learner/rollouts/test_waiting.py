@@ -9,8 +9,9 @@ from learner.members.membership import Member
 from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
 from protocol.alive import Alive, Doing, WorkerActivity
-from protocol.messages import Goodbye, Heartbeat
+from protocol.messages import Evaluated, Goodbye, Heartbeat
 from protocol.random_streams import Purpose
+from protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
 
@@ -21,8 +22,8 @@ NO_WORKER = "a worker to join at tcp://box:5555 (the last one was killed by SIGK
 class Run:
     """A learner and its time, with workers of which a supervisor tells."""
 
-    def __init__(self, lanes: int = 2, max_lag: int = 0, workers: tuple[bytes, ...] = (A,)) -> None:
-        self.learner = Learner(lanes, max_lag=max_lag, publish=False)
+    def __init__(self, lanes: int = 2, max_lag: int = 0, workers: tuple[bytes, ...] = (A,), rollout_steps: int = 1) -> None:
+        self.learner = Learner(lanes, max_lag=max_lag, publish=False, rollout_steps=rollout_steps)
         for peer in workers:
             self.learner.joins(peer, host=f"host-of-{peer.decode()}")
         self.learner.publish(0)
@@ -61,7 +62,8 @@ def test_a_call_that_lasts_is_named_with_its_lanes_worker_and_host() -> None:
     assert run.line == "waiting 12 s for lane 1 (worker b on host-of-b: in reset for 11 s) and 1 more"
     (ticket,) = run.learner.tickets(A)
     run.learner.delivers(ticket)
-    assert run.line == "waiting 12 s for lane 1 (worker b on host-of-b: in reset for 11 s)"
+    awaited = "waiting 12 s for lane 1 (worker b on host-of-b: in reset for 11 s)"
+    assert run.line == f"{awaited}; first rollouts: 1 of 2 env steps"
 
 
 def test_a_wait_is_said_when_it_lasts() -> None:
@@ -88,7 +90,52 @@ def test_of_workers_that_make_short_steps_the_slowest_is_named_with_its_speed() 
     run.steps(B, 3)
     run.does(A, "stepping", 0.4)
     run.does(B, "stepping", 0.3)
-    assert run.line == "waiting 4 s for lane 1 (worker b on host-of-b: 3.0 steps/s) and 1 more"
+    assert run.line.startswith("waiting 4 s for lane 1 (worker b on host-of-b: 3.0 steps/s) and 1 more;")
+
+
+def test_with_a_slow_environment_it_says_how_much_of_the_first_rollouts_is_made_and_how_long_the_rest_takes() -> None:
+    run = Run(lanes=2, workers=(A, B), rollout_steps=64)
+    run.turn("gathering")
+    run.steps(A, 8)
+    assert run.line.endswith("; first rollouts: 8 of 128 env steps, about 15 s left"), "120 steps at 8 a second"
+    run.steps(B, 4)
+    assert run.line.endswith("; first rollouts: 12 of 128 env steps, about 14 s left"), "116 at 4 and at 4: a is silent"
+    run.learner.says(B, Goodbye(run.learner.session(B), "told to stop", ()))
+    assert "; first rollouts: 8 of 128 env steps" in run.line, "what b has made is lost"
+
+
+def test_env_steps_of_a_rollout_that_has_come_and_of_an_evaluation_are_not_counted_again() -> None:
+    run = Run(lanes=1)
+    run.learner.coordinator.begin_evaluation(EvaluationPlan.of(1, 0, 1, 10))
+    run.steps(A, 1)  # of the rollout, which came first
+    coordinator = run.learner.coordinator
+    assert coordinator.collected() == 1
+    run.learner.delivers(0)
+    assert coordinator.collected() == 1
+    run.learner.take()
+    (ticket,) = coordinator.evaluation.held
+    episode = Episode(1.0, 5, 0.0)
+    run.learner.says(A, Evaluated(run.learner.session(A), ticket, (episode,), (False,)))
+    coordinator.evaluation.end()
+    run.learner.publish(1)
+    run.steps(A, 5)  # in all 6: the rollout and the evaluation
+    assert coordinator.collected() == 0
+    run.steps(A, 1)
+    assert coordinator.collected() == 1
+    run.turn("gathering")
+    run.learner.now += 3.0
+    assert run.line.endswith("; next rollouts: 1 of 1 env steps")
+
+
+def test_env_steps_from_before_a_session_are_not_counted_in_it() -> None:
+    run = Run(lanes=1, rollout_steps=64)
+    run.steps(A, 20)
+    run.learner.joins(A, host="host-of-a", attempt=2)
+    assert run.learner.coordinator.collected() == 0
+    session, held = run.learner.session(A), tuple(run.learner.tickets(A))
+    for steps, collected in ((20, 0), (23, 3)):
+        run.learner.says(A, Heartbeat(session, 0, (0,), held, steps, {}, 0))
+        assert run.learner.coordinator.collected() == collected
 
 
 def test_a_process_that_is_stopped_is_silent_whatever_it_did_before() -> None:
@@ -119,7 +166,8 @@ def test_with_a_lag_every_lane_that_may_bring_the_next_rollout_counts_once() -> 
     run.does(B, "stepping", 0.1)
     assert run.line == "waiting 3 s for lane 0 (worker a on host-of-a: in step for 3 s) and 1 more"
     run.learner.delivers(run.learner.tickets(A)[0])  # the rollout of the next update; that of the one after is outstanding
-    assert run.line == "waiting 3 s for lane 1 (worker b on host-of-b: 0.0 steps/s)"
+    awaited = "waiting 3 s for lane 1 (worker b on host-of-b: no env step yet)"
+    assert run.line == f"{awaited}; first rollouts: 1 of 2 env steps"
 
 
 @pytest.mark.parametrize(("max_lag", "idle"), [(0, ", 1 of 1 workers waiting for weights"), (1, "")])

@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
+from learner.report.sentences import per_second
 from learner.run_folder.progress import Progress
 from learner.standard_streams import never_fails
 from millrace.sparkline import ASCII, BLOCKS, COLUMNS, MOST_POINTS, Sparkline
@@ -25,6 +26,7 @@ from millrace.terminal import (
     RateLimitedView,
     block_rows,
     count_line,
+    how_far,
     in_notebook,
     progress_view,
     render_block,
@@ -80,8 +82,28 @@ def test_a_note_is_printed_once_and_at_once() -> None:
 def test_a_plain_line_has_the_main_figures(capsys: pytest.CaptureFixture[str]) -> None:
     PlainLines().show(PROGRESS)
     assert capsys.readouterr().out == (
-        "62,208 of 100,000 env steps | 4,210 steps/s | return 231.4 | lag 0.5 (max 1) | workers 1 of 2 | update 243\n"
+        "62,208 of 100,000 env steps | 4,210 steps/s | return 231.4 | lag 0.5, largest 1 | workers 1 of 2 | update 243\n"
     )
+
+
+def test_before_the_first_update_it_counts_what_workers_have_made(capsys: pytest.CaptureFixture[str]) -> None:
+    """One env step takes a second, and the first update is minutes away."""
+    first = "waiting 23 s for lanes 0, 2 (worker w0 on vm: 1.0 steps/s) and 2 more; first rollouts: 45 of 512 env steps"
+    progress = Progress(
+        total_steps=5_000, collected=50, wall_s=25.0, steps_per_s=2.0, workers_alive=2, workers_expected=2, waiting=first
+    )
+    PlainLines().show(progress)
+    shown = "50 of 5,000 env steps | 2 steps/s | return none yet | workers 2 of 2 | update 0 | The learner has been "
+    assert capsys.readouterr().out == f"{shown}{first}.\n"
+    assert how_far(progress) == (0.01, "1%  0:25, 41:15 left")
+    assert block_rows(progress, Sparkline())["env steps"] == "50 of 5,000   2 a second   update 0"
+
+
+@pytest.mark.parametrize(
+    ("steps", "text"), [(0.0, "0"), (0.05, "0.05"), (1.94, "1.9"), (9.94, "9.9"), (9.96, "10"), (4210.3, "4,210")]
+)
+def test_a_slow_simulator_does_not_look_dead(steps: float, text: str) -> None:
+    assert per_second(steps) == text
 
 
 SLOWEST = "Updates are the slowest part: the learner updates for 75% of the time, and workers wait for 50%."
@@ -114,7 +136,7 @@ def test_the_block_has_everything() -> None:
     assert lines[1:] == [
         "env steps  62,208 of 100,000   4,210 a second   update 243",
         "return     231.4   ▁▂▂▇   best evaluation 240.0 at 50,000 env steps",
-        "workers    1 of 2   lag 0.5 (max 1)",
+        "workers    1 of 2   lag 0.5, largest 1",
         f"time       {SLOWEST}",
         f"lost       {LOST}",
         "run        runs/CartPole-v1-ppo-s1",
@@ -167,7 +189,7 @@ def test_a_block_that_is_redrawn_is_not_slowed_by_a_long_wait() -> None:
 
 def test_an_empty_progress_is_shown_too() -> None:
     assert block_rows(Progress(), Sparkline()) == {
-        "env steps": "0 of 0   0 a second   update 0", "return": "none yet", "workers": "0   lag 0.0 (max 0)",
+        "env steps": "0 of 0   0 a second   update 0", "return": "none yet", "workers": "0",
     }  # fmt: skip
     assert drawn(Progress())[0].endswith(" 0%  0:00")
 

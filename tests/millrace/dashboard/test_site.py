@@ -8,6 +8,7 @@ import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -169,6 +170,19 @@ def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
     assert "waiting learner waiting lane 0 collecting lane 1 resetting" in said
     assert pages.looked == [run]
     assert "Who waits for whom is not known: its learner does not answer." in silent
+
+
+def test_before_the_first_update_it_shows_what_workers_have_made(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    (run / METRICS_FILE).write_text("")
+    waits = "waiting 23 s for lane 0 (worker w0 on box: 1.0 steps/s); first rollouts: 45 of 512 env steps, about 4 min left"
+    known = msgspec.structs.replace(
+        status(worker()), version=0, env_steps=45, steps_per_s=1.9, waiting=waits, stages={"learner_wait": 23.4}
+    )
+    with RunLock(run):
+        said = Pages(tmp_path, seen=Seen(known)).said(f"run/{key_of(run)}")
+    assert f"1.9 env steps per second, about 14 h 36 min left. The learner has been {waits}." in said
+    assert "Env steps of 100,000 45 Env steps per second 1.9 Updates 0 Time of training 23.4 s" in said
 
 
 def test_where_nobody_waits_long_the_slowest_part_is_named(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 from unittest.mock import Mock
@@ -281,7 +282,7 @@ def test_a_pulse_may_abandon_the_collection() -> None:
         collector.collect([Assignment(0, 0, 0, 0), Assignment(1, 1, 0, 0)], 0, 0, pulse)
     assert sorted(said) == ["b", "c"]
     collect(collector, run, 1, lanes=(2,))  # lane 2 goes on,
-    assert collector.steps == 80
+    assert collector.steps == 80 + 2  # two lanes had made a step each when they were abandoned
     collect(collector, run, lanes=(0,))  # and lane 0 can begin again
 
 
@@ -327,6 +328,37 @@ def test_stages_and_steps_are_counted() -> None:
     assert collector.steps == 28
     assert collector.stages.keys() == {"open", "act", "step"}
     assert min(collector.stages.values()) > 0
+
+
+@pytest.mark.parametrize("env", ["Scripted", "Countdown"])
+@pytest.mark.parametrize("lanes", [(0,), (0, 1)])
+def test_steps_are_counted_while_a_rollout_is_under_way(
+    env: str, lanes: Sequence[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also between the copies of one lane, whose step may take minutes; resets are no steps."""
+    monkeypatch.setattr("workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
+    run = run_of(f"{TOY}{env}-v0", T=9, N=3)
+    made = 0
+
+    def counted(step: Callable[..., Any]) -> Callable[..., Any]:
+        def stepped(env: Any, action: Any) -> Any:
+            nonlocal made
+            made += 1
+            return step(env, action)
+
+        return stepped
+
+    toy: type[Scripted | Countdown] = {"Scripted": Scripted, "Countdown": Countdown}[env]
+    monkeypatch.setattr(toy, "step", counted(toy.step))
+    collector, seen = random_collector(run), list[tuple[int, int]]()
+    for k in range(3):
+        pulse = lambda: seen.append((collector.steps, made))  # noqa: E731
+        collector.collect([Assignment(10 * k + lane, lane, 0, k) for lane in lanes], 0, 0, pulse)
+        assert collector.steps == made
+    reported = [steps for steps, _ in seen]
+    assert reported == sorted(reported)
+    assert all(made - len(lanes) * run.copies < steps <= made for steps, made in seen)  # resets of a row may come first
+    assert len(set(reported)) > 3 * run.rollout_steps  # more than one count in a row
 
 
 def test_collecting_imports_no_torch_for_an_mlp() -> None:
