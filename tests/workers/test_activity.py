@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from time import perf_counter
+from typing import Any
 
 import gymnasium
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from protocol.alive import CallTimeouts
+from protocol.wire.plain_values import pack
 from workers.activity import (
     DOING,
     ENV_CALLS,
@@ -20,6 +23,7 @@ from workers.activity import (
     activity,
     share_activity,
 )
+from workers.copies.env_copies import LoopedCopies, VectorCopies
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import EnvLoop
 from workers.envs.toy import Countdown
@@ -66,6 +70,40 @@ def test_the_page_says_what_a_loop_does_at_each_moment() -> None:
     Watched.seen = []
     loop.close()
     assert Watched.seen == ["closing"] * 2
+
+
+class Attributes(Countdown):
+    """Its attributes are properties, as those of an environment on another machine may be."""
+
+    @property
+    def observation_space(self) -> gymnasium.Space[Any]:
+        Watched.seen.append(ActivityReader(activity()).read(perf_counter()).doing)
+        return self._space
+
+    @observation_space.setter
+    def observation_space(self, space: gymnasium.Space[Any]) -> None:
+        self._space = space
+
+    @property
+    def wind(self) -> float:
+        return 0.0
+
+    @wind.setter
+    def wind(self, value: float) -> None:
+        Watched.seen.append(ActivityReader(activity()).read(perf_counter()).doing)
+
+
+def test_the_page_names_what_the_environment_does_when_its_attributes_are_read_or_set() -> None:
+    Watched.seen = []
+    share_activity(page := Activity())
+    loop = LoopedCopies([Attributes], lambda: None)
+    loop.assign("wind", pack(2.0), lambda: None)
+    lane = VectorCopies(SyncVectorEnv([Attributes], autoreset_mode=AutoresetMode.NEXT_STEP))
+    made = len(Watched.seen)  # gymnasium's class reads them, too
+    lane.assign("wind", pack(2.0), lambda: None)
+    assert Watched.seen[:2] == ["making", "stepping"]
+    assert Watched.seen[made:] == ["stepping"]
+    assert ActivityReader(page).read(perf_counter()).doing == "waiting"
 
 
 class Exits(Countdown):

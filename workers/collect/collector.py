@@ -56,9 +56,10 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         case "native":
             with activity().during(MAKING):
                 env = make_copy(first, lambda: make_native(run.env, run.copies))
-            return VectorCopies(env, run.facts, masked=run.masked, critic_keys=keys)
+                return VectorCopies(env, run.facts, masked=run.masked, critic_keys=keys)
         case "envpool":
-            return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
+            with activity().during(MAKING):  # the module that registers the environment is imported
+                return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
         case "loop" if run.seats:
             return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first)
         case "loop":

@@ -28,7 +28,7 @@ from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
 from protocol.specs import RunSpec
 from protocol.wire.plain_values import unpack
-from workers.activity import EVALUATING, RESETTING, STEPPING, activity
+from workers.activity import EVALUATING, MAKING, RESETTING, STEPPING, activity
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
@@ -140,7 +140,8 @@ class LoopedCopies:
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
         self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=EVALUATING if evaluates else STEPPING)
         self.envs, self.count = self._loop.envs, len(self._loop.envs)
-        self.observation_space, self.action_space = self.envs[0].observation_space, self.envs[0].action_space
+        with self._activity.during(MAKING):  # to read an attribute of the environment may run code of its own
+            self.observation_space, self.action_space = self.envs[0].observation_space, self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
         if masked:
             self.observation_space = without_mask(self.observation_space, self.action_space)
@@ -174,8 +175,9 @@ class LoopedCopies:
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of every copy; of its wrappers, the outermost one that has it gets it."""
-        for n, env in enumerate(self.envs):
-            set_attribute(n, env, name, unpack(packed))  # each its own value: they may change it
+        with self._activity.during(STEPPING):
+            for n, env in enumerate(self.envs):
+                set_attribute(n, env, name, unpack(packed))  # each its own value: they may change it
 
     def render(self, copy: int) -> Any:
         """What this copy renders."""
@@ -310,12 +312,13 @@ class VectorCopies:
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of the vector environment, or of each of its copies where it has them (`SyncVectorEnv`)."""
-        copies = getattr(self._env.unwrapped, "envs", None)
-        if isinstance(copies, list | tuple):
-            for n, env in enumerate(copies):
-                set_attribute(n, env, name, unpack(packed))
-        else:
-            set_attribute(None, self._env, name, unpack(packed))
+        with self._activity.during(STEPPING):
+            copies = getattr(self._env.unwrapped, "envs", None)
+            if isinstance(copies, list | tuple):
+                for n, env in enumerate(copies):
+                    set_attribute(n, env, name, unpack(packed))
+            else:
+                set_attribute(None, self._env, name, unpack(packed))
 
     def _of_ended(self, infos: dict[str, Any], ended: Array) -> Facts:
         if not self._facts or not np.any(ended):

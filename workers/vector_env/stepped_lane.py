@@ -21,6 +21,7 @@ from protocol.envs.which_copy import EnvCopy
 from protocol.errors import UsageError
 from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
+from workers.activity import MAKING, activity
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import CopyInfos, EnvLoop, Pulse
 from workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
@@ -55,11 +56,12 @@ class SteppedLane:
         makes = [partial(_make_copy, spec, first + copy) for copy in range(self.count)]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=_first_copy(spec, lane))
-        env = self._loop.envs[0]
-        self._nested_actions = _is_nested(env.action_space)
-        self._nest = make_unflatten(env.action_space)
-        self._nested_observations = _is_nested(env.observation_space)
-        self._read = make_flatten(env.observation_space)
+        with activity().during(MAKING):  # to read an attribute of the environment may run code of its own
+            observation, action = self._loop.envs[0].observation_space, self._loop.envs[0].action_space
+        self._nested_actions = _is_nested(action)
+        self._nest = make_unflatten(action)
+        self._nested_observations = _is_nested(observation)
+        self._read = make_flatten(observation)
         self._observations: list[Any] = [None] * self.count  # as the copies returned them last
         self._seats = spec.seats
         self._writer = ObservationWriter(spec.leaves, len(rows.reward), spec.seats)
