@@ -105,6 +105,7 @@ class OpenRun:
         finally:
             files.close()
             audience.close()
+        audience.confirm_recorded()
 
     def _learn_from_prior(self, prior: PriorDataset) -> None:
         """Make the gradient steps before the first rollouts, with checkpoints when it is time, and at an interrupt."""

@@ -22,6 +22,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder.progress import Progress, Row, named, steps_per_second
 from learner.run_folder.requests import Requests
 from protocol.arrays import Array
+from protocol.errors import RunError
 from protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
@@ -43,6 +44,7 @@ class Audience:
         """`requests`: what callbacks ask for. `dataset` gets the episodes of training. It is closed with the audience."""
         self._config, self._hub, self._tally, self._state = run.config, run.hub, run.tally, run.tally.state
         self._callbacks, self._files, self._requests, self._dataset = callbacks, files, requests, dataset
+        self._not_recorded: RunError | None = None
         self._settings = msgspec.to_builtins(run.config)
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._workers_alive = 0
@@ -85,8 +87,7 @@ class Audience:
             self._callbacks.on_rollouts(progress)
             if self._callbacks.stop_reason is not None:
                 return False
-        if self._dataset is not None:
-            self._dataset.add(rollouts)
+        self._record(rollouts)
         self._tally.gathered_s = time.monotonic() - began_s
         return True
 
@@ -138,6 +139,11 @@ class Audience:
         if self._dataset is not None:
             log.warning("%s", self._dataset.close())
 
+    def confirm_recorded(self) -> None:
+        """Raise `RunError` if the dataset that the run was to write could not be written."""
+        if self._not_recorded is not None:
+            raise self._not_recorded
+
     def env_attributes(self) -> Array | None:
         """The attributes of env copies that callbacks have set, for the weights of this version."""
         return self._requests.attributes.table(self._state.version)
@@ -147,6 +153,16 @@ class Audience:
         return self._progress(self._hub.snapshot())
 
     # ---------------------------------------------------------------- inside
+
+    def _record(self, rollouts: Sequence[AcceptedRollout]) -> None:
+        """Record episodes. If the disk refuses them, training continues, as it does without checkpoints."""
+        if self._dataset is None:
+            return
+        try:
+            self._dataset.add(rollouts)
+        except RunError as error:
+            log.warning("%s; it is removed, and training continues", error)
+            self._dataset, self._not_recorded = None, error
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
         """`collected`: env steps that wait for the next update, if that is awaited."""

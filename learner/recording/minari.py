@@ -7,7 +7,6 @@ take at most about `CHUNK_BYTES` of memory. Images are stored unchanged, not as 
 from __future__ import annotations
 
 import shutil
-import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from types import TracebackType
@@ -16,6 +15,8 @@ from typing import Any, Self
 import gymnasium
 from gymnasium import spaces
 
+from learner.recording.dataset_files import ARRAYS
+from learner.recording.episode_file import append_episodes
 from learner.recording.episodes import RecordedEpisode
 from protocol.arrays import Array
 from protocol.errors import RunError, UsageError, first_line
@@ -51,7 +52,8 @@ class MinariDataset:
         above = self._folder.parents[: len(self._folder.relative_to(root).parts) - 1]
         self._new_folders = [folder for folder in above if not folder.exists()]  # innermost first
         self._id, self._env, self._about = dataset_id, env, about
-        self._dataset: Any = None
+        self._storage: Any = None  # the dataset's files, once an episode is to be written
+        self._episodes = self._steps = 0  # that are in them
         self._chunk: list[Any] = []
         self._chunk_bytes = 0
 
@@ -101,29 +103,45 @@ class MinariDataset:
                 self.discard()
 
     def _write(self) -> None:
-        import minari
-
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # Minari asks for an author, a permalink, …
-                if self._dataset is None:
-                    self._dataset = minari.create_dataset_from_buffers(
-                        self._id,
-                        buffer=self._chunk,
-                        env=self._env if _spec_can_be_stored(self._env) else None,
-                        observation_space=self._env.observation_space,
-                        action_space=self._env.action_space,
-                        algorithm_name="millrace",
-                        description=self._about,
-                        data_format="hdf5",
-                        jpeg_encoding=False,  # images as they were
-                    )
-                else:
-                    self._dataset.update_dataset_from_buffer(self._chunk)
+            if self._storage is None:
+                self._storage = self._new_storage()
+            append_episodes(self._storage.data_path / ARRAYS, self._episodes, self._chunk)
+            self._episodes += len(self._chunk)
+            self._steps += sum(len(episode.rewards) for episode in self._chunk)
+            size = self._storage.get_size()
+            self._storage.update_metadata(
+                {"total_steps": self._steps, "total_episodes": self._episodes, "dataset_size": size}
+            )
         except Exception as error:
             says = first_line(error, "")
             raise RunError(f"dataset {self._id} was not written: {type(error).__name__}: {says}") from error
         self._chunk, self._chunk_bytes = [], 0
+
+    def _new_storage(self) -> Any:
+        """The dataset's files, without an episode."""
+        import minari
+        from minari.dataset.minari_dataset import parse_dataset_id
+        from minari.dataset.minari_storage import MinariStorage
+        from minari.namespace import create_namespace, list_local_namespaces
+
+        data = self._folder / "data"
+        data.mkdir(parents=True)
+        namespace, _, _ = parse_dataset_id(self._id)
+        if namespace is not None and namespace not in list_local_namespaces():
+            create_namespace(namespace)
+        spec = self._env.spec if _spec_can_be_stored(self._env) else None
+        storage = MinariStorage.new(
+            data,
+            observation_space=self._env.observation_space,
+            action_space=self._env.action_space,
+            env_spec=spec,
+            data_format="hdf5",
+            jpeg_encoding=False,  # images as they were
+        )
+        about = {"dataset_id": self._id, "algorithm_name": "millrace", "description": self._about}
+        storage.update_metadata(about | {"minari_version": minari.__version__})
+        return storage
 
 
 def nested(space: gymnasium.Space[Any], leaves: Iterator[Array]) -> Any:

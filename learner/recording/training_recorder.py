@@ -40,7 +40,8 @@ class TrainingRecorder:
                 try:
                     self._dataset.add(episode)
                 except RunError:
-                    self._episodes = 0  # so `close` removes it
+                    self._episodes = 0
+                    self._dataset.discard()
                     raise
                 self._episodes += 1
 

@@ -483,7 +483,6 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     root: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
 ) -> None:
     """`chunk_bytes`: whether the second episode is written while the run trains, or at its end."""
-    from minari.dataset.minari_dataset import MinariDataset
     from minari.dataset.minari_storage import MinariStorage
 
     def full(*_: Any, **__: Any) -> None:
@@ -495,7 +494,7 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
     monkeypatch.setattr(dataset_module, "CHUNK_BYTES", chunk_bytes)
     recorder.add(first)
-    monkeypatch.setattr(MinariDataset, "update_dataset_from_buffer", full)
+    monkeypatch.setattr(dataset_module, "append_episodes", full)
     monkeypatch.setattr(MinariStorage, "new", full)
     says = "dataset ns/countdown-v0 was not written: OSError: .*No space left on device"
     if chunk_bytes == 1:

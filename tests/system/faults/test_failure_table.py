@@ -12,15 +12,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-import pytest
 
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
 from tests.system.stage.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within
+from tests.system.stage.small_disk import filled, small_disk
 from workers.slots import FILE_VARIABLE
 
 LOCAL = {"transport": "tcp", "rollout-steps": 16, "batch-size": 64, "n-epochs": 1, "eval-episodes": 1}
@@ -228,30 +225,6 @@ def test_training_goes_on_after_an_environment_hung(stage: Stage) -> None:
     learner.trains()
     learner.hears(r"worker w\d \(.*\) joined", START_S, times=3)  # its supervisor has started another
     finish(learner, workers)
-
-
-@contextmanager
-def small_disk(at: Path) -> Iterator[Path]:
-    """Mount a file system of 4 MB."""
-    if os.geteuid() != 0:
-        pytest.skip("mounting a small file system takes root")
-    at.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(at)], check=True, timeout=10)
-    try:
-        yield at
-    finally:
-        subprocess.run(["umount", "-l", str(at)], check=True, timeout=10)
-
-
-def filled(disk: Path) -> Path:
-    """Fill the disk with a file."""
-    filler = disk / "filler"
-    with filler.open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(bytes(4096))
-        except OSError:
-            return filler
 
 
 def test_training_goes_on_while_the_disk_is_full(stage: Stage) -> None:

@@ -27,16 +27,18 @@ from learner.config.layers import resolve
 from learner.report.reported_runs import read_run
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
+from learner.run_folder.results import ALL_STEPS_DONE
 from learner.run_folder.run_format import check_format
 from millrace.launch import learner_inference
 from millrace.launch.training import train
-from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
+from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support.in_process.saved_policies import load_policy
 from tests.system.stage import preloaded
 from tests.system.stage.local_runs import SMALL, TOY, run, start, worker_processes
 from tests.system.stage.processes import START_S, wait_for
 from tests.system.stage.run_folders import policy_of, summary
 from tests.system.stage.runs import balanced
+from tests.system.stage.small_disk import filled, small_disk
 from workers.envs.toy import Countdown
 from workers.slots import LIMIT_VARIABLE
 
@@ -199,6 +201,25 @@ def test_a_checkpoint_is_saved_after_every_update_if_no_second_may_pass(tmp_path
     settings: dict[str, Any] = {"checkpoint_every_s": 0.0, "keep_checkpoints": 100, "steps": 2_560, **SMALL}
     folder = run(tmp_path, "CartPole-v1", **settings)
     assert len(list((folder / "checkpoints").iterdir())) == 1 + summary(folder)["updates"]  # one at the start
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 2**20], ids=["while it trains", "at its end"])
+def test_a_dataset_for_which_there_is_no_space_costs_no_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, chunk_bytes: int
+) -> None:
+    """HDF5 would end the process. The run is complete, and fails as one whose summary cannot be written."""
+    monkeypatch.setattr("learner.recording.minari.CHUNK_BYTES", chunk_bytes)
+    with small_disk(tmp_path / "disk") as disk:
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(disk))
+        filler = filled(disk)
+        os.truncate(filler, filler.stat().st_size - 30_000)  # so that the first write begins
+        with pytest.raises(RunError, match=r"^dataset cartpole/training-v0 was not written: .*No space left on device$"):
+            run(tmp_path, "CartPole-v1", steps=3_000, record="cartpole/training-v0", **SMALL)
+        assert list(disk.iterdir()) == [filler]
+    (folder,) = tmp_path.glob("runs*/*")
+    assert summary(folder)["stop_reason"] == ALL_STEPS_DONE
+    said = [record.getMessage() for record in caplog.records if "not written" in record.getMessage()]
+    assert len(said) == (chunk_bytes == 1)
 
 
 def test_training_episodes_are_recorded_whole(

@@ -1,0 +1,142 @@
+"""Appends episodes to the HDF5 file of a Minari dataset, in Minari's layout.
+
+Rule: HDF5 never learns that a write failed. If it does, as on a full disk, it cannot close the file, and the process ends in
+a segmentation fault. So HDF5 writes through a file that remembers the first error, and keeps in memory what could not be
+written until HDF5 has closed it. Only then the error is raised.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from learner.run_folder.regular_files import open_regular
+from protocol.arrays import Array
+
+
+def append_episodes(path: Path, first: int, episodes: Sequence[Any]) -> None:
+    """Append episodes (Minari's `EpisodeBuffer`), of which the first one gets this number. With 0, the file is made.
+
+    Raises `OSError` if the file cannot be written; it is of no use then.
+    """
+    # Ctrl-C raises in the main thread, wherever that is. HDF5 must not see that either.
+    with ThreadPoolExecutor(1, "recording") as writer:
+        writer.submit(_append, path, first, episodes).result()
+
+
+def _append(path: Path, first: int, episodes: Sequence[Any]) -> None:
+    import h5py
+
+    written = _RememberingFile(open_regular(path, os.O_RDWR | os.O_CREAT))
+    try:
+        with h5py.File(written, "r+" if first else "w", track_order=not first or None) as file:
+            for number, episode in enumerate(episodes, first):
+                group = file.create_group(f"episode_{number}")
+                group.attrs["id"], group.attrs["total_steps"] = number, len(episode.rewards)
+                if episode.seed is not None:
+                    group.attrs["seed"] = episode.seed
+                _add(group, "observations", episode.observations)
+                _add(group, "actions", episode.actions)
+                _add(group, "rewards", episode.rewards)
+                _add(group, "terminations", episode.terminations)
+                _add(group, "truncations", episode.truncations)
+                _add(group, "infos", {})
+                if written.error is not None:
+                    break
+    finally:
+        written.close()
+    if written.error is not None:
+        raise written.error
+
+
+def _add(group: Any, name: str, data: Any) -> None:
+    """Add an array, or the arrays of a Dict or a Tuple, one of whose entries is called `_index_0`."""
+    match data:
+        case Mapping():
+            inside = group.create_group(name)
+            for key, inner in data.items():
+                _add(inside, key, inner)
+        case tuple():
+            _add(group, name, {f"_index_{index}": inner for index, inner in enumerate(data)})
+        case _:
+            array: Array = np.asarray(data)
+            group.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
+
+
+class _RememberingFile(io.RawIOBase):
+    """A file for h5py that every write seems to reach."""
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self.error: OSError | None = None
+        """the first one"""
+        self._descriptor = descriptor
+        self._at = 0
+        self._unwritten: list[tuple[int, bytes]] = []  # where, what; in the order of the writes
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place, counted from the beginning, from here, or from the end."""
+        match whence:
+            case os.SEEK_CUR:
+                offset += self._at
+            case os.SEEK_END:
+                ends = (at + len(data) for at, data in self._unwritten)
+                offset += max(os.fstat(self._descriptor).st_size, *ends, 0)
+        self._at = offset
+        return offset
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written, or seems to be; zeros beyond the end."""
+        wanted = memoryview(buffer).cast("B")
+        found = os.pread(self._descriptor, len(wanted), self._at)
+        wanted[:] = found.ljust(len(wanted), b"\0")
+        for at, data in self._unwritten:
+            begin, end = max(at, self._at), min(at + len(data), self._at + len(wanted))
+            if begin < end:
+                wanted[begin - self._at : end - self._at] = data[begin - at : end - at]
+        return len(wanted)
+
+    def write(self, data: Any) -> int:
+        """Write all of it, or remember why not."""
+        view = memoryview(data).cast("B")
+        if not self._tried(lambda: self._write(view)):
+            self._unwritten.append((self._at, bytes(view)))
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Cut or extend the file."""
+        length = self._at if size is None else size
+        self._tried(lambda: os.ftruncate(self._descriptor, length))
+        return length
+
+    def flush(self) -> None:
+        """Nothing waits to be written."""
+
+    def close(self) -> None:
+        """Close it. Some file systems say only now that there is no space."""
+        if not self.closed:
+            super().close()
+            try:
+                os.close(self._descriptor)
+            except OSError as error:
+                self.error = self.error or error
+
+    def _write(self, view: memoryview) -> None:
+        done = 0
+        while done < len(view):
+            done += os.pwrite(self._descriptor, view[done:], self._at + done)
+
+    def _tried(self, write: Callable[[], object]) -> bool:
+        """Whether it could be written. After the first error nothing more is."""
+        if self.error is None:
+            try:
+                write()
+            except OSError as error:
+                self.error = error
+        return self.error is None
