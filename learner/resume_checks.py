@@ -107,7 +107,7 @@ def _is_finished(config: Config, folder: RunFolder) -> bool:
     reason = reason_to_stop(
         config,
         env_steps_after_next_update=summary.env_steps + config.algorithm.rollout_steps * config.envs,
-        evaluation_return=summary.evaluation.return_mean,
+        evaluation_return=summary.evaluation.return_mean if summary.ended_by is None else summary.ended_by,
         training_return=summary.return_mean_100,
     )
     return reason == summary.stop_reason

@@ -157,7 +157,7 @@ class ObservationNormalizer:
         self._first = first.numpy().astype(np.float64).reshape(len(first), D)
 
 
-def _bounded(rows: Floats | Doubles, center: Doubles, spread: Doubles) -> Floats | Doubles:
+def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | Doubles) -> Floats | Doubles:
     """The rows [B, D], with values that are far from the center [D] replaced; the same array if none is."""
     distance = rows - center.astype(rows.dtype)
     if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():

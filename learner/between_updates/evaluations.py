@@ -1,7 +1,8 @@
 """Evaluations of one run: each version at most once, the best policy kept, and that one evaluated again at the end.
 
-The highest of several evaluations is biased upwards. So the summary reports the best policy by a
-second evaluation, on other episodes.
+A number that decided something is no measurement of it: the highest of several evaluations is biased upwards, and so is one
+that ended the run, because it reached the target or because a callback saw it. So the summary reports the best policy, and
+the final policy of such a run, by a second evaluation, on other episodes.
 
 Rule: without `eval_workers`, training waits for each evaluation. With them, an evaluation is beside training: its result
 counts when the next one is due, or at the end, and is awaited there. So it does not depend on anybody's speed what a run
@@ -18,7 +19,7 @@ from learner.between_updates.run_parts import RunParts
 from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
 from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from learner.run_folder.progress import Row
-from learner.run_folder.results import EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
+from learner.run_folder.results import ALL_STEPS_DONE, EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
 from protocol.arrays import Array, Floats
 from protocol.logs.notices import log_notice
 from protocol.random_streams import Purpose
@@ -33,6 +34,10 @@ class Evaluations:
         """`time_limit`: env steps after which an episode of an evaluation is truncated, if any."""
         self.confirmed: Best | None = None
         """The best policy and its second evaluation, once the run was concluded."""
+        self.final: Evaluation | None = None
+        """The evaluation of the final policy to report, once the run was concluded."""
+        self.ended_by: Evaluation | None = None
+        """The one that ended the run, if it was of the final policy. Then `final` is a second one, on other episodes."""
         self._run, self._config, self._time_limit = run, run.config, time_limit
         self._tally, self._state = run.tally, run.tally.state
         self.write_best()  # the folder may have that of a later version, which was lost
@@ -86,13 +91,19 @@ class Evaluations:
 
         Returns whether the final policy had no such evaluation before.
         """
-        state, before = self._state, self.of_newest()
+        state, before, ended = self._state, self.of_newest(), self._tally.stop_reason() != ALL_STEPS_DONE
         size = final_evaluation_size(self._config, state.env_steps, self._tally.window.length_mean, self._time_limit)
         if size != (usual := evaluation_size(self._config)):
             log_notice(log, _smaller(size, usual))
         found = self._evaluate_newest(size, watch)
         if self._config.eval_every or state.best is not None:  # best: of a run that was resumed with eval_every 0
             self._keep_if_best(found, state.env_steps, self._run.algorithm.weights)
+        if ended and before is not None:
+            found_again = self._evaluate(Purpose.CONFIRMATION, size, watch)
+            self._say(found_again, state.env_steps)
+            self.final, self.ended_by = found_again, before
+        else:
+            self.final = found
         self.confirmed = self._confirm(size, watch)
         return found is not before
 
@@ -102,6 +113,12 @@ class Evaluations:
             return
         policy, spec, folder = self._state.best_policy, self._run.spec, self._run.folder
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
+
+    def to_report(self) -> Evaluation | None:
+        """The evaluation of the newest policy, also of a run that was cut short; none that may have ended the run."""
+        if self.final is not None:
+            return self.final
+        return self.of_newest() if self._tally.stop_reason() in (None, ALL_STEPS_DONE) else None
 
     def of_newest(self) -> Evaluation | None:
         """The evaluation of the newest policy, if there is one."""
@@ -113,6 +130,8 @@ class Evaluations:
         if state.best is None:
             return None
         chosen_by, env_steps = state.best
+        if self.final is not None and self.ended_by is not None and env_steps == state.env_steps:
+            return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=self.final)
         self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
         confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
         return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=confirmed)
@@ -128,7 +147,10 @@ class Evaluations:
     def _found(self, found: Evaluation, of: EvaluatedPolicy) -> None:
         """The newest evaluation found this, of this policy."""
         self._state.newest_evaluation, self._state.evaluated = found, of
-        self._tally.note = f"{of.env_steps:,} env steps: greedy {found}"
+        self._say(found, of.env_steps)
+
+    def _say(self, found: Evaluation, env_steps: int) -> None:
+        self._tally.note = f"{env_steps:,} env steps: greedy {found}"
 
     def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
         """Evaluate the weights that were published last, while training waits."""
@@ -150,12 +172,13 @@ class Evaluations:
         return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, found: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
-        """Keep the policy, of which this was found after so many env steps, if it is the best.
+        """Keep the policy, of which this was found after so many env steps, if none was better.
 
-        A tie keeps the earlier one, which needed fewer steps.
+        A tie keeps the newer one: it has learned more, and where all returns are equal, as in a zero-sum game that the
+        policy plays with itself, they say nothing else.
         """
         state = self._state
-        if state.best is None or found.return_mean > state.best[0]:
+        if state.best is None or found.return_mean >= state.best[0]:
             state.best, state.best_policy = (found.return_mean, env_steps), policy()
             self.write_best()
 

@@ -172,6 +172,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
     evaluation: Evaluation | None
     """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
+    ended_by: Real | None = None
+    """the mean return that ended the run, by reaching `target_return` or because a callback saw it, if it was of the final
+    policy. A return that decides something is biased upwards: `evaluation` is then a second one, on other episodes"""
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
     ledger: dict[str, Natural] = {}

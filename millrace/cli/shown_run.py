@@ -58,7 +58,8 @@ def result(summary: Summary) -> list[str]:
     """How a run ended, and what its policy reached."""
     lines = [f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s"]
     if summary.evaluation is not None:
-        lines.append(f"greedy {summary.evaluation}")
+        others = "" if summary.ended_by is None else ", on other episodes than those that ended the run"
+        lines.append(f"greedy {summary.evaluation}{others}")
     if (best := summary.best) is not None and best.env_steps != summary.env_steps:
         lines.append(f"best policy, after {best.env_steps:,} env steps: greedy {best.evaluation}")
     return lines

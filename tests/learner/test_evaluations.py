@@ -59,10 +59,12 @@ class Fakes:
     def write_policy(self, run: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
 
-    def evaluations(self, every: int, state: RunState, seed: int = 1, **settings: Any) -> tuple[Tally, Evaluations]:
+    def evaluations(
+        self, every: int, state: RunState, seed: int = 1, ended_by: Any = lambda: None, **settings: Any
+    ) -> tuple[Tally, Evaluations]:
         config = Config(eval_every=every, eval_episodes=10, seed=seed, **settings)
         folder, algorithm, hub = cast(RunFolder, self), cast(Algorithm, self), cast(Hub, self)
-        tally = Tally(config, run_spec(), state)
+        tally = Tally(config, run_spec(), state, ended_by)
         return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, tally), None)
 
 
@@ -118,7 +120,8 @@ TARGET = "target return 5 reached"
         (1, [6.0, 1.0], [100], f"{TARGET} by the policy of 100 env steps", (6.0, 100)),
         (0, [3.0, 1.0, 2.0, 6.0], [100, 200, 300, 400], TARGET, (6.0, 400)),
         (1, [3.0, 1.0, 2.0, 6.0], [100, 200, 300], "all steps done", (6.0, 400)),
-        (1, [3.0, 3.0, 2.0, 1.0], [100, 200, 300], "all steps done", (3.0, 100)),
+        (1, [3.0, 3.0, 2.0, 1.0], [100, 200, 300], "all steps done", (3.0, 200)),
+        (0, [0.0, 0.0, 0.0, 0.0], [100, 200, 300, 400], "all steps done", (0.0, 400)),
     ],
 )
 def test_when_a_run_stops_and_which_policy_it_keeps(
@@ -138,6 +141,69 @@ def test_when_a_run_stops_and_which_policy_it_keeps(
     assert state.best == best
     number = best[1] // 100 - 1  # what `Fakes.weights` were when this policy was to be evaluated
     assert fakes.written[-1] == number + (eval_workers == 0)
+
+
+def concluded(fakes: Fakes, returns_to_stop: int, **settings: Any) -> tuple[Evaluations, RunState, list[tuple[int, ...]]]:
+    """A run with so many evaluations, which ends after the last of them. Also the seeds of the evaluations that follow."""
+    state = RunState()
+    tally, evaluations = fakes.evaluations(100, state, steps=1_000_000, **settings)
+    assert due((tally, evaluations), *range(100, 100 * returns_to_stop + 1, 100)) == [
+        *range(100, 100 * returns_to_stop + 1, 100)
+    ]
+    before = len(fakes.seeds)
+    assert tally.stop_reason() is not None
+    evaluations.conclude(lambda: None)
+    return evaluations, state, fakes.seeds[before:]
+
+
+def test_the_return_that_reached_the_target_is_not_the_one_that_is_reported() -> None:
+    """The best policy is the final one: a single evaluation on other episodes reports both."""
+    fakes = Fakes(3.0, 6.0, 4.5)
+    evaluations, state, again = concluded(fakes, 2, target_return=5.0)
+    assert evaluations.final is not None
+    assert evaluations.confirmed is not None
+    assert evaluations.ended_by is not None
+    assert (evaluations.final.return_mean, evaluations.ended_by.return_mean) == (4.5, 6.0)
+    assert evaluations.to_report() is evaluations.final is evaluations.confirmed.evaluation
+    assert evaluations.confirmed.chosen_by == 6.0
+    (others,) = again
+    assert not {*others} & {*fakes.seeds[0]}
+    assert state.newest_evaluation is evaluations.ended_by  # the run would end here again, if it were resumed
+
+
+def test_nor_is_it_where_an_earlier_policy_was_better() -> None:
+    """The target was set when the run was resumed."""
+    fakes = Fakes(8.0, 6.0, 4.5, 7.0)
+    policy = np.array([-1], np.float32), np.zeros(0, np.float32)
+    state = RunState(best=(8.0, 50), best_policy=policy)
+    tally, evaluations = fakes.evaluations(100, state, steps=1_000_000, target_return=5.0)
+    next(fakes.returns)
+    assert due((tally, evaluations), 100) == [100]
+    assert (evaluations.to_report(), tally.stop_reason()) == (None, TARGET)
+    evaluations.conclude(lambda: None)
+    assert evaluations.final is not None
+    assert evaluations.confirmed is not None
+    assert evaluations.final.return_mean == 4.5
+    assert (evaluations.confirmed.env_steps, evaluations.confirmed.evaluation.return_mean) == (50, 7.0)
+
+
+def test_nor_one_that_a_callback_saw_before_it_ended_the_run() -> None:
+    fakes, ended = Fakes(6.0, 4.5), ["sweep: pruned"]
+    evaluations, _, _ = concluded(fakes, 1, ended_by=lambda: ended[0] if fakes.evaluated else None)
+    assert evaluations.final is not None
+    assert evaluations.final.return_mean == 4.5
+
+
+def test_a_return_that_decided_nothing_is_reported_as_it_was_found() -> None:
+    fakes = Fakes(3.0, 4.0, 3.5)
+    tally, evaluations = fakes.evaluations(100, state := RunState(), steps=200)
+    assert due((tally, evaluations), 100, 200) == [100, 200]
+    assert tally.stop_reason() == "all steps done"
+    assert not evaluations.conclude(lambda: None)
+    assert evaluations.final is state.newest_evaluation
+    assert evaluations.ended_by is None
+    assert evaluations.confirmed is not None
+    assert evaluations.confirmed.evaluation.return_mean == 3.5
 
 
 def test_the_last_policy_is_not_evaluated_twice() -> None:
