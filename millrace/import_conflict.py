@@ -1,6 +1,6 @@
 """Finds out, when `millrace` is imported, whether it can work with what Python finds in place of what it needs.
 
-Other code may hide its packages `learner`, `workers` or `protocol`, and gymnasium may be too old.
+Other code may hide its packages `learner`, `workers` or `protocol`, and gymnasium or numpy may be too old.
 
 Python searches the folder of the script (with `python -m`: the current folder) before the installed packages. A user's own
 `learner.py` there would be imported in place of millrace's, with a confusing error later.
@@ -13,21 +13,36 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 PACKAGES = ("learner", "workers", "protocol")
 INSTALLED_IN = Path(__file__).parents[1]
 """The folder that holds `millrace` and the packages that belong to it."""
-OLDEST_GYMNASIUM = (1, 1)
-VERSION = re.compile(r"""^__version__ *= *["'](\d+\.\d+[\d.]*)""", re.MULTILINE)
+
+
+class Oldest(NamedTuple):
+    """The oldest version of a package that millrace works with."""
+
+    version: tuple[int, int]
+    file: str
+    """the file of the package that has its version"""
+    asked_by: str
+    """who may have asked for an older one"""
+
+
+OLDEST = {
+    "gymnasium": Oldest((1, 1), "__init__.py", "a package of environments"),
+    "numpy": Oldest((2, 0), "version.py", "another package"),  # before, a uint64 and an int together were a float
+}
+VERSION = re.compile(r"""^(?:__version__|version) *= *["'](\d+\.\d+[\d.]*)""", re.MULTILINE)
 
 
 class ImportConflict(ImportError):
-    """Another module has the name of a package of millrace and would be imported in its place, or gymnasium is too old."""
+    """Another module has the name of a package of millrace and would be imported in its place, or a package is too old."""
 
 
 def check_imports() -> None:
-    """Check that `learner`, `workers` and `protocol` are ours, and gymnasium's version. Raises `ImportConflict`.
+    """Check that `learner`, `workers` and `protocol` are ours, and the versions in `OLDEST`. Raises `ImportConflict`.
 
     Nothing is imported for it.
 
@@ -42,8 +57,9 @@ def check_imports() -> None:
             name,
             found,
         )
-    if too_old := _gymnasium_too_old():
-        _refuse(too_old, "gymnasium", None)
+    for name, oldest in OLDEST.items():
+        if too_old := _too_old(name, oldest):
+            _refuse(too_old, name, None)
 
 
 def _refuse(line: str, name: str, found: Path | None) -> NoReturn:
@@ -54,24 +70,23 @@ def _refuse(line: str, name: str, found: Path | None) -> NoReturn:
     raise ImportConflict(line, name=name, path=None if found is None else str(found))
 
 
-def _gymnasium_too_old() -> str:
-    """A line if the installed gymnasium is too old; else nothing, also if there is none.
+def _too_old(name: str, oldest: Oldest) -> str:
+    """A line if the installed package is too old; else nothing, also if there is none.
 
     Its version is read in its source text: `importlib.metadata` takes a third of the time of `import millrace`.
     """
-    folder = _location("gymnasium")
+    folder = _location(name)
     try:
-        text = "" if folder is None else (folder / "__init__.py").read_text("utf-8", "replace")
+        text = "" if folder is None else (folder / oldest.file).read_text("utf-8", "replace")
     except OSError:
         text = ""
     found = VERSION.search(text)
-    if found is None or tuple(map(int, found[1].split(".")[:2])) >= OLDEST_GYMNASIUM:
+    if found is None or tuple(map(int, found[1].split(".")[:2])) >= oldest.version:
         return ""
-    version = found[1]
-    oldest = ".".join(map(str, OLDEST_GYMNASIUM))
+    wanted = ".".join(map(str, oldest.version))
     return (
-        f"gymnasium {version} is too old, perhaps because a package of environments asked for it: pip install "
-        f"'gymnasium>={oldest}', and a version of that package that allows it"
+        f"{name} {found[1]} is too old, perhaps because {oldest.asked_by} asked for it: pip install '{name}>={wanted}', "
+        "and a version of that package that allows it"
     )
 
 

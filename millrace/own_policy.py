@@ -11,7 +11,7 @@ import numpy as np
 
 from millrace.arguments import plain
 from protocol.env_spec import PickledCallable, Scalar, check_arguments
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from protocol.policy.called_policy import LOG_PROB
 from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
 from protocol.wire.codec import DTYPES
@@ -88,11 +88,13 @@ class OwnPolicy:
         if isinstance(self.factory, str) and not all(self.factory.partition(":")):
             raise UsageError(f"policy {self.factory}: expected module:factory, as in my_package.policies:make_policy")
         if not (type(self.state_size) is int and self.state_size >= 0):
-            raise UsageError(f"policy {self.name}: state_size: expected a whole number from 0, got {self.state_size!r}")
+            raise UsageError(
+                f"policy {self.name}: state_size: expected a whole number from 0, got {safe_repr(self.state_size)}"
+            )
         check_arguments(self.kwargs, f"policy {self.name}", self.name.rpartition(":")[2] + "({name}={name})")
         for name in (*self.arrays, *self.extras):
             if not isinstance(name, str):
-                raise UsageError(f"policy {self.name}: expected text as the name of an array, got {name!r}")
+                raise UsageError(f"policy {self.name}: expected text as the name of an array, got {safe_repr(name)}")
         own = OwnPolicySpec(
             self.name,
             tuple(NamedShape(name, self._shape(name, shape)) for name, shape in self.arrays.items()),
@@ -106,7 +108,7 @@ class OwnPolicy:
     def _shape(self, name: str, shape: Any) -> tuple[int, ...]:
         found = tuple(shape) if isinstance(shape, (tuple, list)) else (None,)
         if not (all(type(side) is int and side > 0 for side in found) and math.prod(found)):
-            raise UsageError(f"policy {self.name}: array {name}: expected a shape, as (64, 4), got {shape!r}")
+            raise UsageError(f"policy {self.name}: array {name}: expected a shape, as (64, 4), got {safe_repr(shape)}")
         return found
 
     def _declared(self) -> tuple[ExtraArray, ...]:
@@ -115,10 +117,10 @@ class OwnPolicy:
             try:
                 kind = np.dtype(dtype)
             except (TypeError, ValueError) as error:
-                raise UsageError(f"policy {self.name}: extra {name}: {_EXPECTED}, got {dtype!r}") from error
+                raise UsageError(f"policy {self.name}: extra {name}: {_EXPECTED}, got {safe_repr(dtype)}") from error
             extra = ExtraArray(name, kind.shape, kind.base.name)
             if kind.base.str not in DTYPES:
-                raise UsageError(f"policy {self.name}: extra {name}: {_EXPECTED}, got {dtype!r}")
+                raise UsageError(f"policy {self.name}: extra {name}: {_EXPECTED}, got {safe_repr(dtype)}")
             if name in BATCH_NAMES or (name == LOG_PROB.name and extra != LOG_PROB):
                 expected = (
                     "float32 for each action" if name == LOG_PROB.name else "another name; a batch has an array of this one"

@@ -43,7 +43,7 @@ from millrace.saved_state import ServiceState, digest, read, write
 from protocol.arrays import Array, Ints
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
-from protocol.errors import CheckpointError, UsageError, check_at_least, did_you_mean, first_line
+from protocol.errors import CheckpointError, UsageError, check_at_least, did_you_mean, first_line, safe_repr
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 
@@ -150,7 +150,9 @@ class RolloutService:
         config = _config(env, wrappers, dict(settings))
         policy = MLP() if policy is None else policy
         if isinstance(policy, type) or not hasattr(policy, "spec"):
-            raise UsageError(f"policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got {policy!r}")
+            raise UsageError(
+                f"policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got {safe_repr(policy)}"
+            )
         check_at_least("rollout_steps", rollout_steps, 1)
         self.restored: dict[str, Array] = {}
         """The arrays of the file that was restored, by name."""

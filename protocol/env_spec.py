@@ -37,7 +37,7 @@ from protocol.envs.unknown_ids import (
 )
 from protocol.envs.which_copy import filled
 from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, first_line, safe_repr
 
 # By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
 # gymnasium imports the module.
@@ -133,8 +133,8 @@ def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasi
         except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
             raise UsageError(
                 f"{of}: argument {name}: expected a number of at most 64 bits, text, True or False, got "
-                f"{type(value).__name__} {one_line(repr(value), 60)}; for others, pass a function in place of the name: "
-                f"lambda: {makes.format(name=name)}"
+                f"{type(value).__name__} {one_line(safe_repr(value), 60)}; for others, pass a function in place of the "
+                f"name: lambda: {makes.format(name=name)}"
             ) from error
 
 

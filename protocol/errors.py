@@ -25,10 +25,14 @@ import builtins
 import difflib
 import errno
 import resource
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from itertools import dropwhile
+from typing import ParamSpec
 
 from protocol.bounds import escaped, one_line
+
+WordedFrom = ParamSpec("WordedFrom")
 
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
@@ -38,6 +42,35 @@ def first_line(error: BaseException, otherwise: str = "no message") -> str:
     except Exception:
         return otherwise
     return (text.strip().splitlines() or [otherwise])[0].strip()
+
+
+def safe_repr(value: object) -> str:
+    """The `repr` of a value, or another text if that raises: what an error quotes may be an object of the user's."""
+    try:
+        return repr(value)
+    except Exception as error:
+        return f"<{type(value).__name__}, whose repr raised {type(error).__name__}>"
+
+
+def words_an_error(words: Callable[WordedFrom, str]) -> Callable[WordedFrom, str]:
+    """Makes a function that words an error, or advice for one, unable to raise: then it returns an empty string.
+
+    It asks objects of the user's, or of other packages, which may be anything. The error itself counts more than advice.
+    """
+
+    @wraps(words)
+    def unable_to_raise(*args: WordedFrom.args, **kwargs: WordedFrom.kwargs) -> str:
+        try:
+            return words(*args, **kwargs)
+        except Exception:
+            return ""
+
+    return unable_to_raise
+
+
+def joined(line: str, advice: str) -> str:
+    """A line with advice at its end, if there is any."""
+    return f"{line}; {advice}" if advice else line
 
 
 def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from learner.config.hyperparameters import AlgorithmConfig
 from protocol.arrays import Floats
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -168,7 +168,7 @@ def numbers(metrics: Any, who: str) -> dict[str, float]:
         try:
             found[name] = float("text" if isinstance(number, str | bytes) or not isinstance(name, str) else number)
         except (TypeError, ValueError, OverflowError, RuntimeError):  # torch raises RuntimeError
-            got = f"{type(number).__name__} for {name!r}"
+            got = f"{type(number).__name__} for {safe_repr(name)}"
             raise UsageError(f"{who}.update: metrics: expected a name and a number, got {got}") from None
     return found
 

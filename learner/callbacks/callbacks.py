@@ -15,7 +15,8 @@ from learner.callbacks.callback import Callback
 from learner.callbacks.named import named_callback
 from learner.run_folder.progress import Progress
 from protocol.bounds import one_line
-from protocol.errors import UsageError, did_you_mean, first_line
+from protocol.envs.found_names import attribute
+from protocol.errors import UsageError, did_you_mean, first_line, safe_repr
 
 log = logging.getLogger("millrace.learner")
 
@@ -133,18 +134,19 @@ def _method(callback: object, moment: str) -> Callable[[Progress], object] | Non
 
 
 def _name(callback: object, moment: str) -> str:
-    name = getattr(callback, "__qualname__", type(callback).__qualname__).rpartition("<locals>.")[2]
+    named = attribute(callback, "__qualname__")
+    name = (named if isinstance(named, str) else type(callback).__qualname__).rpartition("<locals>.")[2]
     return name if moment == "__call__" else f"{name}.{moment}"
 
 
 def _checked(callback: object, name: str = "") -> object:
-    who = one_line(f"callback {name or repr(callback)}", 300)
+    who = one_line(f"callback {name or safe_repr(callback)}", 300)
     if isinstance(callback, type):
         raise UsageError(f"{who}: expected an object, got a class; make one: {callback.__name__}()")
-    for attribute in dir(callback):
-        if attribute.startswith("on_") and attribute not in MOMENTS and callable(getattr(callback, attribute, None)):
-            hint = did_you_mean(attribute, MOMENTS)
-            raise UsageError(f"{who}: a run never calls {attribute}{hint}; expected {', '.join(MOMENTS)}")
+    for name in dir(callback):
+        if name.startswith("on_") and name not in MOMENTS and callable(attribute(callback, name)):
+            hint = did_you_mean(name, MOMENTS)
+            raise UsageError(f"{who}: a run never calls {name}{hint}; expected {', '.join(MOMENTS)}")
     methods = [getattr(callback, moment, None) for moment in MOMENTS]
     if not any(map(callable, methods)) and _method(callback, "__call__") is None:
         raise UsageError(f"{who}: expected a function, or an object with some of the methods {', '.join(MOMENTS)}")

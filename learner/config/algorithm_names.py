@@ -20,7 +20,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.resume_rules import declared
 from protocol.bounds import one_line
 from protocol.envs.found_names import attribute, importable, last_part
-from protocol.errors import UsageError, did_you_mean, first_line
+from protocol.errors import UsageError, did_you_mean, first_line, safe_repr
 from protocol.own_module import import_own, is_name
 
 ALGORITHMS = {
@@ -150,7 +150,7 @@ def _what_is_wrong(algorithm: type) -> str:
     record = getattr(algorithm, "Config", None)
     if not (isinstance(record, type) and issubclass(record, AlgorithmConfig)):
         expected = "a class derived from ActorCriticConfig or AlgorithmConfig of millrace.algorithms"
-        return f"Config: expected {expected}, got {'none' if record is None else one_line(repr(record))}"
+        return f"Config: expected {expected}, got {'none' if record is None else one_line(safe_repr(record))}"
     return _what_is_wrong_with_settings(record)
 
 
@@ -181,5 +181,5 @@ def _why_not_plain(record: type[AlgorithmConfig], setting: str) -> str:
     except msgspec.ValidationError as error:
         return f"its default does not fit its type: {one_line(str(error))}"
     except (TypeError, ValueError):
-        return f"expected a default of numbers, text, true or false, or lists of these, got {one_line(repr(default))}"
+        return f"expected a default of numbers, text, true or false, or lists of these, got {one_line(safe_repr(default))}"
     return ""

@@ -18,7 +18,7 @@ from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.env_spec import check_arguments
 from protocol.envs.wrappers import wrapper_name
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from protocol.flags.fields import fields_of
 from protocol.flags.values import what_was_expected
 from protocol.own_module import is_name
@@ -156,7 +156,7 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
     if len(names) > MAX_FACTS or len(set(names)) < len(names):
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
-        raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(repr(wrong[0]), MAX_NAME)}")
+        raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
     if config.wrappers and config.vector != "loop":
         raise UsageError(
             f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
@@ -233,4 +233,4 @@ def _reworded(message: str, settings: dict[str, Any]) -> str:
     given = algorithm.get(name, settings.get(name))
     given = list(given) if isinstance(given, tuple) else given
     field = fields_of(record).get(name)
-    return f"{name}: {what_was_expected(message, field and field.hint)}, got {given!r}"
+    return f"{name}: {what_was_expected(message, field and field.hint)}, got {safe_repr(given)}"

@@ -13,7 +13,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.bounds import MAX_NAME, one_line
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from protocol.wire.plain_values import pack, unpack
 
 MOST_BYTES = 1 << 20  # of all attributes together: they travel with all weights
@@ -50,7 +50,7 @@ class EnvAttributes:
         if self._refusal:
             raise UsageError(f"set_env_attr {one_line(str(name), 80)}: {self._refusal}")
         if not (isinstance(name, str) and name.isidentifier() and len(name) <= MAX_NAME) or name.startswith("_"):
-            raise UsageError(f"set_env_attr: expected the name of a public attribute, got {one_line(repr(name), 80)}")
+            raise UsageError(f"set_env_attr: expected the name of a public attribute, got {one_line(safe_repr(name), 80)}")
         try:
             value = unpack(pack(value))  # a copy, which the caller cannot change any more
             size = len(pack({**self.now(), name: value}))

@@ -20,7 +20,7 @@ OURS = {"learner", "millrace", "protocol", "workers"}
 
 def last_line(program: str, error: BaseException, command: str, hints: Sequence[str] = ()) -> str:
     """Why `program` ended, for a terminal. `command` is the one that resumes runs; `hints` follow the notes of the error."""
-    more = list(getattr(error, "__notes__", ()))
+    more = [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
     match error:
         case KeyboardInterrupt():
             why = "interrupted"

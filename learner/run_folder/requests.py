@@ -10,7 +10,7 @@ from typing import Any
 
 from learner.run_folder.env_attributes import EnvAttributes
 from protocol.bounds import one_line
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 
 MOST_LOGGED = 1_000  # numbers of one row
 LONGEST_NAME = 200  # characters
@@ -56,4 +56,4 @@ class Requests:
 
 
 def _shown(value: object) -> str:
-    return one_line(f"{type(value).__name__} {value!r}", 80)
+    return one_line(f"{type(value).__name__} {safe_repr(value)}", 80)

@@ -13,7 +13,7 @@ from learner.vector_env.order_coordinator import MakeOrder
 from learner.vector_env.send_recv import SendRecv, VectorEnvParts
 from protocol.bounds import MAX_LINE, one_line
 from protocol.envs.description import DescribedEnv, read_description
-from protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost
+from protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost, safe_repr
 from protocol.messages import DESCRIPTION, Described, Returned
 from protocol.wire.codec import decode_to_learner
 from protocol.wire.plain_values import unpack
@@ -100,7 +100,7 @@ def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values:
 def _check_name(name: object) -> None:
     """Raise `UsageError` for what is no name of an attribute: a worker could not read the message."""
     if not isinstance(name, str) or not name or one_line(name) != name:
-        got = one_line(repr(name), 60)
+        got = one_line(safe_repr(name), 60)
         raise UsageError(f"call: expected the name of an attribute, text of 1 to {MAX_LINE:,} characters, got {got}")
 
 

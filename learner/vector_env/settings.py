@@ -16,7 +16,7 @@ from learner.members.bind_settings import BindSettings
 from protocol.alive import CallTimeouts
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from protocol.machine.cpu_cores import usable_cores
 
 ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
@@ -60,7 +60,7 @@ class VectorEnvSettings:
 
     def __post_init__(self) -> None:
         if not self.timeout_s > 0:  # also true for NaN
-            raise UsageError(f"timeout: expected a number of seconds above 0, got {self.timeout_s!r}")
+            raise UsageError(f"timeout: expected a number of seconds above 0, got {safe_repr(self.timeout_s)}")
         if self.workers is not None and self.workers < 0:
             raise UsageError(f"workers: expected at least 0, got {self.workers}")
         if self.max_env_failures < 0:

@@ -21,7 +21,7 @@ from protocol.alive import CallTimeouts
 from protocol.env_spec import EnvSpec, PickledCallable
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import leaves_with_own_dtype
-from protocol.errors import EnvironmentFailed, UsageError
+from protocol.errors import EnvironmentFailed, UsageError, safe_repr
 from protocol.specs import DescribeSpec, Leaf, StepSpec
 from protocol.wire.codec import check_can_be_sent
 
@@ -164,4 +164,4 @@ def _autoreset_mode(mode: AutoresetMode | str) -> Literal["NextStep", "SameStep"
         return AutoresetMode(mode).value
     except ValueError as error:
         modes = ", ".join(known.value for known in AutoresetMode)
-        raise UsageError(f"autoreset_mode: expected one of {modes}, got {mode!r}") from error
+        raise UsageError(f"autoreset_mode: expected one of {modes}, got {safe_repr(mode)}") from error

@@ -18,7 +18,7 @@ from learner.config.config import Config
 from learner.config.rollout_config import RolloutConfig
 from learner.members.bind_settings import generate_run_keys
 from learner.run_folder.regular_files import open_regular, reason, subfolder
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
 from workers.supervise.supervisor import Supervisor, core_flags
@@ -44,7 +44,7 @@ def private_address(transport: str, stack: ExitStack) -> str:
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             return f"ipc://{folder}/learner"
         case _:
-            raise UsageError(f"transport: expected ipc, tcp or inproc, got {transport!r}")
+            raise UsageError(f"transport: expected ipc, tcp or inproc, got {safe_repr(transport)}")
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from protocol.envs.advice.space_advice import observation_advice
 from protocol.envs.seats import SeatedEnv
 from protocol.envs.space_generators import generator_states, restore_generators
 from protocol.envs.space_records import describe_space, make_space
-from protocol.errors import BadMessage, UsageError, first_line
+from protocol.errors import BadMessage, UsageError, first_line, joined
 from protocol.space_spec import MAX_SEATS, MAX_WRAPPERS, EnvDescription, check_size
 from protocol.wire import plain_values
 
@@ -52,7 +52,7 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     try:
         observation = describe_space(env.observation_space, "observation space")
     except UsageError as error:
-        raise UsageError(f"{error}; {observation_advice(env)}") from error
+        raise UsageError(joined(str(error), observation_advice(env))) from error
     seats, takes_turns = agents_of(env)
     description = EnvDescription(
         observation=observation,

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from types import ModuleType
 
 MAIN = "__main__"
 
 
 def name_of(made: object) -> str:
     """The name under which `made` is found again, or one that says that it is not."""
-    module, qualname = getattr(made, "__module__", None), getattr(made, "__qualname__", None)
+    module, qualname = attribute(made, "__module__"), attribute(made, "__qualname__")
     if not isinstance(module, str) or not isinstance(qualname, str):
         return f"<{type(made).__name__}>"
     if attribute(sys.modules.get(module), qualname) is not made:
@@ -51,13 +50,13 @@ def last_part(name: str) -> str:
     return name if "/" in name else name.rpartition(".")[2]
 
 
-def attribute(module: ModuleType | None, qualname: str) -> object:
-    """What a module has under this dotted name; None if nothing."""
-    found: object = module
+def attribute(module: object, qualname: str) -> object:
+    """What a module, or an object, has under this dotted name; None if nothing."""
+    found = module
     for part in qualname.split("."):
         try:
             found = getattr(found, part, None)
-        except ImportError:  # of a module that imports its names when they are asked for, such as supersuit
+        except Exception:  # of a module that imports its names when they are asked for, such as supersuit, or of a property
             return None
     return found
 
@@ -66,5 +65,5 @@ def importable(module: str) -> bool:
     """Whether another process that has our search path could import this module."""
     try:
         return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError, AttributeError):
+    except Exception:  # the package that it is in is imported for it
         return False

@@ -20,7 +20,7 @@ from protocol.envs.found_names import attribute
 from protocol.envs.seats import has_seats
 from protocol.envs.unknown_ids import most_similar, what_to_write
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, first_line, joined, words_an_error
 
 
 def names_a_function(env_id: str) -> bool:
@@ -36,6 +36,7 @@ def _names_a_module(env_id: str) -> bool:
     return re.fullmatch(r"[^\W\d]\w*(\.\w+)*\.\w+_v\d+", env_id) is not None
 
 
+@words_an_error
 def _newer_or_older(module: str) -> str:
     """Which module of the same package was perhaps meant, as the end of a line; empty if none is similar."""
     package, _, name = module.rpartition(".")
@@ -78,7 +79,7 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
     try:
         made = factory(*copy, **kwargs)
     except TypeError as error:
-        if not parameter or EnvCopy.__name__ not in str(error):
+        if not parameter or EnvCopy.__name__ not in first_line(error):
             raise
         raise UsageError(
             f"environment {name}: {first_line(error)}: its argument {parameter}, which has no default, got the EnvCopy; "
@@ -92,19 +93,30 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
         ) from error
     if isinstance(made, gymnasium.Env) or has_seats(made):
         return made
+    line = f"env factory {name}: expected it to return an environment of gymnasium or PettingZoo, got {type(made).__name__}"
+    raise UsageError(joined(line, _what_to_return(made)))
+
+
+@words_an_error
+def _what_to_return(made: object) -> str:
+    """What a callable should return instead of something that is no environment."""
     if is_of_old_gym(made):
-        advice = f"; {instead_of_object(made)}"
-    elif hasattr(made, "num_envs"):
-        advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
-    else:
-        advice = ""
-    expected = "an environment of gymnasium or PettingZoo"
-    raise UsageError(f"env factory {name}: expected it to return {expected}, got {type(made).__name__}{advice}")
+        return instead_of_object(made)
+    if hasattr(made, "num_envs"):
+        return "it is a vector environment: return one copy, of which millrace makes as many as it needs"
+    return ""
 
 
 def why_not_made(
     env_id: str, error: Exception, failed: Sequence[str] = (), why_not: Callable[[str], str] = lambda env_id: ""
 ) -> str:
+    """One line for an environment that cannot be made. Arguments: see `_why_not_made`."""
+    says = first_line(error)
+    return _why_not_made(env_id, error, failed, why_not) or f"environment {env_id} cannot be made: {says}"
+
+
+@words_an_error
+def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not: Callable[[str], str]) -> str:
     """One line for an environment that is not known, or whose package is missing.
 
     `failed`: lines about installed packages that could not register their environments. `why_not`: as of `what_to_write`.
@@ -136,7 +148,8 @@ def why_not_made(
             return f"environment {env_id} is not registered: write {ours}"
         case gymnasium.error.UnregisteredEnv() if not colon:
             broken = f" ({'; '.join(failed)})" if failed else ""
-            return f"environment {env_id} is not registered: {what_to_write(env_id, why_not)}{broken}"
+            advice = what_to_write(env_id, why_not)
+            return f"environment {env_id} is not registered{f': {advice}' if advice else ''}{broken}"
         case gymnasium.error.UnregisteredEnv() if wrapped := instead_of_id(env_id):
             return f"environment {env_id} is of the old package gym; {wrapped}"
         case gymnasium.error.UnregisteredEnv():

@@ -19,6 +19,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from protocol.envs.found_names import attribute
 from protocol.errors import UsageError
 
 SEAT, STATE = "seat", "state"
@@ -282,7 +283,7 @@ class TurnSeats(SeatedEnv):
 
 def has_seats(made: object) -> bool:
     """Whether an object is an environment of several agents in one of PettingZoo's interfaces."""
-    return hasattr(made, "possible_agents") and callable(getattr(made, "observation_space", None))
+    return attribute(made, "possible_agents") is not None and callable(attribute(made, "observation_space"))
 
 
 def seat_id(env: Any) -> Any:

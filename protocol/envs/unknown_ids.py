@@ -27,7 +27,7 @@ from gymnasium.envs.registration import namespace as _namespace
 
 from protocol.bounds import one_line
 from protocol.envs.advice.missing_modules import what_to_install
-from protocol.errors import first_line
+from protocol.errors import first_line, words_an_error
 
 GROUP = "gymnasium.envs"
 LARGEST_FILE, LARGEST_PACKAGE = 1 << 20, 1 << 24  # bytes of source text that are read
@@ -123,9 +123,17 @@ def _plugins() -> Iterator[Plugin]:
     """The plugins. The namespace is the name of the entry point, or stands in the name of its group."""
     found = metadata.entry_points()
     for entry_point in (one for group in found.groups for one in found.select(group=group)):
-        if entry_point.group == GROUP or entry_point.group.startswith(f"{GROUP}."):
+        if (entry_point.group == GROUP or entry_point.group.startswith(f"{GROUP}.")) and _is_whole(entry_point):
             namespace = entry_point.name if entry_point.group == GROUP else entry_point.group[len(GROUP) + 1 :]
             yield Plugin(entry_point, "" if namespace == "__root__" else namespace)
+
+
+def _is_whole(entry_point: metadata.EntryPoint) -> bool:
+    """Whether it names a module, as it should."""
+    try:
+        return bool(entry_point.module)
+    except AttributeError:
+        return False
 
 
 def is_registered(env_id: str) -> bool:
@@ -162,6 +170,7 @@ def _source(module: str) -> str:
         return ""
 
 
+@words_an_error
 def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
     """What to write instead of an id that is not registered, as the end of a line.
 
@@ -196,13 +205,32 @@ def most_similar(env_id: str, examples: Iterable[str], why_not: Callable[[str], 
 
 def installed_packages() -> Iterator[InstalledPackage]:
     """Installed packages that need gymnasium, with the ids in their source text. Imports none of them."""
-    for found in sorted(metadata.distributions(), key=lambda each: each.name):
-        if any(re.match(r"gymnasium\b", need) and "extra ==" not in need for need in found.requires or ()):
-            files = [file for file in found.files or () if file.suffix == ".py" and len(file.parts) > 1]
-            module = next((file.parts[0] for file in files if file.name == "__init__.py" and len(file.parts) == 2), "")
-            if module and module not in {"workers", "learner", "millrace", "protocol"}:
-                own = [file for file in files if file.parts[0] == module]
-                yield InstalledPackage(module, dict(_ids_of_files(own)))
+    for found in sorted(metadata.distributions(), key=_name_of):
+        try:
+            package = _with_environments(found)
+        except Exception:  # what is left of a package that was removed, or a file of it that cannot be read
+            continue
+        if package is not None:
+            yield package
+
+
+def _name_of(found: metadata.Distribution) -> str:
+    """The name of an installed package; empty if its metadata are gone."""
+    try:
+        return str(found.name)
+    except Exception:
+        return ""
+
+
+def _with_environments(found: metadata.Distribution) -> InstalledPackage | None:
+    """The package that this is, if it may have environments."""
+    if not any(re.match(r"gymnasium\b", need) and "extra ==" not in need for need in found.requires or ()):
+        return None
+    files = [file for file in found.files or () if file.suffix == ".py" and len(file.parts) > 1]
+    module = next((file.parts[0] for file in files if file.name == "__init__.py" and len(file.parts) == 2), "")
+    if not module or module in {"workers", "learner", "millrace", "protocol"}:
+        return None
+    return InstalledPackage(module, dict(_ids_of_files([file for file in files if file.parts[0] == module])))
 
 
 def _ids_of_files(files: Iterable[metadata.PackagePath]) -> Iterator[tuple[str, str]]:

@@ -17,7 +17,7 @@ import gymnasium
 from protocol.bounds import one_line
 from protocol.envs.found_names import found_by_others, in_main, last_part, name_of
 from protocol.envs.seats import has_seats
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, first_line, safe_repr
 from protocol.own_module import own_callable
 
 Wrapper = Callable[..., Any]
@@ -72,7 +72,7 @@ def wrapper_name(wrapper: WrapperLike) -> str:
     if not isinstance(wrapper, functools.partial):
         return name_of(wrapper)
     name = name_of(wrapper.func)
-    arguments = [*map(repr, wrapper.args), *(f"{key}={value!r}" for key, value in wrapper.keywords.items())]
+    arguments = [*map(safe_repr, wrapper.args), *(f"{key}={safe_repr(value)}" for key, value in wrapper.keywords.items())]
     named = f"{name}({', '.join(arguments)})"
     try:
         read = read_wrapper(named)

@@ -17,7 +17,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from protocol.errors import BadMessage
+from protocol.errors import BadMessage, safe_repr
 
 DTYPE_KINDS = "biufcSUmM"
 MAX_DEPTH = 32
@@ -94,7 +94,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
         return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
     if use_repr:
-        return msgpack.ExtType(_REPR, _repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
+        return msgpack.ExtType(_REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
     got = {str: "text with a lone surrogate", int: "an integer with too many digits"}.get(kind, kind.__name__)
     raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
 
@@ -116,14 +116,6 @@ def _digits(value: int) -> bytes | None:
         return str(value).encode()
     except ValueError:
         return None
-
-
-def _repr(value: object) -> str:
-    """The `repr`, or another text if that raises."""
-    try:
-        return repr(value)
-    except Exception as error:  # code of the user's
-        return f"<{type(value).__name__}, whose repr raised {type(error).__name__}>"
 
 
 def _unpack(data: bytes | memoryview, depth: int) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.import_conflict import OLDEST_GYMNASIUM, PACKAGES
+from millrace.import_conflict import OLDEST, PACKAGES, VERSION
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,15 +57,28 @@ def test_python_m_millrace_says_one_line_without_a_traceback(tmp_path: Path) -> 
     assert done.stderr == f"millrace: {message(tmp_path / 'learner.py', 'learner')}\n"
 
 
-def test_a_gymnasium_that_is_too_old_is_said_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "gymnasium").mkdir()
-    (tmp_path / "gymnasium" / "__init__.py").write_text('__version__ = "0.29.1"\n')
-    done = python(tmp_path, "-m", "millrace", "train", "CartPole-v1")
+@pytest.mark.parametrize(("name", "text"), [("gymnasium", '__version__ = "0.29.1"'), ("numpy", 'version = "1.26.4"')])
+@pytest.mark.parametrize("command", ["train", "worker"])
+def test_a_package_that_is_too_old_is_said_in_one_line(tmp_path: Path, name: str, text: str, command: str) -> None:
+    version = text.split('"')[1]
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").touch()
+    (tmp_path / name / OLDEST[name].file).write_text(f"{text}\n")
+    done = python(tmp_path, "-m", "millrace", command, "CartPole-v1")
     assert done.returncode == 2
-    assert done.stderr.startswith("millrace: gymnasium 0.29.1 is too old")
-    oldest = f"gymnasium>={'.'.join(map(str, OLDEST_GYMNASIUM))}"
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"millrace: {name} {version} is too old")
+    oldest = f"{name}>={'.'.join(map(str, OLDEST[name].version))}"
     assert f"pip install '{oldest}'" in done.stderr
     assert f'"{oldest}",' in (ROOT / "pyproject.toml").read_text()
+
+
+@pytest.mark.parametrize("name", OLDEST)
+def test_the_version_of_an_installed_package_is_found(name: str) -> None:
+    folder = Path(importlib.import_module(name).__file__ or "").parent
+    found = VERSION.search((folder / OLDEST[name].file).read_text())
+    assert found is not None
+    assert importlib.import_module(name).__version__.startswith(found[1])
 
 
 def test_the_installed_command_searches_the_current_folder_last(tmp_path: Path) -> None:

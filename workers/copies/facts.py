@@ -14,6 +14,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.bounds import one_line
+from protocol.errors import safe_repr
 from workers.copies.env_errors import CopyFailed
 
 Facts = Mapping[int, tuple[float, ...]]
@@ -53,7 +54,7 @@ def _number(name: str, value: Any, copy: int | None) -> float:
         if array.size == 1 and array.dtype.kind in "biuf":
             number = float(array.reshape(()))
             return number if math.isfinite(number) else math.nan
-    except (ValueError, OverflowError):  # rows of different lengths
+    except Exception:  # rows of different lengths, a number too large for a float, an object of the user's
         pass
     if value is None:
         return math.nan
@@ -63,4 +64,4 @@ def _number(name: str, value: Any, copy: int | None) -> float:
 
 
 def _shown(value: Any) -> str:
-    return one_line(f"{type(value).__name__} {value!r}", 80)
+    return one_line(f"{type(value).__name__} {safe_repr(value)}", 80)

@@ -17,6 +17,7 @@ from protocol.arrays import Array, Bools
 from protocol.bounds import one_line
 from protocol.envs.action_masks import has_mask
 from protocol.envs.spaces import action_spec
+from protocol.errors import safe_repr
 from protocol.policy.masks import MASK, choices, no_choice
 from workers.copies.env_errors import CopyFailed
 
@@ -102,7 +103,7 @@ def _as_array(value: Any) -> Array | None:
         if isinstance(value, tuple | list) and value and np.ndim(value[0]):
             return np.concatenate([np.asarray(part).reshape(-1) for part in value])
         return np.asarray(value)
-    except (ValueError, TypeError):  # rows of different lengths
+    except Exception:  # rows of different lengths, or an object of the user's
         return None
 
 
@@ -117,5 +118,5 @@ def _rows(given: Any, count: int) -> Sequence[Any]:
 
 def _shown(value: Any, array: Array | None) -> str:
     if array is None or array.dtype.kind not in "biuf":
-        return one_line(f"{type(value).__name__} {value!r}", 80)
+        return one_line(f"{type(value).__name__} {safe_repr(value)}", 80)
     return f"{array.dtype}{list(array.shape)}"

@@ -18,6 +18,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.bounds import one_line
+from protocol.errors import first_line, safe_repr
 from protocol.specs import Leaf
 from workers.copies.env_errors import CopyFailed
 
@@ -146,11 +147,11 @@ def read_leaves(
 
 def missing_leaf(n: int | None, observation: Any, error: Exception) -> CopyFailed:
     """The error for an observation in which a leaf of its space cannot be found."""
-    keys = f" of {', '.join(map(repr, observation))}" if isinstance(observation, dict) else ""
+    keys = f" of {', '.join(map(safe_repr, observation))}" if isinstance(observation, dict) else ""
     return CopyFailed(
         n,
         line=f"observation: expected the structure of its space, got a {type(observation).__name__}{keys} "
-        f"({type(error).__name__}: {error}); fix the environment or its observation_space",
+        f"({type(error).__name__}: {first_line(error)}); fix the environment or its observation_space",
     )
 
 
@@ -172,12 +173,12 @@ def one_number(name: str, n: int, value: Any) -> Any:
     """Reward, terminated or truncated (`name`) of copy `n`, as a number. Raises `CopyFailed`, with advice for a vector."""
     try:
         array = np.asarray(value)
-    except ValueError:  # rows of different lengths
+    except Exception:  # rows of different lengths, or an object of the user's
         array = np.asarray(None)
     if array.size == 1 and array.dtype.kind in "biuf":
         return array.item()
     if array.size == 1:
-        raise CopyFailed(n, line=f"{name}: expected a number, got {one_line(repr(value), 80)}")
+        raise CopyFailed(n, line=f"{name}: expected a number, got {one_line(safe_repr(value), 80)}")
     advice = "; wrap the environment so that it returns one number" if name == "reward" else ""
     if advice and "mo_gymnasium" in sys.modules:
         advice += ", as --wrappers mo_gymnasium.wrappers:LinearReward does"

@@ -8,32 +8,34 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 
 from protocol.envs.found_names import attribute
+from protocol.errors import words_an_error
 
 INSTALL = "pip install gym==0.26.2 shimmy"
 
 
 def is_of_old_gym(made: object) -> bool:
     """Whether this is an environment of gym: by its classes, or, as if it does without gym, by its methods and spaces."""
-    if any(kind.__module__.partition(".")[0] == "gym" for kind in type(made).__mro__):
+    if any(str(kind.__module__).partition(".")[0] == "gym" for kind in type(made).__mro__):
         return True
-    space = getattr(made, "action_space", None)
-    methods = (getattr(made, name, None) for name in ("reset", "step"))
+    space = attribute(made, "action_space")
+    methods = (attribute(made, name) for name in ("reset", "step"))
     return all(map(callable, methods)) and not (space is None or callable(space) or isinstance(space, gymnasium.Space))
 
 
-def instead_of_object(made: Any) -> str:
+@words_an_error
+def instead_of_object(made: object) -> str:
     """What a callable should return instead of an environment of gym."""
-    version = _version(made.reset)
+    version = _version(made)
     wrap = f"`{INSTALL}`, and return shimmy.Gym{version}CompatibilityV0(env=it)"
     return f"it has the interface of the old package gym: {wrap}{_about_seed(made, version)}"
 
 
+@words_an_error
 def instead_of_id(env_id: str) -> str:
     """What to write instead of an id that is registered in gym; empty if it is not."""
     registry = attribute(sys.modules.get("gym"), "envs.registration.registry")
@@ -41,24 +43,38 @@ def instead_of_id(env_id: str) -> str:
     spec = known.get(env_id.rpartition(":")[2]) if isinstance(known, dict) else None
     if spec is None:
         return ""
-    point: Any = spec.entry_point
-    try:
-        module, _, name = str(point).partition(":")
-        point = attribute(importlib.import_module(module), name) if isinstance(point, str) else point
-        version = _version(point.reset)
-    except Exception:  # another package's code, or a function that makes the environment
-        version = "V26"
+    point = _class_of(spec)
+    version = _version(point)
     write = f"`{INSTALL}`, then write shimmy:Gym{version}Environment-v0 --env-kwargs env_id {env_id}"
     return f"{write}{_about_seed(point, version)}"
 
 
+def _class_of(spec: object) -> object:
+    """The class or function that a specification names; None if it cannot be found. gym 0.9 has a private attribute."""
+    point = attribute(spec, "entry_point") or attribute(spec, "_entry_point")
+    if not isinstance(point, str):
+        return point
+    module, _, name = point.partition(":")
+    try:
+        return attribute(importlib.import_module(module), name)
+    except Exception:  # another package's code
+        return None
+
+
 def _about_seed(of: object, version: str) -> str:
     """What to do about an environment, or its class, that shimmy cannot seed, as the end of a line; else nothing."""
-    if version != "V21" or hasattr(of, "seed"):
+    if version != "V21" or attribute(of, "seed") is not None:
         return ""
     return "; it also needs a method seed(seed), as under 'Old gym environments' in docs/how-to/third_party_environments.md"
 
 
-def _version(reset: Callable[..., object]) -> str:
-    """Of gym's two interfaces the one that this `reset` is of, as shimmy names it."""
-    return "V26" if "seed" in inspect.signature(reset).parameters else "V21"
+def _version(of: object) -> str:
+    """Of gym's two interfaces the one that an environment, or its class, has, as shimmy names it; V26 if it has no `reset`.
+
+    A function that makes the environment has none.
+    """
+    reset: Any = attribute(of, "reset")
+    try:
+        return "V26" if "seed" in inspect.signature(reset).parameters else "V21"
+    except (TypeError, ValueError):
+        return "V26"

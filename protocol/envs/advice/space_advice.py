@@ -8,16 +8,17 @@ import gymnasium
 from gymnasium import spaces
 
 from protocol.envs.space_records import describe_space
-from protocol.errors import UsageError
+from protocol.errors import words_an_error
 
 IMAGES_ONLY = {"minigrid": "minigrid.wrappers:ImgObsWrapper", "babyai": "minigrid.wrappers:ImgObsWrapper"}
 """By the package of an environment whose observations have a text beside an image: its wrapper that leaves the image"""
 
 
+@words_an_error
 def observation_advice(env: gymnasium.Env[Any, Any]) -> str:
     """How to wrap an environment whose observation space is not supported, as the end of a line."""
     space = env.observation_space
-    package = type(env.unwrapped).__module__.partition(".")[0]
+    package = str(type(env.unwrapped).__module__).partition(".")[0]
     own = "--wrappers my_module:MyWrapper, a gymnasium.ObservationWrapper of yours that returns arrays"
     match space:
         case spaces.Dict():
@@ -38,6 +39,6 @@ def observation_advice(env: gymnasium.Env[Any, Any]) -> str:
 def _is_supported(space: gymnasium.Space[Any]) -> bool:
     try:
         describe_space(space)
-    except UsageError:
+    except Exception:  # not only a `UsageError`: the space may be the user's own
         return False
     return True
