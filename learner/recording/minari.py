@@ -22,6 +22,7 @@ from protocol.arrays import Array
 from protocol.errors import RunError, UsageError, first_line
 
 CHUNK_BYTES = 64 * 2**20
+OF_NAMESPACE = "namespace_metadata.json"  # the file that makes a folder one of Minari's namespaces
 
 
 class MinariDataset:
@@ -49,8 +50,8 @@ class MinariDataset:
         root, self._folder = get_dataset_path(), get_dataset_path(dataset_id)
         if self._folder.exists():
             raise UsageError(f"dataset {dataset_id} is there already, at {self._folder}; choose another name or version")
-        above = self._folder.parents[: len(self._folder.relative_to(root).parts) - 1]
-        self._new_folders = [folder for folder in above if not folder.exists()]  # innermost first
+        self._namespaces = self._folder.parents[: len(self._folder.relative_to(root).parts) - 1]  # innermost first
+        self._new_folders = [folder for folder in self._namespaces if not folder.exists()]
         self._id, self._env, self._about = dataset_id, env, about
         self._storage: Any = None  # the dataset's files, once an episode is to be written
         self._episodes = self._steps = 0  # that are in them
@@ -85,7 +86,7 @@ class MinariDataset:
         shutil.rmtree(self._folder, ignore_errors=True)
         for folder in self._new_folders:
             with suppress(OSError):
-                if {path.name for path in folder.iterdir()} <= {"namespace_metadata.json"}:
+                if {path.name for path in folder.iterdir()} <= {OF_NAMESPACE}:
                     shutil.rmtree(folder)
 
     def __enter__(self) -> Self:
@@ -121,15 +122,13 @@ class MinariDataset:
     def _new_storage(self) -> Any:
         """The dataset's files, without an episode."""
         import minari
-        from minari.dataset.minari_dataset import parse_dataset_id
         from minari.dataset.minari_storage import MinariStorage
-        from minari.namespace import create_namespace, list_local_namespaces
 
         data = self._folder / "data"
         data.mkdir(parents=True)
-        namespace, _, _ = parse_dataset_id(self._id)
-        if namespace is not None and namespace not in list_local_namespaces():
-            create_namespace(namespace)
+        for namespace in self._namespaces:  # Minari's own function follows links in all datasets
+            if not (namespace / OF_NAMESPACE).exists():
+                (namespace / OF_NAMESPACE).write_text("{}")
         spec = self._env.spec if _spec_can_be_stored(self._env) else None
         storage = MinariStorage.new(
             data,

@@ -66,13 +66,14 @@ def record(
     about = f"Actions {how} the policy of millrace run {run.resolve().name}; seed {seed}."
     returns: list[float] = []
     taken = cut = 0
-    with NpyRows(npy) as rows, MinariDataset(dataset_id, env, about) as dataset:
+    with MinariDataset(dataset_id, env, about) as dataset, NpyRows(npy) as rows:
         for episode, was_cut in PlayedEpisodes(player, recording_seeds(seed), stochastic=stochastic).until(steps):
             dataset.add(episode)
             rows.add(episode)
             returns.append(episode.episode_return)
             taken += episode.length
             cut += was_cut
+        dataset.close()  # before the rows are written: if that fails, leaving the dataset removes it
     return RecordedDataset(
         dataset_id=dataset_id,
         episodes=len(returns),

@@ -21,6 +21,7 @@ from learner.policy_player import saved_policy
 from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
 from learner.recording.played_episodes import recording_seeds
+from learner.recording.prior_dataset import PriorDataset
 from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_with
 from learner.recording.training_recorder import TrainingRecorder
@@ -461,6 +462,29 @@ def test_a_namespace_with_another_dataset_in_it_stays(tmp_path: Path, root: Path
     assert everything(root) == before
     fails(good, "ours/good-v0", UsageError, "dataset ours/good-v0 is there already, at .*; choose another name or version")
     assert everything(root) == before
+
+
+def test_without_the_rows_there_is_no_dataset(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("learner.recording.npy_rows.write_atomically", full)
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    fails(run, "ns/box-v0", RunError, "rows.npy was not written: No space left on device", npy=tmp_path / "rows.npy")
+    assert everything(root) == set()
+
+
+def test_folders_that_lead_around_in_a_circle_hold_nobody_up(tmp_path: Path, root: Path) -> None:
+    """Another dataset may come from a stranger."""
+    theirs = root / "theirs"
+    theirs.mkdir(parents=True)
+    for name in ("a", "b", "c"):
+        (theirs / name).symlink_to(theirs)
+    record(a_run(tmp_path, EnvSpec("millrace-tests/Box-v0")), "ours/deeper/good-v0", 5, seed=1)
+    assert (root / "ours" / "namespace_metadata.json").read_text() == "{}"
+    policy = PolicySpec(observation_leaves(spaces.Discrete(2)), action_spec(spaces.Discrete(2)))
+    with pytest.raises(UsageError, match=r"no such dataset here; there are: ours/deeper/good-v0\."):
+        PriorDataset("ours/bad-v0", policy)
 
 
 def test_what_minari_leaves_when_it_fails_is_removed(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
