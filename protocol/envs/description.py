@@ -20,7 +20,7 @@ from protocol.envs.seats import SeatedEnv
 from protocol.envs.space_generators import generator_states, restore_generators
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError, first_line, joined
-from protocol.space_spec import MAX_SEATS, MAX_WRAPPERS, EnvDescription, check_size
+from protocol.space_spec import MAX_SEATS, MAX_WRAPPERS, EnvDescription, SpaceSpec, check_size
 from protocol.wire import plain_values
 
 MAX_METADATA_BYTES = 1 << 16
@@ -48,7 +48,10 @@ class DescribedEnv:
 
 
 def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
-    """The description of an env copy. Raises `UsageError` if its spaces are not supported or too large to send."""
+    """The description of an env copy. Raises `UsageError` if its spaces are not supported or too large to send.
+
+    Rule: what it returns, `read_description` takes.
+    """
     try:
         observation = describe_space(env.observation_space, "observation space")
     except UsageError as error:
@@ -68,6 +71,7 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     )
     try:
         check_size(description)
+        read_description(description)  # what the learner would refuse is refused here, where the environment is known
     except BadMessage as error:
         raise UsageError(str(error)) from error
     return description
@@ -86,7 +90,8 @@ def read_description(description: EnvDescription) -> DescribedEnv:
     seats, takes_turns = description.seats, description.takes_turns
     if len(set(seats)) < len(seats) or (takes_turns and not seats):
         raise BadMessage(f"seats: expected agents of different names, or none, got {agents_in_words(seats, takes_turns)}")
-    observation_space, action_space = make_space(description.observation), make_space(description.action)
+    observation_space = _made_space(description.observation, "observation space")
+    action_space = _made_space(description.action, "action space")
     restore_generators(description.generators, observation_space, action_space)
     return DescribedEnv(
         observation_space=observation_space,
@@ -101,13 +106,20 @@ def read_description(description: EnvDescription) -> DescribedEnv:
     )
 
 
+def _made_space(spec: SpaceSpec, name: str) -> gymnasium.Space[Any]:
+    try:
+        return make_space(spec)
+    except BadMessage as error:
+        raise BadMessage(f"{name}: {error}") from error
+
+
 def agents_of(env: gymnasium.Env[Any, Any]) -> tuple[tuple[str, ...], bool]:
     """The names of its agents in a description, none if it is gymnasium's, and whether they take turns."""
     if not isinstance(env, SeatedEnv):
         return (), False
     if len(env.seats) > MAX_SEATS:
         raise UsageError(f"environment: expected at most {MAX_SEATS} agents, got {len(env.seats)}")
-    return tuple(one_line(seat, MAX_NAME) for seat in env.seats), env.takes_turns
+    return env.seats, env.takes_turns
 
 
 def agents_in_words(seats: Sequence[str], takes_turns: bool) -> str:
@@ -145,6 +157,8 @@ def _metadata(metadata: object) -> Array:
 def _spec_as_text(spec: GymnasiumSpec | None) -> str:
     try:
         text = "" if spec is None else spec.to_json()
+        if text:
+            GymnasiumSpec.from_json(text)
     except Exception:  # an entry point or an argument that JSON cannot hold, or a specification of the user's own
         return ""
     return text if len(text) <= MAX_TEXT else ""

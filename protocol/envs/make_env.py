@@ -14,8 +14,10 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
 from protocol.envs.advice.atari_ids import preprocessed
+from protocol.envs.advice.config_dict import wants_a_dict
 from protocol.envs.advice.missing_modules import what_to_install
 from protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
+from protocol.envs.advice.several_agents import what_it_lacks
 from protocol.envs.found_names import attribute
 from protocol.envs.seats import has_seats
 from protocol.envs.unknown_ids import most_similar, what_to_write
@@ -78,7 +80,9 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
     copy = [being_made.get() or FIRST_COPY] if parameter else []
     try:
         made = factory(*copy, **kwargs)
-    except TypeError as error:
+    except (TypeError, AttributeError) as error:
+        if advice := wants_a_dict(name, factory, kwargs, error):
+            raise UsageError(f"environment {name}: {type(error).__name__}: {first_line(error)}: {advice}") from error
         if not parameter or EnvCopy.__name__ not in first_line(error):
             raise
         raise UsageError(
@@ -104,7 +108,7 @@ def _what_to_return(made: object) -> str:
         return instead_of_object(made)
     if hasattr(made, "num_envs"):
         return "it is a vector environment: return one copy, of which millrace makes as many as it needs"
-    return ""
+    return what_it_lacks(made)
 
 
 def why_not_made(

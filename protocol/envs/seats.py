@@ -6,6 +6,7 @@ only now and then, leave before the others, or come later.
 Rule: a row of a seat is the span from one of its actions to its next observation, in which it has the move again or which
 is its last. `SeatStep.complete` marks the step in which that observation comes. Until then the seat waits, and shows the
 observation in which it acted. Rewards belong to the row in which they fall; those outside of any count in the return alone.
+An agent whose part has ended is out until the reset, whatever `agents` says.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from protocol.bounds import MAX_NAME, one_line
+from protocol.envs.answers import OF_STEP, WrongAnswer, in_words, reset_answer, wrong_step
 from protocol.envs.found_names import attribute
 from protocol.errors import UsageError
 
 SEAT, STATE = "seat", "state"
 """Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""
+MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters, so that the name of an agent's return is not cut
 _NO_INFO: Mapping[str, Any] = {}
-RETURNED_WRONGLY = AttributeError, KeyError, TypeError
-"""What dicts without an agent, and what are no dicts, raise where they are read."""
+RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError
+"""What dicts without an agent, and what are no dicts and no numbers, raise where they are read."""
 
 
 class SeatStep(NamedTuple):
@@ -77,8 +81,9 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         self.env, self.metadata = env, getattr(env, "metadata", {})
         self.render_mode = getattr(env, "render_mode", None)
         self.agents = list(env.possible_agents)
-        self.seats = tuple(map(str, self.agents))
+        self.seats = _names(self.agents)
         self.seat_of = {agent: number for number, agent in enumerate(self.agents)}
+        self._gone = set[Any]()  # agents whose part of the episode has ended
         self._tells_seats, shows_state = (getattr(env, name, False) for name in ("tells_seats", "shows_state"))
         self._state_space = _state_space(env, name) if shows_state else None
         observation, self.action_space = (
@@ -118,9 +123,10 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[SeatStep, dict[str, Any]]:
         """Begin an episode."""
         found = self._nothing()
+        self._gone.clear()
         self._begin(found, {"seed": seed} if options is None else {"seed": seed, "options": options})
         if True not in found.acts:
-            raise RuntimeError("expected an agent that acts after reset, got none")
+            raise WrongAnswer("its reset: expected an agent that acts after it, got none")
         self._check_agents()
         self._last = list(found.observations)
         return found, {}
@@ -132,9 +138,14 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         self._last = list(found.observations)
         return found, 0.0, over, False, {}
 
-    def _check_agents(self) -> None:
-        if unknown := [agent for agent in self.env.agents if agent not in self.seat_of]:
-            raise RuntimeError(f"agents: expected some of possible_agents, got {unknown[0]}")
+    def _check_agents(self, rewards: Iterable[Any] = ()) -> None:
+        for what, agents in (("agents", self.env.agents), ("rewards", rewards)):
+            if unknown := [agent for agent in agents if agent not in self.seat_of]:
+                raise WrongAnswer(f"{what}: expected some of possible_agents, got {unknown[0]}")
+
+    def pending(self) -> list[float]:
+        """[A] rewards that seats which wait for the move have got, and that no step has returned yet."""
+        return [0.0] * len(self.seats)
 
     @abstractmethod
     def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
@@ -181,24 +192,34 @@ class ParallelSeats(SeatedEnv):
     takes_turns = False
 
     def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
-        observations, infos = self.env.reset(**keywords)
+        observations, infos = reset_answer(self.env.reset(**keywords))
         self._present = [agent for agent in self.agents if agent in self.env.agents]
         try:
             for agent in self._present:
-                self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+                self._shows(found, agent, observations[agent], _info_of(infos, agent))
         except RETURNED_WRONGLY as error:
             self._explain(error, self._present, observations=observations)
             raise
 
     def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
         given = {agent: actions[self.seat_of[agent]] for agent in self._present}
-        observations, rewards, terminated, truncated, infos = self.env.step(given)
+        answer = self.env.step(given)
+        try:
+            observations, rewards, terminated, truncated, infos = answer
+        except (TypeError, ValueError) as error:
+            raise wrong_step(answer) from error
+        infos = _NO_INFO if infos is None else infos
         try:
             return self._takes(given, found, observations, rewards, terminated, truncated, infos)
         except RETURNED_WRONGLY as error:
             self._explain(
                 error, given, rewards=rewards, terminated=terminated, truncated=truncated, observations=observations
             )
+            self._explain(error, (), infos=infos)
+            self._check_agents(rewards)
+            for agent in rewards:
+                flags = {"terminated": terminated[agent], "truncated": truncated[agent]} if agent in given else {}
+                _check_numbers(agent, reward=rewards[agent], **flags)
             raise
 
     def _takes(self, given: Mapping[Any, Any], found: SeatStep, *returned: Mapping[Any, Any]) -> bool:
@@ -207,21 +228,22 @@ class ParallelSeats(SeatedEnv):
         here = set(self.env.agents)
         for agent in given:
             seat = self.seat_of[agent]
-            complete[seat], reward[seat], told[seat] = True, float(rewards[agent]), infos.get(agent, _NO_INFO)
+            complete[seat], reward[seat], told[seat] = True, float(rewards[agent]), _info_of(infos, agent)
             terminates[seat], truncates[seat] = bool(terminated[agent]), bool(truncated[agent])
             # The last observation of a task that has ended may be missing: nobody learns from it.
-            if agent in observations or not terminates[seat]:
+            if not terminates[seat] or observations.get(agent) is not None:
                 seen[seat] = self._seen(seat, observations[agent])
             if terminates[seat] or truncates[seat]:
-                here.discard(agent)
+                self._gone.add(agent)
             elif agent in here:
                 acts[seat] = True
             else:
-                raise RuntimeError(f"agent {agent} left, expected it to be terminated or truncated in its last step")
+                raise WrongAnswer(f"agent {agent} left, expected it to be terminated or truncated in its last step")
         for agent in rewards.keys() - given.keys():
             outside[self.seat_of[agent]] = float(rewards[agent])
+        here -= self._gone
         for agent in here - given.keys():
-            self._shows(found, agent, observations[agent], infos.get(agent, _NO_INFO))
+            self._shows(found, agent, observations[agent], _info_of(infos, agent))
         self._present = [agent for agent in self.agents if agent in here]
         return not self._present
 
@@ -230,10 +252,10 @@ class ParallelSeats(SeatedEnv):
         self._check_agents()
         for what, by_agent in returned.items():
             if not isinstance(by_agent, Mapping):
-                raise TypeError(f"{what}: expected a dict by agent, got {type(by_agent).__name__}") from error
+                raise WrongAnswer(f"{what}: expected a dict by agent, got {type(by_agent).__name__}") from error
             if missing := [agent for agent in agents if agent not in by_agent]:
                 got = ", ".join(map(str, by_agent)) or "none"
-                raise RuntimeError(f"{what}: expected agent {missing[0]} among them, got {got}") from error
+                raise WrongAnswer(f"{what}: expected agent {missing[0]} among them, got {got}") from error
 
     def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Mapping[str, Any]) -> None:
         seat = self.seat_of[agent]
@@ -258,32 +280,79 @@ class TurnSeats(SeatedEnv):
 
     def _next(self, found: SeatStep) -> bool:
         """Let agents whose part has ended leave, and find who has the move. Returns whether nobody is left."""
-        while self.env.agents:
+        while not self._gone.issuperset(self.env.agents):
             agent = self.env.agent_selection
-            seat = self.seat_of[agent]
-            observation, reward, terminated, truncated, info = self.env.last()
-            if self._waits[seat]:
-                found.complete[seat], found.reward[seat] = True, float(reward)
-                found.terminated[seat], found.truncated[seat] = bool(terminated), bool(truncated)
-                self._waits[seat] = False
-            else:
-                found.outside[seat] = float(reward)
+            seat = self._seat_with_the_move(agent)
+            answer = self.env.last()
+            try:
+                observation, reward, terminated, truncated, info = answer
+            except (TypeError, ValueError) as error:
+                raise WrongAnswer(f"its last() returned {in_words(answer)}; {OF_STEP}") from error
+            try:
+                if self._waits[seat]:
+                    found.complete[seat], found.reward[seat] = True, float(reward)
+                    found.terminated[seat], found.truncated[seat] = bool(terminated), bool(truncated)
+                else:
+                    found.outside[seat] = float(reward)
+            except (TypeError, ValueError):
+                _check_numbers(agent, reward=reward, terminated=terminated, truncated=truncated)
+                raise
             if observation is not None:  # a copy: the seat shows it until it has the move again
                 found.observations[seat] = self._seen(seat, deepcopy(observation))
-            found.infos[seat] = info
+            elif not terminated and (self._waits[seat] or not truncated):  # it acts on it, or learns from its value
+                raise WrongAnswer(f"agent {agent}: expected an observation unless it is terminated, got None")
+            self._waits[seat] = False
+            found.infos[seat] = _info_of({agent: info}, agent)
             if not (terminated or truncated):
                 found.acts[seat] = True
                 return False
+            self._gone.add(agent)
             self.env.step(None)
         if True in self._waits:
             who = self.seats[self._waits.index(True)]
-            raise RuntimeError(f"agent {who} left, expected it to be selected once more when its part had ended")
+            raise WrongAnswer(f"agent {who} left, expected it to be selected once more when its part had ended")
         return True
+
+    def _seat_with_the_move(self, agent: Any) -> int:
+        if agent in self._gone:
+            raise WrongAnswer(
+                f"agent_selection: expected an agent whose part has not ended, got {agent} again; after its end, step(None) "
+                "selects another one"
+            )
+        if agent not in self.seat_of:
+            raise WrongAnswer(f"agent_selection: expected one of possible_agents, got {agent}")
+        return self.seat_of[agent]
+
+    def pending(self) -> list[float]:
+        """[A] what agents have got since they moved who do not have the move, as far as PettingZoo's base class sums it."""
+        earned = getattr(self.env, "_cumulative_rewards", {})
+        waits = set(self.env.agents) - self._gone - {self.env.agent_selection}
+        return [float(earned.get(agent, 0.0)) if agent in waits else 0.0 for agent in self.agents]
+
+
+def _info_of(infos: Mapping[Any, Any], agent: Any) -> Mapping[str, Any]:
+    """The info of an agent; an empty one if there is none."""
+    info: Mapping[str, Any] = infos.get(agent, _NO_INFO)
+    if type(info) is dict:
+        return info
+    if info is not None and not isinstance(info, Mapping):
+        raise WrongAnswer(f"info of agent {agent}: expected a dict, got {type(info).__name__}")
+    return info or _NO_INFO
+
+
+def _check_numbers(agent: Any, **numbers: Any) -> None:
+    """Raise `WrongAnswer` for what is no number."""
+    for what, value in numbers.items():
+        try:
+            float(value) if what == "reward" else bool(value)
+        except (TypeError, ValueError) as error:
+            raise WrongAnswer(f"{what} of agent {agent}: expected a number, got {one_line(repr(value), 80)}") from error
 
 
 def has_seats(made: object) -> bool:
     """Whether an object is an environment of several agents in one of PettingZoo's interfaces."""
-    return attribute(made, "possible_agents") is not None and callable(attribute(made, "observation_space"))
+    is_method = callable(attribute(made, "observation_space")) and callable(attribute(made, "action_space"))
+    return is_method and attribute(made, "possible_agents") is not None
 
 
 def seat_id(env: Any) -> Any:
@@ -324,9 +393,26 @@ def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
 def seated(made: Any, name: str) -> SeatedEnv:
     """A PettingZoo environment as an environment with seats. Raises `UsageError`."""
     if not made.possible_agents:
-        raise UsageError(f"environment {name}: expected at least one agent in its possible_agents, got none")
+        raise UsageError(
+            f"environment {name}: expected at least one agent in its possible_agents, got none; it must list all agents "
+            "before its first reset"
+        )
+    named: dict[str, Any] = {}
+    for agent, text in zip(made.possible_agents, _names(made.possible_agents), strict=True):
+        if text in named:
+            both = " and ".join(one_line(repr(each), 60) for each in (named[text], agent))
+            raise UsageError(
+                f"environment {name}: possible_agents: expected agents of different names, got {both}; names are text, and "
+                f"their first {MAX_AGENT_NAME - 1} characters count"
+            )
+        named[text] = agent
     kind = TurnSeats if hasattr(made, "agent_iter") else ParallelSeats
     return kind(made, name)
+
+
+def _names(agents: Iterable[Any]) -> tuple[str, ...]:
+    """The names of agents, as the learner, metrics and errors have them."""
+    return tuple(one_line(str(agent), MAX_AGENT_NAME) for agent in agents)
 
 
 def _common(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import gymnasium
 
 from protocol.bounds import one_line
+from protocol.envs.advice.several_agents import what_it_lacks
 from protocol.envs.found_names import found_by_others, in_main, last_part, name_of
 from protocol.envs.seats import has_seats
 from protocol.errors import UsageError, first_line, safe_repr
@@ -129,6 +130,7 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
     if not (isinstance(made, gymnasium.Env) or has_seats(made)):
         raise UsageError(
             f"wrapper {name}: expected it to return an environment of gymnasium or PettingZoo, got {type(made).__name__}"
+            f"{f'; {lacks}' if (lacks := what_it_lacks(made)) else ''}"
         )
     return made
 

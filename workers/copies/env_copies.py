@@ -19,6 +19,7 @@ from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array, Bools, Doubles
 from protocol.envs.action_masks import without_mask
+from protocol.envs.answers import reset_answer, wrong_step
 from protocol.envs.description import agents_in_words, agents_of
 from protocol.envs.seats import SeatedEnv
 from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
@@ -268,7 +269,7 @@ class VectorCopies:
             raise UsageError(f"vector environment {self._env}: expected {len(seeds)} copies, got {self._env.num_envs}")
         try:
             with activity().during(RESETTING):
-                observation, infos = self._first(seeds)
+                observation, infos = reset_answer(self._first(seeds))
                 leaves = self._read(observation)
             if self._masks is None:
                 return leaves
@@ -290,11 +291,15 @@ class VectorCopies:
         """Step all copies at once."""
         self._activity.begin(STEPPING)
         try:
-            observation, reward, terminated, truncated, infos = self._env.step(actions)
+            answer = self._env.step(actions)
         except BaseException as error:
             raise CopyFailed(None, "step") from error
         finally:
             self._activity.end(self._env.num_envs)
+        try:
+            observation, reward, terminated, truncated, infos = answer
+        except (TypeError, ValueError) as error:
+            raise CopyFailed(None, "step", str(wrong_step(answer))) from error
         for name, array in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
             if np.shape(array) != self._per_copy:
                 line = (

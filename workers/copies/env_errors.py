@@ -8,11 +8,12 @@ from __future__ import annotations
 import re
 from traceback import extract_tb, format_exception
 
+from protocol.envs.answers import OF_RESET, OF_STEP, WrongAnswer
 from protocol.errors import EnvironmentFailed, first_line
 
 
 class CopyFailed(Exception):
-    """An env copy raised, and the environment's own exception is the cause; or it returned what no array can hold.
+    """An env copy raised, and the environment's own exception is the cause; or it returned what it must not.
 
     `copy` is its number within the lane, or None where a vector environment does not say which one it was.
     `doing` says what it did: "make", "reset" or a step. `line` says what was expected and what it was, if it did not raise.
@@ -34,21 +35,38 @@ def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = ""
     copy = "" if what.copy is None else f"copy {what.copy}, "
     if not (line := what.line):
         cause = what.__cause__ or what
-        line = f"its environment raised {type(cause).__name__}: {first_line(cause, '')}{_about_action(cause)}"
-        detail = "".join(format_exception(cause))
+        line = _what_it_did(cause)
+        detail = "" if isinstance(cause, WrongAnswer) else "".join(format_exception(cause))
     return EnvironmentFailed(f"{whose}{copy}{doing or what.doing}: {line}", detail, lane)
 
 
-def _about_action(cause: BaseException) -> str:
+def _what_it_did(cause: BaseException) -> str:
+    """What the environment did, as a line: it raised an exception, of which we know more in some cases."""
+    if isinstance(cause, WrongAnswer):
+        return str(cause)
+    frames = extract_tb(cause.__traceback__)
+    raised_by = (frames[-1].line or "") if frames else ""
+    says = first_line(cause, "")
+    advice = _about_action(says, raised_by) or _about_answer(says, raised_by)
+    return f"its environment raised {type(cause).__name__}: {says}{advice}"
+
+
+def _about_action(says: str, raised_by: str) -> str:
     """What to write if the environment wants an action to be an int of Python, as the end of a line; else nothing.
 
     It gets a numpy integer, as from gymnasium's vector environments and from `Discrete.sample`.
     """
-    frames = extract_tb(cause.__traceback__)
-    raised_by = (frames[-1].line or "") if frames else ""
-    if not re.search(r"isinstance\(.*\bint\b", raised_by) and "np.int64(" not in first_line(cause, ""):
+    if not re.search(r"isinstance\(.*\bint\b", raised_by) and "np.int64(" not in says:
         return ""
     return (
         "; its action is a numpy integer: write int(action) there, or --wrappers my_module:MyWrapper, a "
         "gymnasium.ActionWrapper of yours whose action() returns int(action)"
     )
+
+
+def _about_answer(says: str, raised_by: str) -> str:
+    """What a wrapper expected that could not unpack what `reset` or `step` returned, as the end of a line; else nothing."""
+    called = re.search(r"= .*\b(reset|step)\(", raised_by) if "unpack" in says else None
+    if called is None:
+        return ""
+    return f"; {called[1]} below this wrapper returned another form: {OF_RESET if called[1] == 'reset' else OF_STEP}"

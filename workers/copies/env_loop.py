@@ -17,6 +17,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
+from protocol.envs.answers import reset_answer, wrong_step
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
 from workers.activity import (
@@ -99,7 +100,7 @@ class EnvLoop:
             pulse()
             try:
                 with self._activity.during(RESETTING):
-                    into[n], info = self.envs[n].reset(seed=seed, **further)
+                    into[n], info = reset_answer(self.envs[n].reset(seed=seed, **further))
             except BaseException as error:
                 raise CopyFailed(n, "reset") from error
             self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False
@@ -131,19 +132,25 @@ class EnvLoop:
             try:
                 if resets:
                     begin(RESETTING)
-                    observation, info = self.envs[n].reset()
+                    observation, info = reset_answer(self.envs[n].reset())
                     begin(stepping)
                     reward[n], terminated[n], truncated[n] = 0.0, False, False
                 else:
-                    observation, reward[n], terminated[n], truncated[n], info = step(action)
+                    answer = step(action)
+                    try:
+                        observation, reward[n], terminated[n], truncated[n], info = answer
+                    except (TypeError, ValueError) as error:
+                        raise wrong_step(answer) from error
+                    if type(info) is not dict and info is not None and not isinstance(info, Mapping):
+                        raise wrong_step(answer)
                     if same_step and (terminated[n] or truncated[n]):
                         resets = True
                         # Copies, because the reset may overwrite them.
                         last = {"final_obs": deepcopy(observation), "final_info": _kept(info)}
                         begin(RESETTING)
-                        observation, info = self.envs[n].reset()
+                        observation, info = reset_answer(self.envs[n].reset())
                         begin(stepping)
-                        info = last | info
+                        info = last | dict(info)
                 into[n] = observation
             except BaseException as error:
                 begin(WAITING)

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from protocol.envs.answers import WrongAnswer
 from protocol.envs.seats import seated
 from tests.support.users_code.seat_envs import RockPaperScissors
 
@@ -48,7 +49,7 @@ class Wrong(RockPaperScissors):
 )
 def test_what_is_wrong_is_named(wrong: str, instead: Any, says: str) -> None:
     env = seated(Wrong(wrong, instead), "game")
-    with pytest.raises((RuntimeError, TypeError)) as caught:
+    with pytest.raises(WrongAnswer) as caught:
         env.reset(seed=1)
         env.step([0, 0])
     assert str(caught.value) == says

@@ -1,0 +1,37 @@
+"""Environments whose constructor takes one dict, as RLlib hands it: how to give them theirs. Pure.
+
+Rule: only the exception of such a constructor is looked at, after it was called without the dict.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from traceback import extract_tb
+from typing import Any
+
+from protocol.envs.found_names import last_part
+from protocol.errors import first_line, words_an_error
+
+_READS_A_DICT = re.compile(
+    r"'(NoneType|EnvCopy)' object (has no attribute '(get|items|keys|pop|setdefault|update|copy)'"
+    r"|is not (subscriptable|iterable)|does not support item)|argument of type '(NoneType|EnvCopy)' is not iterable"
+)
+
+
+@words_an_error
+def wants_a_dict(name: str, factory: Callable[..., object], kwargs: Mapping[str, Any], error: Exception) -> str:
+    """What to write if the constructor of an environment failed because its first argument was no dict; else nothing."""
+    if not _READS_A_DICT.search(first_line(error)):
+        return ""
+    parameters = list(inspect.signature(factory).parameters.values())
+    if not parameters or parameters[0].name in kwargs or parameters[0].default not in (None, inspect.Parameter.empty):
+        return ""
+    raised_by = extract_tb(error.__traceback__)[-1].line or ""
+    if not re.search(rf"\b({parameters[0].name}|\w*config)\b", raised_by):
+        return ""  # something else was None
+    return (
+        f"its argument {parameters[0].name} is a dict, as RLlib passes it; name a function of yours in place of {name}: "
+        f"def make_env(**config): return {last_part(name)}(config), and give entries of the dict as --env-kwargs NAME VALUE"
+    )

@@ -1,0 +1,54 @@
+"""What `reset` and `step` of an environment return, read. What is not of gymnasium's form is a `WrongAnswer`.
+
+Rule: an info that is None is empty. Anything else than a dict in its place means that the environment returned something
+else, perhaps an observation of as many elements, and nothing of it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from protocol.bounds import one_line
+
+RESET, STEP = "observation, info", "observation, reward, terminated, truncated, info"
+"""What each method returns."""
+OF_RESET = f"expected ({RESET})"
+OF_STEP = f"expected ({STEP})"
+
+
+class WrongAnswer(Exception):
+    """An environment returned what its interface does not allow. The text is the line of an error, without the copy."""
+
+
+def reset_answer(answer: Any) -> tuple[Any, Mapping[str, Any]]:
+    """What `reset` returned: the observation and the info. Raises `WrongAnswer`."""
+    if isinstance(answer, tuple | list) and len(answer) == 2 and (answer[1] is None or isinstance(answer[1], Mapping)):
+        return answer[0], answer[1] or {}
+    raise WrongAnswer(f"its reset returned {in_words(answer)}; {OF_RESET}: end it with `return observation, {{}}`")
+
+
+def wrong_step(answer: Any) -> WrongAnswer:
+    """The error for what `step` returned, if that is not five values with a dict at the end."""
+    told = f"its step returned {in_words(answer)}; {OF_STEP}"
+    if isinstance(answer, tuple | list) and len(answer) == 4:
+        return WrongAnswer(f"{told}, not the old form with `done`: truncated is True where a time limit ends the episode")
+    return WrongAnswer(told)
+
+
+def in_words(answer: Any) -> str:
+    """What was returned, by its form."""
+    match answer:
+        case tuple() | list():
+            kinds = ", ".join(_kind(each) for each in answer[:6])
+            return one_line(f"{len(answer)} values ({kinds}{', …' if len(answer) > 6 else ''})", 160)
+        case _:
+            return _kind(answer)
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{list(value.shape)}"
+    return "None" if value is None else type(value).__name__
