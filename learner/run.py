@@ -21,6 +21,7 @@ from learner.between_updates.tally import Tally
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
+from learner.config.costs import large_observations
 from learner.config.validation import unused_setting
 from learner.conversations import open_hub
 from learner.members.process_callbacks import ProcessCallbacks
@@ -146,6 +147,8 @@ def open_run(
     spec = run_spec(setup.config, setup.known.env, setup.known.spaces)
     for line in flattened_images(spec.policy):
         log.warning("%s", line)
+    if torch_device(setup.config) == "cpu" and (line := large_observations(setup.config, spec.policy)):
+        log_notice(log, line)
     setup = _use_threads(setup, spec.policy, processes)
     config, folder = setup.config, setup.folder
     algorithm, prior = _new_algorithm(setup, spec)

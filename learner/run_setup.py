@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from learner.config.config import Config
+from learner.config.costs import endless_evaluations
 from learner.conversations import describe_settings, describe_spec
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
@@ -155,6 +156,8 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
         log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
     if env.factory is None and not env.wrappers and (ours := preprocessed(env.id)):
         log_notice(log, f"{env.id} shows raw frames, one at a time; {ours} has the usual wrappers, and presets")
+    if line := endless_evaluations(config, evaluation):
+        log_notice(log, line)
     return KnownEnvironment(env, spaces, described, evaluation.max_episode_steps)
 
 

@@ -180,6 +180,8 @@ class Heartbeat(Message, frozen=True):
     """resident memory of the worker's process; 0 if it is not known"""
     late_actions: Natural = 0
     """how often since the worker started a program that owns its loop took an action of its own, because none had come"""
+    note: Line = ""
+    """what whoever trains should know of the environment, if the worker has seen something; the learner says it once"""
 
 
 class HeartbeatReply(Message, frozen=True):

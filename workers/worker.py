@@ -314,7 +314,8 @@ class Worker:
                 stages["evaluate"] = earlier.get("evaluate", 0.0) + self._evaluator.seconds
                 steps += self._evaluator.steps
             stages = {**earlier, **stages, "wait": self._waited_s}
-            self._statistics = Statistics(steps, stages, self._resident_bytes)
+            note = "" if self._collector is None else self._collector.note
+            self._statistics = Statistics(steps, stages, self._resident_bytes, note)
             self._session.update_statistics(self._statistics)
 
     def _do(self, effects: list[WorkerEffect]) -> None:

@@ -121,7 +121,25 @@ class RejoinRequested:
     late: int
 
 
-Event = WorkerJoined | WorkerLeft | WorkerRefused | WorkerNotStarted | NamelessHello | Failed | RejoinRequested
+@dataclass(frozen=True)
+class EnvironmentNoted:
+    """A worker has seen something in its environment that whoever trains should know."""
+
+    json_name: ClassVar[str] = "environment_noted"
+    worker: str
+    note: str
+
+
+Event = (
+    WorkerJoined
+    | WorkerLeft
+    | WorkerRefused
+    | WorkerNotStarted
+    | NamelessHello
+    | Failed
+    | RejoinRequested
+    | EnvironmentNoted
+)
 
 
 def describe(event: Event) -> str:
@@ -157,6 +175,8 @@ def _line(event: Event) -> str:
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"
+        case EnvironmentNoted(worker, note):
+            return f"worker {worker}: {note}"
 
 
 def _dealt_again(tickets: int) -> str:

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 
 from learner.members.coordinator import Coordinator
-from learner.members.events import Failed, PolicyRaised
+from learner.members.events import EnvironmentNoted, Failed, PolicyRaised
 from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.member_states import SentUnusable
 from learner.members.membership import Member, Membership, Outgoing
@@ -40,6 +40,7 @@ from protocol.messages import (
 )
 from protocol.specs import RunSpec
 
+MOST_NOTES = 10  # of all workers together
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
 
@@ -70,6 +71,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.version = -1  # until `publish`
         self._placement = LanePlacement(lanes, _by_joining)
         self.weights = SentWeights()
+        self._notes = set[str]()  # of workers; all that step one environment see the same
 
     # ---------------------------------------------------------------- in
 
@@ -197,6 +199,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         self.rollouts.ledger.late_actions += member.new_late_actions(heartbeat)
+        note = heartbeat.note
+        if note and note not in self._notes and len(self._notes) < MOST_NOTES:
+            self._notes.add(note)
+            self.events.append(EnvironmentNoted(member.hello.worker, note))
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:

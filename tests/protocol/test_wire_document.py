@@ -164,6 +164,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice as long as the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello messages, at most",
     (ticket_coordinator, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
+    (ticket_coordinator, "MOST_NOTES"): "different notes of workers that the learner says",
     (membership, "REMEMBERED"): "refused processes that the learner remembers, so that they do not come back",
     (membership, "MAX_MEMBERS"): "workers of one learner",
     (join_limiter, "AT_ONCE"): "times that the workers of one key may say Hello at once; more are not answered",

@@ -131,6 +131,8 @@ class Collector:
         step_all: StepAll = no_step_for_all,
     ) -> None:
         """`step_all`: steps the env copies of all lanes at once, if one vector environment holds them all."""
+        self.note = ""
+        """what whoever trains should know of the environment, once a lane has seen it"""
         self._ended_steps = 0  # of rollouts that are whole or were dropped
         self._under_way: _UnderWay | None = None
         self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
@@ -222,6 +224,7 @@ class Collector:
         lane = self.lanes.open(number, made)
         lane.set_attributes(self.env_attributes, pulse)
         lane.reset(pulse)
+        self.note = self.note or lane.copies.note
         self.stages["open"] += perf_counter() - began
         return lane
 

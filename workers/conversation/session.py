@@ -158,6 +158,8 @@ class Statistics:
     """seconds in each stage"""
     resident_bytes: int = 0
     """resident memory of this process"""
+    note: str = ""
+    """what whoever trains should know of the environment"""
 
 
 @dataclass
@@ -326,6 +328,7 @@ class Session:
             steps=statistics.steps,
             stages=dict(statistics.stages),
             resident_bytes=statistics.resident_bytes,
+            note=statistics.note,
         )
         return [SendMessage(each) for each in (heartbeat, current.described) if each is not None]
 

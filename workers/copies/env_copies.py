@@ -33,7 +33,7 @@ from workers.activity import EVALUATING, MAKING, RESETTING, STEPPING, activity
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
-from workers.copies.mask_reader import MaskReader
+from workers.copies.mask_reader import MaskReader, unused_mask
 from workers.copies.row_writers import missing_leaf, read_leaves
 from workers.copy_slots import close_copy
 from workers.envs.reset_ahead import ResetAhead
@@ -78,6 +78,8 @@ class EnvCopies(Protocol):
     """Observation space of one copy."""
     action_space: gymnasium.Space[Any]
     """Action space of one copy."""
+    note: str
+    """What whoever trains should know of the environment, as the first reset shows; empty if nothing."""
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""
@@ -144,6 +146,7 @@ class LoopedCopies:
         with self._activity.during(MAKING):  # to read an attribute of the environment may run code of its own
             self.observation_space, self.action_space = self.envs[0].observation_space, self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
+        self.note = ""
         if masked:
             self.observation_space = without_mask(self.observation_space, self.action_space)
         self.observation_space = with_last(self.observation_space, critic_keys)
@@ -156,6 +159,8 @@ class LoopedCopies:
         copies = range(len(seeds))
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         leaves = self._leaves()
+        if self._masks is None:
+            self.note = unused_mask((info for _, info in infos), self.action_space)
         return leaves if self._masks is None else (*leaves, self._read_masks(self._masks, infos, copies))
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
@@ -254,6 +259,7 @@ class VectorCopies:
         check_resets_next_step(env)
         self._env, self._activity, self._facts = env, activity(), facts
         self._per_copy = (env.num_envs,)
+        self.note = ""
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
@@ -272,6 +278,7 @@ class VectorCopies:
                 observation, infos = reset_answer(self._first(seeds))
                 leaves = self._read(observation)
             if self._masks is None:
+                self.note = unused_mask([infos], self.action_space)
                 return leaves
             no_end = np.zeros(self._per_copy, bool)
             return [*leaves, self._masks.read_all(observation, infos, no_end, no_end)]

@@ -29,6 +29,7 @@ class EnvpoolCopies:
 
     def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = ()) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode."""
+        self.note = ""
         self._facts = facts
         self.observation_space = pool.observation_space
         self.action_space = pool.action_space

@@ -7,7 +7,7 @@ was truncated, the mask is kept, because the value of the last observation count
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -23,6 +23,13 @@ from workers.copies.env_errors import CopyFailed
 
 DTYPES = ("bool", "int8", "uint8", "int64", "int32")
 _NONE: Mapping[str, Any] = {}
+
+
+def unused_mask(infos: Iterable[Mapping[str, Any]], action: gymnasium.Space[Any]) -> str:
+    """A line for whoever trains, if there is a mask in one of these infos of resets, which the run does not use."""
+    if not choices(action_spec(action)) or not any(isinstance(info, Mapping) and MASK in info for info in infos):
+        return ""
+    return f"the environment's info has an {MASK}, which this run does not use; --action-masks info does"
 
 
 class MaskReader:

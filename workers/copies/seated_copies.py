@@ -18,6 +18,7 @@ from workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepRes
 from workers.copies.env_errors import CopyFailed
 from workers.copies.env_loop import Pulse
 from workers.copies.facts import facts_of_info
+from workers.copies.mask_reader import unused_mask
 from workers.copies.row_writers import read_leaves
 
 
@@ -46,6 +47,9 @@ class SeatedCopies(LoopedCopies):
         copies = range(len(seeds))
         self._allowed = [None] * (self.count * self._seats)
         self._loop.reset(copies, seeds, self._observations, pulse)
+        if self._masks is None:
+            infos = [info for step in self._observations if step is not None for info in step.infos]
+            self.note = unused_mask(infos, self.action_space)
         return self._result(copies).leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:

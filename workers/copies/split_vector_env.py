@@ -191,6 +191,7 @@ class SplitLane:
     def __init__(self, split: SplitVectorEnv, first: int, count: int) -> None:
         self._split, self._first, self.count = split, first, count
         self._copies = slice(first, first + count)
+        self.note = ""
         self.observation_space = split.observation_space
         self.action_space = split.env.single_action_space
 

@@ -11,6 +11,7 @@ import pytest
 
 from learner.config.validation import MOST_TICKETS
 from learner.members.events import (
+    EnvironmentNoted,
     EnvironmentRaised,
     Failed,
     NamelessHello,
@@ -18,13 +19,14 @@ from learner.members.events import (
     WorkerJoined,
     WorkerLeft,
     WorkerRefused,
+    describe,
 )
 from learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.lanes import TicketedLane
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
+from learner.rollouts.ticket_coordinator import MOST_NOTES, STRIKES, TicketCoordinator
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
@@ -1207,3 +1209,15 @@ def test_the_most_tickets_that_a_run_may_have_outstanding_fit_one_message() -> N
     received = tuple(Received(n, 200, 10**5) for n in range(MOST_TICKETS))
     order = Collect(2**48, 10**6, tuple(Permit(number, n, 200, 10**5) for n, number in enumerate(numbers)), received, ())
     assert decode_to_worker([bytes(frame) for frame in encode(order)]) == order
+
+
+def test_what_workers_note_of_the_environment_is_told_once() -> None:
+    learner = Learner()
+    notes = ["it has a mask", "it has a mask", "", *(f"note {n}" for n in range(2 * MOST_NOTES))]
+    for peer in (A, B):
+        learner.joins(peer)
+        for note in notes:
+            learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), tuple(learner.tickets(peer)), 0, {}, 0, note=note))
+    told = [event for event in learner.coordinator.events if isinstance(event, EnvironmentNoted)]
+    assert len(told) == MOST_NOTES
+    assert [describe(event) for event in told[:2]] == ["worker a: it has a mask", "worker a: note 0"]

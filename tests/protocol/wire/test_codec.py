@@ -204,7 +204,7 @@ def test_a_default_stands_at_the_end_alone() -> None:
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
     assert defaults == {
         Hello: (False,), Alive: (None,),
-        Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
+        Weights: (None,), Heartbeat: (0, ""), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
         Evaluate: ((), (), ()),
     }  # fmt: skip
     assert Rollout.__struct_fields__[-4:] == ("episodes", "mask", "extras", "resets")
@@ -217,9 +217,9 @@ def test_a_default_stands_at_the_end_alone() -> None:
         (["Heartbeat", 7, 0, [], [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
         (["Heartbeat", 7, 0, [], [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
         (["Heartbeat", 7, 0, [], [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
-        (["Heartbeat", 7, 0, [], [], 0, {}], "Heartbeat expected 8 fields, got 6"),
-        (["Heartbeat", 7, 0, [], [], 0, {}, 0, 0, 0], "Heartbeat expected 8 fields, got 9"),
-        (["Heartbeat"], "Heartbeat expected 8 fields, got 0"),
+        (["Heartbeat", 7, 0, [], [], 0, {}], "Heartbeat expected 9 fields, got 6"),
+        (["Heartbeat", 7, 0, [], [], 0, {}, 0, 0, "", 0], "Heartbeat expected 9 fields, got 10"),
+        (["Heartbeat"], "Heartbeat expected 9 fields, got 0"),
         (["Inquire", 1], "Inquire expected 0 fields, got 1"),
         ({"type": "Hello", "protocol": None}, "Expected `int`, got `null` - at `$.protocol`"),
         ({"type": "Hello"}, "Object missing required field `protocol`"),

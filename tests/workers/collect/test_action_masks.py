@@ -238,3 +238,24 @@ def test_masks_of_lanes_do_not_depend_on_each_other() -> None:
     alone = [collect(random_collector(run), run, lanes=[lane])[0] for lane in (0, 1)]
     both = collect(split(run, 2)[1], run, lanes=[0, 1])
     assert all(map(same, alone, both))
+
+
+# ------------------------------------------------------------------------------------------------ a mask that is not used
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_whoever_trains_is_told_of_a_mask_in_info_that_the_run_does_not_use(vector: bool) -> None:
+    run = msgspec.structs.replace(masked_run("InInfo"), masked=False)
+    collector = random_collector(run, vectorized) if vector else random_collector(run)
+    assert collector.note == ""
+    with pytest.raises(EnvironmentFailed, match="illegal action"):
+        collect(collector, run)
+    said = "the environment's info has an action_mask, which this run does not use; --action-masks info does"
+    assert collector.note == said
+
+
+def test_a_mask_that_is_used_is_not_told_of() -> None:
+    run = masked_run("InInfo")
+    collector = random_collector(run)
+    collect(collector, run)
+    assert collector.note == ""

@@ -1,0 +1,50 @@
+"""What will cost a run much time, in lines for the user before it starts. Pure: settings and shapes in, a line out.
+
+Rule: a line gives the number and what makes it smaller. It is empty where the cost is usual.
+"""
+
+from __future__ import annotations
+
+import math
+
+from gymnasium.wrappers import TimeLimit
+
+from learner.config.config import Config
+from learner.config.evaluation_size import evaluation_size
+from protocol.envs.description import DescribedEnv, class_name
+from protocol.policy.layout import multiply_adds
+from protocol.specs import PolicySpec
+
+MANY_MULTIPLY_ADDS = 1 << 24  # of one observation; Atari's four frames of 84 x 84 take half of it
+PASSES = 3  # a gradient costs twice as much as the pass forward
+
+
+def large_observations(config: Config, policy: PolicySpec) -> str:
+    """What a minibatch costs, if an observation is large."""
+    if (of_one := multiply_adds(policy)) < MANY_MULTIPLY_ADDS:
+        return ""
+    numbers = sum(math.prod(leaf.shape) for leaf in policy.observation)
+    rows = getattr(config.algorithm, "batch_size", config.algorithm.rollout_steps * config.envs)
+    smaller = (
+        '--wrappers "gymnasium.wrappers:ResizeObservation(shape=(84, 84))"'
+        if any(leaf.is_image for leaf in policy.observation)
+        else "a wrapper that keeps the numbers which matter, or a smaller --net"
+    )
+    return (
+        f"an observation of {config.env} has {numbers:,} numbers, so a minibatch of {rows:,} takes "
+        f"{PASSES * rows * of_one / 1e9:,.0f} billion multiply-adds: updates may take minutes; what helps: {smaller}, "
+        "or an --encoder of your own"
+    )
+
+
+def endless_evaluations(config: Config, evaluation: DescribedEnv) -> str:
+    """How long an evaluation during training may take, if nothing limits the episodes of its environment."""
+    limited = evaluation.max_episode_steps is not None or class_name(TimeLimit) in evaluation.wrappers
+    if limited or not (config.eval_every or config.eval_episodes):
+        return ""
+    size = evaluation_size(config)
+    limit = "" if evaluation.seats else ' --wrappers "gymnasium.wrappers:TimeLimit(max_episode_steps=1000)" or'
+    return (
+        f"no time limit of {config.env} is known: where episodes do not end, an evaluation of {size.episodes} takes "
+        f"{size.max_steps:,} env steps; limit it by{limit} --eval-max-steps"
+    )
