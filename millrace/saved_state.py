@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,8 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
     """The state, and the user's arrays by name. Raises `CheckpointError`."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged file open
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
+                raise ValueError("it is compressed, and no file of ours is")  # a few bytes could fill the memory
             arrays = {name: file[name] for name in file.files}
         state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
     except Exception as error:  # zipfile, numpy and msgspec raise a dozen types for damaged files

@@ -239,7 +239,10 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     whole = file.read_bytes()
     nested = io.BytesIO()
     np.savez(nested, millrace=np.frombuffer(b'{"normalizer":' + b'{"a":' * 100_000, np.uint8))
-    for damaged in (b"", whole[: len(whole) // 2], b"rubbish", nested.getvalue()):
+    compressed = io.BytesIO()
+    with np.load(file) as saved:
+        np.savez_compressed(compressed, **saved)
+    for damaged in (b"", whole[: len(whole) // 2], b"rubbish", nested.getvalue(), compressed.getvalue()):
         file.write_bytes(damaged)
         with pytest.raises(CheckpointError, match=r"state\.npz"):
             millrace.RolloutService("CartPole-v1", restore=file, **SMALL)
