@@ -11,13 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Floats
+from protocol.arrays import Array, Bools, Doubles, Floats
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
 from protocol.specs import RunSpec
 from workers.copies.env_copies import SeatColumns, StepResult
 from workers.copies.facts import Facts
+from workers.copies.value_checks import check_rewards
 from workers.opponents import Match, Opponent, OtherTeams, whole_episode
 
 
@@ -44,7 +45,7 @@ class SeatRows:
     def start(self, first: SeatColumns, now_s: float) -> None:
         """All copies were reset."""
         self.acts = first.acts
-        self._return += first.outside.reshape(self._return.shape)
+        self._add(first.outside, 0)
         self._start_s[:] = now_s
 
     def begin(self, state: Floats, opponent: Opponent | None) -> Floats:
@@ -81,7 +82,9 @@ class SeatRows:
         complete, self.acts, outside, over = row.columns
         self.valid[t] = complete
         self._waits &= ~complete
-        self._return += (np.asarray(row.reward, np.float64) + outside).reshape(self._return.shape)
+        self._return += np.asarray(row.reward, np.float64).reshape(self._return.shape)
+        if np.count_nonzero(outside):
+            self._add(outside, t)
         self._length += ~self._resets
         state[np.repeat(self._resets, self._seats)] = 0.0
         if self.others is not None and self._opponent is not None:
@@ -89,6 +92,11 @@ class SeatRows:
         self.resets[t + 1] = self._resets = over
         for n in np.flatnonzero(over).tolist():
             self._episodes.append(self._ended(n, row.facts, now_s))
+
+    def _add(self, outside: Doubles, t: int) -> None:
+        """Add rewards [N · A] of step t that are in no row to the returns. No later check sees them."""
+        check_rewards(self._lane, outside[None], self._run.row_axes, t)
+        self._return += outside.reshape(self._return.shape)
 
     def _ended(self, n: int, facts: Facts, now_s: float) -> Episode:
         """The episode of copy n, which is over."""

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from protocol.arrays import Array, Bools
-from protocol.envs.seats import SeatStep, side_by_side
+from protocol.envs.seats import SeatedEnv, SeatStep, side_by_side
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
 from workers.copies.env_errors import CopyFailed
@@ -83,6 +83,12 @@ class SeatedCopies(LoopedCopies):
         self.columns = SeatColumns(np.array(complete, bool), np.array(acts, bool), np.array(outside, np.float64), ended)
         facts = {n: self._facts_of(steps[n]) for n in stepped if ended[n]} if self._facts else {}
         return StepResult(leaves, reward, terminated, truncated, facts=facts, columns=self.columns)
+
+    def pending(self, copy: int) -> Array:
+        """[A] rewards that the seats of this copy have got, and that none of its steps has returned."""
+        env = self.envs[copy]
+        assert isinstance(env, SeatedEnv)
+        return np.array(env.pending(), np.float64)
 
     def _facts_of(self, last: SeatStep) -> tuple[float, ...]:
         """Of each fact, the mean over the seats that report it in the last step of a copy's episode; NaN if none does."""

@@ -162,7 +162,9 @@ class Evaluator:
         played, running, t = EpisodesSoFar(self._run, order), list(range(k)), 0
         self._write(obs, running, copies.reset(order.seeds, pulse), 0, "first reset")
         if isinstance(copies, SeatedCopies):
-            played.returns += copies.columns.outside[: k * A].reshape(k, A)
+            outside = copies.columns.outside[: k * A]
+            check_rewards(None, outside[None], self._run.row_axes)
+            played.returns += outside.reshape(k, A)
         for n, sender in enumerate(senders):
             self._observe(sender, obs, n, copies)
         while running:
@@ -181,6 +183,8 @@ class Evaluator:
                 return None
             step, rewards, terminated, truncated = made
             self._write(obs, running, step.leaves, t + 1, f"step {t}")
+            if isinstance(copies, SeatedCopies) and t + 1 == order.most_steps:  # those that go on are cut
+                self._add_pending(rewards, copies, running, t)
             going_on = played.add(running, rewards, terminated | truncated, step.facts)
             for n in running if senders else ():
                 self._observe(senders[n], obs, n, copies)
@@ -206,12 +210,22 @@ class Evaluator:
             write_numbers(numbers, slice(None), (step.reward[:rows], step.terminated[:rows], step.truncated[:rows]))
         except CopyFailed as error:
             raise environment_failed(None, error, f"step {t}") from error
+        if (columns := step.columns) is not None:
+            numbers[0][:] += columns.outside[:rows]
         check_rewards(None, numbers[0][None], self._run.row_axes, t)
         rewards, terminated, truncated = (array.reshape(-1, A) for array in numbers)
-        if (columns := step.columns) is None:
+        if columns is None:
             return step, rewards, terminated[:, 0], truncated[:, 0]
         over = columns.over[: rows // A]
-        return step, rewards + columns.outside[:rows].reshape(-1, A), over, np.zeros_like(over)
+        return step, rewards, over, np.zeros_like(over)
+
+    def _add_pending(self, rewards: Array, copies: SeatedCopies, running: Sequence[int], t: int) -> None:
+        """Add what seats have got that wait for the move after step t to rewards [k, A]: no later step will return it."""
+        pending = np.zeros_like(rewards)
+        for n in running:
+            pending[n] = copies.pending(n)
+        check_rewards(None, pending.reshape(1, -1), self._run.row_axes, t)
+        rewards += pending
 
     def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
         """The other teams, if the order says who plays them."""

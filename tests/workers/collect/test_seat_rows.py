@@ -8,16 +8,19 @@ import gymnasium
 import msgspec
 import numpy as np
 import pytest
+from pettingzoo.utils.wrappers import BaseWrapper
 
 from learner.algorithms.minibatches import log_probs
 from learner.algorithms.ppo import PPO
 from learner.algorithms.replay.replay_buffer import ReplayBuffer
 from learner.algorithms.returns import EpisodeEnds, complete, discounted_return, gae, vtrace
 from learner.config.hyperparameters import PPOConfig
+from learner.rollouts.evaluation_dealer import episode_seeds
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, UsageError
+from protocol.messages import EpisodeRows, Evaluate
 from protocol.policy.policy import make_policy
 from protocol.rollout import Rollout, stack_rollouts
 from protocol.rows.rollout_checks import validate
@@ -25,6 +28,7 @@ from protocol.specs import PolicySpec, RunSpec, seat_returns
 from tests.support.in_process.collectors import collect, evaluated, no_pulse, random_collector, random_policy
 from tests.support.users_code.seat_envs import AGENTS, Lived, RandomCrowd, RandomGame
 from workers.collect.collector import Collector
+from workers.evaluate.evaluator import Evaluator
 
 FORMS: dict[str, Any] = {"turns": RandomGame, "together": RandomCrowd}
 GAMMA, LAMBDA, RHO, C = 0.9, 0.8, 1.1, 0.9
@@ -336,3 +340,82 @@ def test_a_value_that_is_no_number_is_named_by_the_seat_that_it_is_of(form: str,
         collect(random_collector(run), run)
     with pytest.raises(EnvironmentFailed, match=says):
         evaluated(run, random_policy(run.policy), 3, 0)
+
+
+class PaysLater(RandomCrowd):
+    """Rewards `c`, which is never there, from its second step on."""
+
+    paid = float("nan")
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
+        self.agents = ["a", "b"]
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        seen, rewards, *rest = super().step(actions)
+        rewards.pop("c", None)
+        return seen, rewards | ({} if self.steps < 2 or "c" in self._was_here else {"c": self.paid}), *rest
+
+
+class PaysFirst(RandomGame):
+    """Rewards `c` with the reset, before its first move."""
+
+    paid = float("nan")
+
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        super().reset(seed, options)
+        self._cumulative = dict.fromkeys(AGENTS, 0.0) | {self.agent_selection: self.paid}
+
+
+@pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize(("form", "made"), [("together", PaysLater), ("turns", PaysFirst)])
+def test_a_reward_outside_of_any_row_must_be_finite_too(
+    form: str, made: Any, paid: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No row holds it, but the return of the episode does."""
+    monkeypatch.setattr(made, "paid", paid)
+    run = msgspec.structs.replace(seated_run(form, T=12, N=3), env=EnvSpec(f"{__name__}:{made.__name__}"))
+    got = "nan" if np.isnan(paid) else "-inf" if paid < 0 else "inf"
+    says = rf"reward: expected finite values, got {got} at step \d+, copy [0-2], [abc]$"
+    with pytest.raises(EnvironmentFailed, match=f"^lane 0, {says}"):
+        collect(random_collector(run), run)
+    with pytest.raises(EnvironmentFailed, match=f"^while the policy was evaluated: {says}"):
+        evaluated(run, random_policy(run.policy), 3, 0)
+
+
+class Summing(RandomGame):
+    """Sums what agents got since they moved under the name that PettingZoo's base class has for it."""
+
+    rewards_at_reset = 0.0
+
+    @property
+    def _cumulative_rewards(self) -> dict[str, float]:
+        return self._cumulative
+
+
+class SummingInWrapper(BaseWrapper):  # type: ignore[misc]
+    def __init__(self) -> None:
+        super().__init__(Summing())
+
+    def last(self, observe: bool = True) -> Any:
+        return self.env.last(observe)
+
+
+@pytest.mark.parametrize("made", [Summing, SummingInWrapper])
+def test_an_evaluation_that_is_cut_counts_what_waiting_seats_have_got(made: Any) -> None:
+    run = msgspec.structs.replace(seated_run("turns", T=4, N=1), env=EnvSpec(f"{__name__}:{made.__name__}"))
+    cut = 0
+    for most_steps in (1, 2, 3, 5, 9):
+        evaluator, seeds = Evaluator(run, random_policy(run.policy)), episode_seeds(most_steps, 12)
+        rows: list[EpisodeRows] = []
+        answer = evaluator.play(Evaluate(1, 1, 0, seeds, True, most_steps, True, False), rows.append, no_pulse)
+        copies = [env.env.unwrapped for env in evaluator._copies[None].envs]  # type: ignore[attr-defined]
+        for n, (episode, env) in enumerate(zip(answer.episodes, copies, strict=True)):
+            lived = env.told[-1]
+            np.testing.assert_allclose(episode.facts, [lived[agent].total for agent in AGENTS], atol=1e-9)
+            assert episode.reward == pytest.approx(sum(episode.facts), abs=1e-9)
+            of_rows = sum(float(message.reward.sum()) for message in rows if message.episode == n)
+            assert of_rows == pytest.approx(episode.reward, abs=1e-9)
+        cut += sum(answer.cut)
+        evaluator.close()
+    assert cut > 20
