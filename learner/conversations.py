@@ -21,7 +21,7 @@ from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, Vector, facts_of_all_seats
+from protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, Vector, facts_of_all_seats, seat_returns
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import has_zstd
 from protocol.wire.learner_link import LearnerLink
@@ -58,6 +58,10 @@ def rollout_spec(
         )
     if seats and config.vector != "loop":
         raise UsageError(f"vector {config.vector}: {env.id} has several agents, whose copies are looped; use --vector loop")
+    returns = dict(zip(seat_returns(seats), seats, strict=True))
+    if taken := [name for name in config.info_keys if name in returns]:
+        agent = returns[taken[0]]
+        raise UsageError(f"info_keys: expected another name than {taken[0]}, which is the return of agent {agent}")
     run = RunSpec(
         env=env,
         policy=policy,

@@ -14,6 +14,7 @@ from learner.config.config import TABLES, Config
 from learner.config.evaluation_size import evaluation_size
 from learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
 from learner.config.rollout_config import RolloutConfig
+from learner.run_folder.results import METRICS_BESIDE_FACTS
 from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.env_spec import check_arguments
@@ -157,6 +158,8 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
         raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
+    if taken := METRICS_BESIDE_FACTS.union(f"{name}_missing" for name in names).intersection(names):
+        raise UsageError(f"{at}info_keys: expected another name than {min(taken)}, under which something else is logged")
     if config.wrappers and config.vector != "loop":
         raise UsageError(
             f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"

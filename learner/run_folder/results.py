@@ -37,6 +37,12 @@ class FactMean(msgspec.Struct, frozen=True):
         return f"{mean} ({self.missing} without)" if self.missing and self.mean is not None else mean
 
 
+METRICS_BESIDE_FACTS = frozenset(
+    {"ep_rew_mean", "ep_len_mean", "exploration_rate", "mean_reward", "mean_ep_length", "env_steps"}
+)
+"""What else is logged as rollout/NAME or eval/NAME: no fact may be called so, because one of the two would be lost."""
+
+
 def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dict[str, FactMean]:
     """The means of the facts of these episodes, by name. NaN is a fact that is missing."""
     columns = zip(*episodes, strict=True)

@@ -7,11 +7,14 @@ import pytest
 
 from learner.config.config import Config
 from learner.env_spaces import EnvSpaces
+from learner.metric_names import METRICS
+from learner.run_folder.results import METRICS_BESIDE_FACTS
 from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import read_description
 from protocol.errors import UsageError
 from protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiDiscreteSpace, SpaceSpec, check_size
+from protocol.specs import SCORE
 from protocol.wire.plain_values import pack
 
 SMALL = DiscreteSpace(2, 0, "int64")
@@ -47,3 +50,23 @@ def test_observations_whose_arrays_cannot_be_named_are_refused(observation: Spac
     description = EnvDescription(observation, SMALL, np.frombuffer(pack({}), np.uint8), "", 0, "")
     with pytest.raises(UsageError, match=expected):
         EnvSpaces.of_description(read_description(description))
+
+
+def test_a_number_of_the_environment_may_not_be_called_as_the_return_of_an_agent() -> None:
+    """Both are facts of an episode, and the metrics of one name would hold one of them."""
+    description = EnvDescription(BOX, SMALL, np.frombuffer(pack({}), np.uint8), "", 0, "", seats=("a", "b"))
+    env, described = EnvSpec("my_module:Game"), EnvSpaces.of_description(read_description(description))
+    kept = run_spec(Config(env="my_module:Game", info_keys=("return_c", "wins")), env, described)
+    assert kept.facts == ("return_c", "wins", "return_a", "return_b")
+    for opponents in ({}, {"self_play": 1}):
+        config = Config(env="my_module:Game", info_keys=("wins", "return_b"), **opponents)  # type: ignore[arg-type]
+        with pytest.raises(
+            UsageError, match=r"^info_keys: expected another name than return_b, which is the return of agent b$"
+        ):
+            run_spec(config, env, described)
+
+
+def test_every_other_metric_beside_the_facts_is_known() -> None:
+    logged = [name.partition("/") for group in METRICS.values() for name in group]
+    beside = {name for where, _, name in logged if where in ("rollout", "eval") and "NAME" not in name and name != SCORE}
+    assert beside == METRICS_BESIDE_FACTS
