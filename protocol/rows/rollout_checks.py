@@ -1,4 +1,8 @@
-"""What a rollout must be: arrays of the run's shapes and dtypes, values of its spaces, and the law of a row. Pure."""
+"""What a rollout must be: arrays of the run's shapes and dtypes, values of its spaces, and the law of a row. Pure.
+
+Rule: whatever an environment can break is found by the worker that has the environment, before it sends: values by
+`workers/copies/value_checks.py`, the law by `check_law`. The learner checks it all again, because a worker may be hostile.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +49,13 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(why)
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
+    check_law(rollout, run)
+
+
+def check_law(rollout: Rollout, run: RunSpec) -> None:
+    """Check the law of a row, masks and episodes of a rollout whose arrays are right. Raises `BadRollout`, with one line."""
     if rollout.mask is not None:
-        _check_mask(rollout.mask, rollout, action, axes)
+        _check_mask(rollout.mask, rollout, run.policy.action, run.sent_axes)
     ended = rollout.terminated | rollout.truncated
     if rollout.resets is not None:
         _check_seats(rollout.valid, ended, rollout.resets, run)
@@ -58,14 +67,9 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         count = int(np.count_nonzero(ended & rollout.valid))
     if len(rollout.episodes) != count:
         raise BadRollout(f"episodes: expected {count}, got {len(rollout.episodes)}")
-    steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
+    steps_so_far = (rollout.sequence + 1) * run.rollout_steps  # of this incarnation of the lane
     for episode in rollout.episodes:
-        whole = 0 < episode.length <= steps_so_far and 0 <= episode.seconds < math.inf
-        if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # false for NaN too
-            raise BadRollout(
-                f"episode: expected a finite return of 1 to {steps_so_far} float32 rewards and a duration, got {episode}"
-            )
-        if why := wrong_facts(episode, run):
+        if why := wrong_episode(episode, run, steps_so_far):
             raise BadRollout(f"episode: {why}")
 
 
@@ -97,6 +101,14 @@ def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -
         t, n = np.argwhere(wrong)[0]
         got = rollout.action[t, n].tolist()
         raise BadRollout(f"action: expected one that the mask allows at {place_of((t, n), axes)}, got {got}")
+
+
+def wrong_episode(episode: Episode, run: RunSpec, most_steps: int) -> str:
+    """What is wrong with an episode of at most so many steps; empty if it can be one of the run."""
+    whole = 0 < episode.length <= most_steps and 0 <= episode.seconds < math.inf
+    if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # false for NaN too
+        return f"expected a finite return of 1 to {most_steps} float32 rewards and a duration, got {episode}"
+    return wrong_facts(episode, run)
 
 
 def wrong_facts(episode: Episode, run: RunSpec) -> str:

@@ -39,7 +39,10 @@ class RowSender:
         return self._order.send_frames and self._frames_so_far < MOST_FRAMES
 
     def observe(self, leaves: Sequence[Array], frame: Array | None) -> None:
-        """Add an observation: its arrays, which are copied, and what was rendered."""
+        """Add an observation: its arrays, which are copied, and what was rendered. Raises `ValueError` for another size."""
+        if frame is not None and self._frames and frame.shape != self._frames[-1].shape:
+            before, now = list(self._frames[-1].shape), list(frame.shape)
+            raise ValueError(f"render: expected pictures of one size, {before} as the one before, got {now}")
         self._obs.append(tuple(leaf.copy() for leaf in leaves))
         self._bytes += sum(leaf.nbytes for leaf in leaves)
         if frame is not None:
@@ -81,6 +84,6 @@ class RowSender:
 def as_frame(rendered: Any) -> Array:
     """A copy of a rendered picture [H, W, 3] uint8. Raises `ValueError` for anything else."""
     frame = np.asarray(rendered)
-    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
         raise ValueError(f"render: expected an array [H, W, 3] of uint8, got {frame.dtype}{list(frame.shape)}")
     return frame.copy()  # an environment may draw the next one into the same array

@@ -29,6 +29,7 @@ from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
+from protocol.rows.rollout_checks import wrong_episode
 from protocol.specs import RunSpec
 from workers.acting import acting_of
 from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
@@ -192,7 +193,11 @@ class Evaluator:
                 senders[n].step(acted, float(rewards[n].sum()), bool(terminated[n]), bool(truncated[n]) or played.cut[n])
             self.steps += len(running)
             running, t = going_on, t + 1
-        return Evaluated(order.session, order.ticket, played.episodes(others), tuple(played.cut))
+        episodes = played.episodes(others)
+        for n, episode in enumerate(episodes):
+            if why := wrong_episode(episode, self._run, order.most_steps):
+                raise environment_failed(None, f"copy {n}, episode: {why}")
+        return Evaluated(order.session, order.ticket, episodes, tuple(played.cut))
 
     def _step(
         self, copies: EvaluationCopies, actions: Array, running: Sequence[int], t: int, pulse: Pulse
@@ -264,10 +269,10 @@ class Evaluator:
             check_acted(None, "action", acted[None], obs, self._run.row_axes, t)
 
     def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
-        try:
-            frame = as_frame(copies.render(n)) if sender.wants_frame else None
-        except ValueError as error:
-            raise environment_failed(None, f"copy {n}, {error}") from error
         shown = obs[: len(self._run.policy.observation)]  # without the mask, and what only the critic sees
         A = self._run.seats_of_copy
-        sender.observe([leaf[0, n * A : (n + 1) * A] if self._run.seats else leaf[0, n] for leaf in shown], frame)
+        leaves = [leaf[0, n * A : (n + 1) * A] if self._run.seats else leaf[0, n] for leaf in shown]
+        try:
+            sender.observe(leaves, as_frame(copies.render(n)) if sender.wants_frame else None)
+        except ValueError as error:
+            raise environment_failed(None, f"copy {n}, {error}") from error
