@@ -76,6 +76,12 @@ class AllowedCode(Enum):
         )
 
 
+FACTORY = "an environment factory"
+REGISTER_IT = (
+    "; or register an id for it (gymnasium.register in a module that workers have) and name it as my_module:MyEnv-v0"
+)
+
+
 class PickledCallable:
     """A callable, pickled by cloudpickle. It travels in a frame of its own."""
 
@@ -196,22 +202,24 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.factory is not None and code is not AllowedCode.CALLABLES:
             return (
                 f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
-                "with a token (and not with --no-code), else name it as my_module:MyEnv-v0"
+                f"with a token (and not with --no-code){REGISTER_IT}"
             )
         if self.factory is None and (":" in self.id or names_a_function(self.id)) and code is AllowedCode.REGISTERED:
             return (
                 f"environment {self.id} imports a module, which this worker does not do for a learner it is not sure of; "
-                "give it a token (and not --no-code)"
+                "give it a token (and not --no-code), or name an id that a package installed there registers by itself "
+                "(entry point gymnasium.envs)"
             )
-        if self.called_code:
-            return code.refuses_to_call(f"wrapper {self.wrappers[0]}" if self.wrappers else f"environment {self.id}")
-        return ""
+        if self.wrappers:
+            return code.refuses_to_call(f"wrapper {self.wrappers[0]}")
+        refused = code.refuses_to_call(f"environment {self.id}") if names_a_function(self.id) else ""
+        return f"{refused}{REGISTER_IT}" if refused else ""
 
     @property
     def called_code(self) -> str:
         """What a worker calls that the learner names or sends, in words: a factory, or a wrapper. Empty for an id alone."""
         if self.factory is not None or names_a_function(self.id):
-            return "an environment factory"
+            return FACTORY
         return "a wrapper" if self.wrappers else ""
 
     def kwargs_of_copy(self) -> dict[str, Any]:

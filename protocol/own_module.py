@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from protocol.bounds import one_line
+from protocol.envs.advice.files_as_modules import module_of_file
 from protocol.envs.advice.missing_modules import what_to_install
 from protocol.envs.found_names import attribute
 from protocol.errors import UsageError, did_you_mean, first_line
@@ -29,7 +30,7 @@ def is_name(text: str) -> bool:
 def own_callable(name: str, what: str, example: str) -> Callable[..., Any]:
     """Import `module:name`, a function or class. `what` quotes the setting, as `callback mine:Stop`. Raises `UsageError`."""
     if not is_name(name):
-        raise UsageError(f"{what}: expected module:factory, as in {example}")
+        raise UsageError(f"{what}: {module_of_file(name, 'NAME') or f'expected module:factory, as in {example}'}")
     module_name, _, qualname = name.partition(":")
     return callable_of(import_own(module_name, what), qualname, what)
 
@@ -40,9 +41,8 @@ def import_own(module: str, what: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is not None and f"{module}.".startswith(f"{error.name}."):
-            raise UsageError(
-                f"{what}: no module named {error.name}; is it installed, or its folder on PYTHONPATH?"
-            ) from error
+            instead = module_of_file(module, "NAME") or "is it installed, or its folder on PYTHONPATH?"
+            raise UsageError(f"{what}: no module named {error.name}; {instead}") from error
         raise UsageError(f"{what}: the import of {module} failed: {_why(error)}; {what_to_install(error.name)}") from error
     except (Exception, SystemExit) as error:
         raise own_code_failed(f"{what}: the import of {module}", error) from error

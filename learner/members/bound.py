@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 import zmq
 
 from learner.members.bind_settings import Listening, join_lines, keyring_for
+from protocol.env_spec import FACTORY, REGISTER_IT
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring
 from protocol.logs.notices import log_notice
@@ -51,7 +52,8 @@ def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str 
     `code`: what travels to the workers as code, for the error; empty if nothing does. Raises `UsageError`.
     """
     if code and address.startswith("tcp://") and keyring is None:
-        raise UsageError(f"{code} is code: it travels over ipc or inproc only, or over tcp with keys")
+        instead = REGISTER_IT if code == FACTORY else ""
+        raise UsageError(f"{code} is code: it travels over ipc or inproc only, or over tcp with keys{instead}")
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     resources.callback(context.term)
     link = LearnerLink(address, context, keyring)

@@ -15,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
 from protocol.envs.advice.atari_ids import preprocessed
 from protocol.envs.advice.config_dict import wants_a_dict
+from protocol.envs.advice.files_as_modules import module_of_file
 from protocol.envs.advice.missing_modules import what_to_install
 from protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
 from protocol.envs.advice.several_agents import what_it_lacks
@@ -125,6 +126,8 @@ def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not:
 
     `failed`: lines about installed packages that could not register their environments. `why_not`: as of `what_to_write`.
     """
+    if instead := module_of_file(env_id, "MyEnv"):
+        return f"environment {env_id}: {instead}"
     module, colon, name = env_id.partition(":")
     while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
         error = error.__cause__  # gymnasium raises one of its own, which names the module of the id whatever is missing

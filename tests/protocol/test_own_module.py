@@ -57,6 +57,11 @@ def failure(setting: str, name: str) -> UserFacingError:
     ("name", "says", "detail"),
     [
         ("nowhere_to_find:Mine", "no module named nowhere_to_find; is it installed, or its folder on PYTHONPATH?", ""),
+        (
+            "of_own_module.py:Stop",
+            "no module named of_own_module.py; a file is named as a module, without .py: write of_own_module:NAME",
+            "",
+        ),
         ("nowhere_to.find:Mine", "no module named nowhere_to; is it installed, or its folder on PYTHONPATH?", ""),
         (
             "needs_a_package:Mine",

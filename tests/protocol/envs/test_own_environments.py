@@ -379,6 +379,22 @@ def test_a_package_that_the_module_of_an_environment_needs_is_named(
         EnvSpec(f"has_a_nee:{name}").make()
 
 
+@pytest.mark.parametrize(
+    ("env", "write"),
+    [
+        ("thermostat.py", "thermostat:MyEnv"),
+        ("thermostat.py:Thermostat", "thermostat:Thermostat"),
+        ("./thermostat.py:Thermostat", "thermostat:Thermostat"),
+        ("envs/mine/thermostat.py:Thermostat", "thermostat:Thermostat, with envs/mine on PYTHONPATH"),
+        ("/envs/thermostat.py", "thermostat:MyEnv, with /envs on PYTHONPATH"),
+    ],
+)
+def test_the_path_of_a_file_is_answered_with_the_module_to_write(env: str, write: str) -> None:
+    with pytest.raises(UsageError) as why:
+        EnvSpec(env).make()
+    assert str(why.value) == f"environment {env}: a file is named as a module, without .py: write {write}"
+
+
 def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     named, pickled = (EnvSpec.of("CartPole-v1", {}, [wrapper]) for wrapper in (Halved, lambda env: env))
     codes = [AllowedCode.REGISTERED, AllowedCode.MODULES, AllowedCode.CALLABLES]
@@ -389,6 +405,10 @@ def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     by_id = EnvSpec("workers.envs.toy:Countdown-v0")
     assert [bool(by_id.rejection_reason(code)) for code in codes] == [True, False, False]
     assert by_id.called_code == ""
+    for spec in (function, pickled):
+        assert "; or register an id for it (gymnasium.register" in spec.rejection_reason(AllowedCode.MODULES)
+    assert "register" not in named.rejection_reason(AllowedCode.MODULES), "an id does not help a wrapper"
+    assert "an id that a package installed there registers" in by_id.rejection_reason(AllowedCode.REGISTERED)
     assert cloudpickle.loads(pickled.factory.data if pickled.factory else b"").__class__.__module__ == "protocol.env_spec"
 
 
