@@ -25,12 +25,13 @@ import builtins
 import difflib
 import errno
 import resource
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from itertools import dropwhile
 from typing import ParamSpec
 
-from protocol.bounds import escaped, one_line
+from protocol.bounds import MAX_TEXT, escaped, one_line
 
 WordedFrom = ParamSpec("WordedFrom")
 
@@ -162,6 +163,29 @@ class RunError(UserFacingError):
     Traceback (most recent call last):
     protocol.errors.RunError: no-such-folder/curve.png not written: No such file or directory
     """
+
+
+@contextmanager
+def refusals_of(package: str) -> Iterator[None]:
+    """What a package that is not ours refuses becomes a `RunError`: one line that names the package and what it said.
+
+    For packages that do something of their own for the user (log elsewhere, write a film, start machines). What torch or
+    numpy raise is mostly our mistake, and stays what it is.
+    """
+    try:
+        yield
+    except MillraceError:
+        raise
+    except Exception as error:
+        raise RunError(f"{package}: {type(error).__name__}: {_whole_message(error)}") from error
+
+
+def _whole_message(error: Exception) -> str:
+    """All lines of its message in one: the first may only announce what follows."""
+    try:
+        return one_line(" ".join(str(error).split()), MAX_TEXT) or "no message"
+    except Exception:  # its __str__ raised
+        return "no message"
 
 
 class CheckpointError(RunError):

@@ -33,13 +33,12 @@ class MlflowCallback(RowCallback):
 
         Raises `UsageError` if MLflow is not installed.
         """
-        super().__init__(every_s)
+        super().__init__("mlflow", every_s)
         self._mlflow, self._experiment, self._uri = tool("mlflow"), experiment, tracking_uri
         self._client: Any = None
         self._run = ""
 
-    def on_start(self, progress: Progress) -> None:
-        """Begin a run of this folder's name, or go on with the one that is there."""
+    def _begin(self, progress: Progress) -> None:
         client = self._client = self._mlflow.MlflowClient(tracking_uri=self._uri)
         found = client.get_experiment_by_name(self._experiment)
         experiment = client.create_experiment(self._experiment) if found is None else found.experiment_id
@@ -56,8 +55,7 @@ class MlflowCallback(RowCallback):
         for i in range(0, len(parameters), MOST_PARAMETERS):
             client.log_batch(self._run, params=parameters[i : i + MOST_PARAMETERS])
 
-    def on_end(self, progress: Progress) -> None:
-        """Log the last row, and end the MLflow run."""
+    def _end(self, progress: Progress) -> None:
         if not self._run:
             return
         self._log(self._rows.last(progress), progress)

@@ -14,7 +14,7 @@ from typing import Any
 
 from learner.callbacks.callback import Callback
 from learner.run_folder.progress import Progress
-from protocol.errors import UsageError
+from protocol.errors import UsageError, refusals_of
 
 
 class RowFilter:
@@ -52,11 +52,19 @@ class RowFilter:
 
 
 class RowCallback(Callback):
-    """Sends rows to a tool. A class of its own for each tool says how: `_send`."""
+    """Sends rows to a tool. A class of its own for each tool says how: `_begin`, `_send`, `_end`.
 
-    def __init__(self, every_s: float) -> None:
-        """`every_s`: least number of seconds between two rows."""
-        self._rows = RowFilter(every_s)
+    What the tool refuses ends the run, in one line that names the tool.
+    """
+
+    def __init__(self, tool: str, every_s: float) -> None:
+        """`tool`: the module of this tool. `every_s`: least number of seconds between two rows."""
+        self._tool, self._rows = tool, RowFilter(every_s)
+
+    def on_start(self, progress: Progress) -> None:
+        """Begin a run of this folder's name, or go on with the one that is there."""
+        with refusals_of(self._tool):
+            self._begin(progress)
 
     def on_update(self, progress: Progress) -> None:
         """Log the metrics of the update."""
@@ -69,9 +77,21 @@ class RowCallback(Callback):
             row |= numbers({**progress.evaluation.metrics(), **logged(progress)})
         self._log(row, progress)
 
+    def on_end(self, progress: Progress) -> None:
+        """Log the last row, and end the run."""
+        with refusals_of(self._tool):
+            self._end(progress)
+
     def _log(self, row: dict[str, float] | None, progress: Progress) -> None:
         if row:
-            self._send(row, progress)
+            with refusals_of(self._tool):
+                self._send(row, progress)
+
+    def _begin(self, progress: Progress) -> None:
+        raise NotImplementedError
+
+    def _end(self, progress: Progress) -> None:
+        raise NotImplementedError
 
     def _send(self, row: dict[str, float], progress: Progress) -> None:
         raise NotImplementedError

@@ -25,20 +25,18 @@ class WandbCallback(RowCallback):
 
         Raises `UsageError` if wandb is not installed.
         """
-        super().__init__(every_s)
+        super().__init__("wandb", every_s)
         self._wandb, self._init = tool("wandb"), init
         self._run: Any = None
 
-    def on_start(self, progress: Progress) -> None:
-        """Begin, or go on with, the run of this folder's name."""
+    def _begin(self, progress: Progress) -> None:
         name = run_name(progress)
         same = {"id": re.sub(r"[^\w.-]", "-", name)[:128], "name": name, "resume": "allow"}
         self._run = self._wandb.init(**{**same, "config": flat_settings(progress), "dir": progress.run, **self._init})
         self._run.define_metric(ENV_STEPS_KEY)
         self._run.define_metric("*", step_metric=ENV_STEPS_KEY)
 
-    def on_end(self, progress: Progress) -> None:
-        """Log the last row, and end the run."""
+    def _end(self, progress: Progress) -> None:
         if self._run is None:
             return
         self._log(self._rows.last(progress), progress)

@@ -120,6 +120,24 @@ def test_numbers_of_callbacks_are_sent_with_a_row(tmp_path: Path, wandb_runs: li
     assert all("custom/evaluated" in row for row in evaluations)
 
 
+def test_what_a_tool_refuses_is_one_line_that_names_it_and_what_it_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wandb_runs: list[FakeWandbRun]
+) -> None:
+    def refuse(*arguments: object, **named: object) -> None:
+        raise ValueError("1 validation error for Settings\nmode\n  expected 'online', got 'onlin'")
+
+    says = "wandb: ValueError: 1 validation error for Settings mode expected 'online', got 'onlin'"
+    monkeypatch.setattr(FakeWandbRun, "log", refuse)
+    with pytest.raises(millrace.RunError) as later:
+        run(tmp_path / "later", WandbCallback(every_s=0.0))
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=refuse))
+    with pytest.raises(millrace.RunError) as at_once:
+        run(tmp_path / "at once", WandbCallback())
+    for error in (later.value, at_once.value):
+        assert str(error) == says
+        assert type(error.__cause__) is ValueError
+
+
 class FakeMlflow:
     """As much of MLflow as the callback uses."""
 
