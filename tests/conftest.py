@@ -16,6 +16,11 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else hundreds of processes of
 sys.dont_write_bytecode = False
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a background job does, and all that it starts
     signal.signal(signal.SIGINT, signal.default_int_handler)
+UNDER_NOHUP = "TESTS_UNDER_NOHUP"  # for the processes of pytest-xdist
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN or UNDER_NOHUP in os.environ:
+    # The tests go on when the terminal is gone. What they start must heed the signal, and inherits no function.
+    os.environ[UNDER_NOHUP] = "1"
+    signal.signal(signal.SIGHUP, lambda number, frame: None)
 
 import tempfile
 import threading

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -52,14 +52,6 @@ def is_whole(tmp_path: Path) -> bool:
     """Whether the newest checkpoint is of the last update."""
     last = read_rows(folder(tmp_path) / "metrics.jsonl")[-1]
     return bool(checkpoint.newest(folder(tmp_path))[0].env_steps == last["time/total_timesteps"])
-
-
-@pytest.fixture(autouse=True)
-def sighup_ends_processes() -> Iterator[None]:
-    """Child processes inherit whether a signal is ignored: these tests may run under nohup."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
 
 
 def done(tmp_path: Path, command: Sequence[str], **streams: Any) -> None:
