@@ -86,7 +86,8 @@ def _too_old(name: str, oldest: Oldest) -> str:
     wanted = ".".join(map(str, oldest.version))
     return (
         f"{name} {found[1]} is too old, perhaps because {oldest.asked_by} asked for it: pip install '{name}>={wanted}', "
-        "and a version of that package that allows it"
+        "and a version of that package that allows it; or give that package a Python of its own, as under 'An older "
+        "gymnasium' in docs/how-to/third_party_environments.md"
     )
 
 

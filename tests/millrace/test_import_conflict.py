@@ -70,6 +70,8 @@ def test_a_package_that_is_too_old_is_said_in_one_line(tmp_path: Path, name: str
     assert done.stderr.startswith(f"millrace: {name} {version} is too old")
     oldest = f"{name}>={'.'.join(map(str, OLDEST[name].version))}"
     assert f"pip install '{oldest}'" in done.stderr
+    assert "'An older gymnasium' in docs/how-to/third_party_environments.md" in done.stderr
+    assert "\n## An older gymnasium" in (ROOT / "docs" / "how-to" / "third_party_environments.md").read_text()
     assert f'"{oldest}",' in (ROOT / "pyproject.toml").read_text()
 
 
