@@ -21,7 +21,7 @@ from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
 from millrace.launch.ray_worker import WorkerHost
 from millrace.launch.training import train
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, first_line, refusals_of
 from protocol.keys.key_folder import Keyring, read_token
 
 
@@ -37,12 +37,13 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
         if config.inference == "learner":
             raise UsageError("launch ray does not take --inference learner; use millrace learner")
         token = _token_text(keyring_for(config, datetime.now(UTC).replace(microsecond=0)))
-        actor = ray.remote(
-            num_cpus=flags.processes, max_restarts=-1, max_task_retries=-1, scheduling_strategy="SPREAD"
-        )(WorkerHost)  # fmt: skip
-        actors = [actor.options(name=f"{flags.name}-{number}").remote() for number in range(flags.workers)]
-        for each in actors:
-            each.run.options(retry_exceptions=True).remote(config.bind, token, flags.processes)
+        with refusals_of("ray"):
+            actor = ray.remote(
+                num_cpus=flags.processes, max_restarts=-1, max_task_retries=-1, scheduling_strategy="SPREAD"
+            )(WorkerHost)  # fmt: skip
+            actors = [actor.options(name=f"{flags.name}-{number}").remote() for number in range(flags.workers)]
+            for each in actors:
+                each.run.options(retry_exceptions=True).remote(config.bind, token, flags.processes)
         return train(config, resume, watch, elsewhere=True)
 
 

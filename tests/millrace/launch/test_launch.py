@@ -10,6 +10,7 @@ import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import kubernetes_validate
@@ -23,6 +24,26 @@ from protocol.keys.key_folder import KeyFolder
 ROOT = Path(__file__).parents[3]
 KUBERNETES = ("1.29", "1.31", "1.34", "1.37")
 DEFAULTS = ("kubernetes", "CartPole-v1", "--workers", "3", "--", "--steps", "1000")
+
+
+def test_what_ray_refuses_is_one_line_that_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As when an actor of this name is there already."""
+
+    def refuse(**options: object) -> None:
+        raise ValueError("The name workers-0 is already taken.\nPlease use a different name.")
+
+    node = {"NodeID": 1, "NodeManagerAddress": "127.0.0.1"}
+    context = SimpleNamespace(get_node_id=lambda: 1)
+    fake = SimpleNamespace(init=lambda **options: None, remote=refuse, nodes=lambda: [node], shutdown=lambda: None)
+    fake.get_runtime_context = lambda: context
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setitem(sys.modules, "millrace.launch.ray", fake)
+    del sys.modules["millrace.launch.ray"]  # imported here with this Ray, and forgotten afterwards
+    assert main(["launch", "ray", "CartPole-v1", "--", "--keys", str(tmp_path / "keys"), "--run-dir", str(tmp_path)]) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == "millrace: ray: ValueError: The name workers-0 is already taken. Please use a different name."
 
 
 def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
