@@ -95,6 +95,13 @@ class Sb3VecEnv(VecEnv):
         self._flatten, self._unflatten = make_flatten(space), make_unflatten(space)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset: copy n gets `seed + n`, whatever its number of agents. Returns that of each row."""
+        first, *_ = super().seed(seed)
+        if first is not None:
+            self._seeds = [first + n // self._rows_of_copy for n in range(self.num_envs)]
+        return self._seeds
+
     def reset(self) -> Any:
         """Begin episodes in all env copies, with the seeds and options that were set. Returns the observations."""
         seeds = self._seeds[:: self._rows_of_copy] if any(seed is not None for seed in self._seeds) else None

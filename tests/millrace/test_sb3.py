@@ -282,7 +282,7 @@ def test_each_agent_is_a_row_where_all_act_at_every_step() -> None:
     env, loops, draw = make_vec_env(RandomTeam, 2, monitor=False, transport="inproc"), [], np.random.default_rng(1)
     env.seed(5)
     seen: Any = env.reset()
-    for n, seed in enumerate((5, 5 + A)):
+    for n, seed in enumerate((5, 6)):
         loops.append(seated(RandomTeam(), "it"))
         first, _ = loops[-1].reset(seed=seed)
         assert bit_equal([*seen[n * A : n * A + A]], first.observations)
