@@ -1,8 +1,10 @@
-"""The device of PyTorch, and how many threads PyTorch and numpy have while this process learns or acts.
+"""The device of PyTorch, its defaults, and how many threads PyTorch and numpy have while this process learns or acts.
 
-Rule: the numbers of threads do not depend on who imported the two first: a script, a notebook or the command line. numpy's
-matrices are so small that more threads of its BLAS gain nothing, and beside other busy processes they wait for one another:
-an update takes up to thirty times as long. Afterwards the program that called has the threads that it had.
+Rules: a run has the defaults of a program that has just started: float32, the CPU, gradients. What the calling program has
+chosen for itself changes no bit of it. The numbers of threads do not depend on who imported the two first: a script, a
+notebook or the command line. numpy's matrices are so small that more threads of its BLAS gain nothing, and beside other busy
+processes they wait for one another: an update takes up to thirty times as long. Afterwards the program that called has the
+threads and defaults that it had.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ _inside: list[list[ExitStack]] = []
 def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
     """One thread for numpy's BLAS, and for PyTorch until `torch.set_num_threads` is called; later as many as before.
 
-    PyTorch is imported only if it `uses_torch`. Threads of the program may leave in another order than they entered.
+    PyTorch has its own defaults meanwhile; it is imported only if it `uses_torch`. Threads of the program may leave in
+    another order than they entered.
     """
     own = [ExitStack()]
     with _lock:
@@ -46,9 +49,16 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
 
             own[0].callback(torch.set_num_threads, torch.get_num_threads())
             torch.set_num_threads(1)
+            own[0].callback(torch.set_default_dtype, torch.get_default_dtype())
+            torch.set_default_dtype(torch.float32)
         _inside.append(own)
     try:
-        yield
+        with ExitStack() as of_this_thread:
+            if uses_torch:
+                from protocol.policy.networks import defaults_of_thread
+
+                of_this_thread.enter_context(defaults_of_thread())
+            yield
     finally:
         with _lock:
             later = _inside[_inside.index(own) + 1 :]

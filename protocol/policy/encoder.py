@@ -92,9 +92,10 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
         raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
     if kept := [name for name, _ in module.named_buffers()]:
         raise UsageError(f"encoder {factory}: expected parameters alone, got the buffer {kept[0]}; use LayerNorm, say")
-    if strange := [name for name, parameter in module.named_parameters() if parameter.dtype != torch.float32]:
+    usual = (torch.float32, torch.get_default_dtype())  # the latter is the program's own choice, or an environment's
+    if strange := [name for name, parameter in module.named_parameters() if parameter.dtype not in usual]:
         raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")
-    return module.eval()
+    return module.float().eval()
 
 
 def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:
@@ -102,7 +103,7 @@ def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int
     images = [torch.zeros(ROWS, *leaf.shape, dtype=torch.uint8) for leaf in spec.observation if leaf.is_image]
     try:
         with torch.no_grad():
-            out = module(torch.zeros(ROWS, feature_size(spec)), *images)
+            out = module(torch.zeros(ROWS, feature_size(spec), dtype=torch.float32), *images)
     except Exception as error:
         raise UsageError(f"encoder {factory} raised {type(error).__name__}: {first_line(error)}") from error
     if not isinstance(out, torch.Tensor) or out.dim() != 2 or len(out) != ROWS or out.dtype != torch.float32:

@@ -8,7 +8,8 @@ copies the first part of one tensor. Features come from `protocol.policy.feature
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -46,6 +47,20 @@ class RecurrentInput(NamedTuple):
         """That of the first steps of some columns."""
         advances = None if self.advances is None else self.advances[:steps, columns]
         return RecurrentInput(self.initial_state[columns], self.keep_state[:steps, columns], output_rows, advances)
+
+
+@contextmanager
+def defaults_of_thread() -> Iterator[None]:
+    """PyTorch's own defaults, of those that each thread has for itself: gradients, no autocast, tensors on the CPU."""
+    with ExitStack() as stack:
+        stack.enter_context(torch.inference_mode(False))
+        stack.enter_context(torch.enable_grad())
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))  # else not entered: every call of torch takes longer in it
+        for device in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(device):
+                stack.enter_context(torch.autocast(device, enabled=False))
+        yield
 
 
 def refuse_second_derivatives() -> None:
@@ -435,7 +450,7 @@ def _initial(fields: Sequence[Field], seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
     parts = []
     for field in fields:
-        part = torch.zeros(field.shape)
+        part = torch.zeros(field.shape, dtype=torch.float32)
         if field.gain:
             torch.nn.init.orthogonal_(part, field.gain, generator)
         parts.append(part.flatten())

@@ -1,4 +1,7 @@
-"""The forward pass of policies that need torch (images, custom encoders). Workers act with it."""
+"""The forward pass of policies that need torch (images, custom encoders). Workers act with it.
+
+Rule: it does not depend on the defaults that the program, or an environment, has chosen for its own use of torch.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import torch
 from protocol.arrays import Array, Floats
 from protocol.policy.features import features, normalize
 from protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views
-from protocol.policy.networks import ActorCriticNetwork, network_of
+from protocol.policy.networks import ActorCriticNetwork, defaults_of_thread, network_of
 from protocol.policy.recurrent import zero_state
 from protocol.specs import PolicySpec
 from protocol.wire.weight_dtypes import ActingDtype
@@ -26,7 +29,8 @@ class TorchPolicy:
         self.spec = spec
         self._images_dtype = images
         self._device, self._together = device, together
-        self._net = network_of(spec, device)
+        with defaults_of_thread():
+            self._net = network_of(spec, device)
         self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -37,9 +41,10 @@ class TorchPolicy:
                 f"weights: expected {count} parameters and {buffer_size(self.spec)} buffers, "
                 f"got {parameters.shape} and {buffers.shape}"
             )
-        self._net.flat[:count].copy_(torch.tensor(parameters))
-        if self._images_dtype == "bfloat16":
-            self._net.use_bfloat16_convolutions()
+        with defaults_of_thread():
+            self._net.flat[:count].copy_(torch.tensor(parameters))
+            if self._images_dtype == "bfloat16":
+                self._net.use_bfloat16_convolutions()
         self._buffers = named_views(buffers, buffer_layout(self.spec))
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
@@ -64,7 +69,7 @@ class TorchPolicy:
     def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
         """Distribution parameters [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], updated in place."""
         inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
-        with torch.no_grad():
+        with defaults_of_thread(), torch.no_grad():
             if not isinstance(self._net, ActorCriticNetwork):
                 return np.asarray(self._net.params(*inputs).cpu().numpy())
             params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))
