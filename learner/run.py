@@ -94,7 +94,7 @@ class OpenRun:
             self.hub.drain(str(error), timeout_s=DRAIN_S)
             raise
         except BaseException as error:
-            if line := files.saved():
+            if line := files.saved(elsewhere=self.setup.elsewhere):
                 error.add_note(line)
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
             self.hub.drain(reason, timeout_s=self.setup.interrupts.at_most(DRAIN_S))

@@ -65,6 +65,8 @@ class RunSetup:
     resumed: bool
     interrupts: Interrupts
     """Entered: signals are noted from now on."""
+    elsewhere: bool = False
+    """Whether its workers are started elsewhere, and not by this program."""
 
     def check_interrupt(self) -> None:
         """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""

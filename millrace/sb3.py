@@ -96,7 +96,7 @@ class Sb3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: copy n gets `seed + n`, whatever its number of agents. Returns that of each row."""
+        """Set the seeds of the next reset: copy n gets `seed + n`, however many agents it has. Returns that of each row."""
         first, *_ = super().seed(seed)
         if first is not None:
             self._seeds = [first + n // self._rows_of_copy for n in range(self.num_envs)]

@@ -20,12 +20,14 @@ from learner.between_updates.run_parts import RunParts
 from learner.recording.image_sample import image_samples
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import EnvAttributes
+from learner.run_folder.last_line import resume_command
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress, Row, steps_per_second
 from learner.run_folder.results import Summary
 from learner.run_folder.run_format import versions
 from protocol.arrays import Floats
 from protocol.bounds import one_line
+from protocol.envs.found_names import found_by_others
 from protocol.errors import RunError, first_line
 from protocol.rollout import Batch
 
@@ -136,17 +138,23 @@ class RunFiles:
             line += f"; {lost:,} later update{'s were' if lost > 1 else ' was'} not saved, and must be made again"
         return line
 
-    def saved(self) -> str:
-        """One line that says what can be resumed, and where; empty if nothing was learned yet."""
+    def saved(self, *, elsewhere: bool) -> str:
+        """One line that says what can be resumed, and how; empty if nothing was learned yet.
+
+        `elsewhere`: as of `resume_command`. A run whose environment was given as a function goes on in Python only.
+        """
         if not self._state.version:
             return ""
-        where = shlex.quote(str(self._folder.path))
+        folder = self._folder.path
         if self._saved_env_steps is None:
-            return f"no checkpoint could be written to {where}"
+            return f"no checkpoint could be written to {shlex.quote(str(folder))}"
         newest = f"{self._saved_env_steps:,} env steps are saved"
         if self._policy_env_steps not in (None, self._saved_env_steps):
             newest += f", and the policy of {self._policy_env_steps:,}"
-        return f"{newest}; go on with: --resume {where}"
+        env = self._spec.env
+        if env.factory is not None and not found_by_others(env.id):
+            return f"{newest}; go on in Python with: millrace.train(ENV, resume={str(folder)!r})"
+        return f"{newest}; go on with: {resume_command(folder, elsewhere=elsewhere)}"
 
     def close(self) -> None:
         """Close the metrics. Also for a run that was cut short."""

@@ -18,14 +18,19 @@ OURS = {"learner", "millrace", "protocol", "workers"}
 """Our packages"""
 
 
-def last_line(program: str, error: BaseException, command: str, hints: Sequence[str] = ()) -> str:
-    """Why `program` ended, for a terminal. `command` is the one that resumes runs; `hints` follow the notes of the error."""
+def resume_command(run: Path, *, elsewhere: bool) -> str:
+    """What to type in a shell to go on with a run. `elsewhere`: its workers are started elsewhere, not by the learner."""
+    return f"millrace {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
+
+
+def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, elsewhere: bool = False) -> str:
+    """Why `program` ended, for a terminal. `hints` follow the notes of the error; `elsewhere` as of `resume_command`."""
     more = [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
     match error:
         case KeyboardInterrupt():
             why = "interrupted"
             if (run := getattr(error, "run", None)) is not None:  # `Interrupted`; its class need not be imported for this
-                more = [f"go on with: {command} --resume {shlex.quote(str(run))}"]
+                more = [f"go on with: {resume_command(run, elsewhere=elsewhere)}"]
         case UserFacingError():
             why = str(error)
         case _:

@@ -57,12 +57,12 @@ def _exit_code(argv: list[str]) -> int:
         sys.stdout.flush()
         return exit_code
     except UserFacingError as error:
-        _print_error(last_line("millrace", error, _resumes(argv)))
+        _print_error(last_line("millrace", error, elsewhere=_elsewhere(argv)))
         if error.detail:
             _print_error(indented(error.detail))
         return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
-        _print_error(last_line("millrace", interrupt, _resumes(argv)))
+        _print_error(last_line("millrace", interrupt, elsewhere=_elsewhere(argv)))
         return _failed(argv, 130)
     except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -117,13 +117,14 @@ def _print_error(line: str) -> None:
     print(escaped(line), file=sys.stderr)  # it may quote what a worker said
 
 
-def _resumes(argv: list[str]) -> str:
-    """The command that resumes a run of this command line: a learner without workers stays one."""
-    return "millrace learner" if argv[:1] == ["learner"] else "millrace train"
+def _elsewhere(argv: list[str]) -> bool:
+    """Whether this command line is that of a learner whose workers are started elsewhere: a resumed run stays one."""
+    return argv[:1] == ["learner"]
 
 
 def _internal_error(argv: list[str], error: Exception) -> int:
-    _print_error(last_line("millrace", error, _resumes(argv), [] if "--debug" in argv else ["--debug shows the traceback"]))
+    hints = [] if "--debug" in argv else ["--debug shows the traceback"]
+    _print_error(last_line("millrace", error, hints, elsewhere=_elsewhere(argv)))
     return _failed(argv, 1)
 
 

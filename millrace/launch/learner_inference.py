@@ -73,7 +73,8 @@ def train(
         from learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
 
         with interrupts, one_thread():
-            run = open_run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
+            setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
+            run = open_run(setup, link, processes, watch, observer)
             # The learner's own endpoint is inproc: `millrace status` asks where the workers join.
             env.hub.status_of_run = run.hub.status
             run.announce(env.address, config.advertise, listening.endpoint.keyring)

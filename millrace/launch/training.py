@@ -76,6 +76,6 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         from learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
 
         with interrupts, one_thread():
-            setup = RunSetup(config, known, folder, resume is not None, interrupts)
+            setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
             open_run(setup, endpoint.link, processes, watch, observer).train(workers)
         return folder.path

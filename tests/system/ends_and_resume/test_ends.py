@@ -6,7 +6,6 @@ import errno
 import logging
 import math
 import os
-import shlex
 import shutil
 import signal
 from collections.abc import Callable
@@ -16,17 +15,20 @@ from typing import Any
 import pytest
 import torch
 
+import millrace
 from learner.algorithms.minibatches import LossInput
 from learner.algorithms.ppo import PPO
 from learner.callbacks.callbacks import Callbacks
 from learner.config.layers import resolve
 from learner.run_folder import atomic_write, checkpoint
+from learner.run_folder.last_line import resume_command
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.training import train
 from protocol.errors import RunError, UsageError
 from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
+from workers.envs.toy import Identity
 
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 2, "batch_size": 16,
@@ -54,9 +56,8 @@ def raises_at(update: int, error: BaseException) -> Watch:
 
 
 def how_to_go_on(folder: Path) -> list[str]:
-    return [
-        f"{checkpoint.newest(folder)[0].env_steps:,} env steps are saved; go on with: --resume {shlex.quote(str(folder))}"
-    ]
+    env_steps = checkpoint.newest(folder)[0].env_steps
+    return [f"{env_steps:,} env steps are saved; go on with: {resume_command(folder, elsewhere=False)}"]
 
 
 def parameters(folder: Path) -> torch.Tensor:
@@ -79,6 +80,19 @@ def test_a_watch_that_raises(tmp_path: Path, error: BaseException, max_lag: int)
     assert told["stop_reason"] in ("UsersError: no", "interrupted", "SystemExit: 3")
     accounted(told, lanes=2, rows=16, max_lag=max_lag)
     del error.__notes__
+
+
+def test_a_run_whose_environment_only_the_script_has_goes_on_in_python(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {**SMALL, "run_dir": str(tmp_path / "runs"), "progress": False}
+    with pytest.raises(UsersError) as caught:
+        millrace.train(lambda: Identity(), callbacks=[raises_at(2, UsersError())], **settings)
+    folder = str(folder_of(tmp_path / "runs"))
+    assert caught.value.__notes__[-1].endswith(f"; go on in Python with: millrace.train(ENV, resume={folder!r})")
+
+
+def test_the_command_that_goes_on_is_of_the_same_kind_and_may_be_pasted_into_a_shell() -> None:
+    assert resume_command(Path("runs/my run"), elsewhere=False) == "millrace train --resume 'runs/my run'"
+    assert resume_command(Path("runs/mine"), elsewhere=True) == "millrace learner --resume runs/mine"
 
 
 def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
