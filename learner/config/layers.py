@@ -159,7 +159,7 @@ def _read_toml(file: Path) -> dict[str, Any]:
     try:
         return parse_toml(file.read_text("utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is not text"
+        why = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise UsageError(f"config file {file} cannot be read: {why}") from error
 
 

@@ -107,6 +107,7 @@ def read_config(run: Path) -> dict[str, Any]:
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
     """The content of a TOML file. Raises `UsageError`, also for a config.toml that has the first line and not the last."""
+    text = text.removeprefix("\ufeff")  # a byte order mark, which some editors write
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
     lines = text.split("\n")

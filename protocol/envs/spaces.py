@@ -93,6 +93,8 @@ def with_last(space: gymnasium.Space[Any], keys: Sequence[str]) -> gymnasium.Spa
 
 def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
     """Describe the action. Raises `UsageError` for a space that is not supported."""
+    if space.shape is not None and 0 in space.shape:
+        raise UsageError(f"action space {space}: expected at least one number to choose, got shape {list(space.shape)}")
     match space:
         case spaces.Discrete():
             return ActionSpec("discrete", (), "int64", (int(space.n),), (int(space.start),))

@@ -34,6 +34,9 @@ from protocol.policy.torch_distributions import log_prob_and_entropy, squashed_s
 from protocol.random_streams import Purpose, torch_seed
 from protocol.specs import PolicySpec
 
+DTYPE = torch.float32
+"""of all parameters, whatever PyTorch's default is"""
+
 
 class RecurrentInput(NamedTuple):
     """What a recurrent core needs in addition to the features of T steps of C env copies, in time order [T · C, …]."""
@@ -450,7 +453,7 @@ def _initial(fields: Sequence[Field], seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
     parts = []
     for field in fields:
-        part = torch.zeros(field.shape, dtype=torch.float32)
+        part = torch.zeros(field.shape, dtype=DTYPE)
         if field.gain:
             torch.nn.init.orthogonal_(part, field.gain, generator)
         parts.append(part.flatten())

@@ -55,9 +55,13 @@ class Continuous(Clones, OffPolicy):
             raise UsageError(
                 f"{name}: expected an action space Box, got {action.kind}{shape}; take --algo ppo or dqn for it"
             )
+        largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # it stands for no bound
         for low, high in zip(action.low, action.high, strict=True):
-            if not (math.isfinite(low) and math.isfinite(high)):
-                raise UsageError(f"{name}: expected an action Box with finite bounds, got {low} to {high}; take --algo ppo")
+            if max(-low, high) >= largest:
+                raise UsageError(
+                    f"{name}: expected an action Box with finite bounds, got {low:g} to {high:g}; "
+                    "take --algo ppo, or give the Box the bounds between which good actions are"
+                )
         if images := [leaf for leaf in observation if leaf.is_image]:
             where = f" at {images[0].path}" if images[0].path else ""
             raise UsageError(f"{name}: expected no images, got {list(images[0].shape)}{where}; take --algo ppo for them")

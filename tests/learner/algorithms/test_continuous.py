@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS
 from protocol.arrays import Floats
 from protocol.envs.spaces import action_converter_of, action_spec
 from protocol.errors import UsageError
+from protocol.policy import networks
 from protocol.policy.distributions import Deterministic, Squashed, distribution
 from protocol.policy.layout import LOG_STD_BOUNDS, named_views
 from protocol.policy.numpy_policy import NumpyPolicy
@@ -179,6 +181,20 @@ def test_workers_act_as_the_network_does(algo: str) -> None:
             ACTION,
             {},
             r"expected no images, got \[32, 32, 3\] at eye",
+        ),
+        *(
+            (
+                OBSERVATION,
+                action_spec(gymnasium.spaces.Box(-bound, bound, (2,), dtype)),
+                {},
+                re.escape(f"got -{bound:g} to {bound:g}"),
+            )
+            for bound, dtype in (
+                (float(np.finfo(np.float64).max), np.float64),
+                (float(np.finfo(np.float32).max), np.float32),
+                (float(np.finfo(np.float32).max), np.float64),
+                (float(np.finfo(np.float16).max), np.float16),
+            )
         ),
         (OBSERVATION, ACTION, {"encoder": "a:b"}, "expected no encoder, got a:b"),
     ],
@@ -360,7 +376,8 @@ def test_they_import_nothing_that_a_user_could_not(name: str) -> None:
 
 
 @pytest.fixture
-def _float64() -> Iterator[None]:
+def _float64(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(networks, "DTYPE", torch.float64)
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)

@@ -210,6 +210,13 @@ def test_a_bad_file_is_named(tmp_path: Path, text: str, says: str) -> None:
     assert str(file) in line
 
 
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    """Editors of Windows write it."""
+    file = tmp_path / "my.toml"
+    file.write_text("env = 'CartPole-v1'\nseed = 7\n", "utf-8-sig")
+    assert resolve(file=file).seed == 7
+
+
 def test_a_file_of_bytes_is_not_text(tmp_path: Path) -> None:
     file = tmp_path / "my.toml"
     file.write_bytes(b"\xff\xfe\x00")

@@ -145,6 +145,12 @@ def test_a_tuple_of_actions_is_answered_with_the_recipes_that_make_agents_or_one
         assert f"\n## {heading}\n" in (ROOT / "docs" / "how-to" / page).read_text()
 
 
+@pytest.mark.parametrize("space", [spaces.Box(-1, 1, (0,)), spaces.Box(-1, 1, (2, 0)), spaces.MultiDiscrete([])])
+def test_an_action_of_no_numbers_is_refused(space: Any) -> None:
+    with pytest.raises(UsageError, match=r"^action space .*: expected at least one number to choose, got shape \[.*0\]$"):
+        action_spec(space)
+
+
 @pytest.mark.parametrize(
     "space",
     [

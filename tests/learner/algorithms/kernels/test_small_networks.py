@@ -18,6 +18,7 @@ from torch import Tensor
 from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels import trained_networks
 from learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
+from protocol.policy import networks
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from protocol.specs import ActionSpec, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
@@ -31,7 +32,8 @@ ROUNDS = {"chunk": st.sampled_from([512, 7, 1]), "by_torch": st.booleans(), "see
 
 
 @pytest.fixture
-def float64() -> Iterator[None]:
+def float64(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(networks, "DTYPE", torch.float64)
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     yield
