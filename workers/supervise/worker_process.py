@@ -28,6 +28,7 @@ from workers.activity import STACK_SIGNAL, ActivityReader
 from workers.slots import free_all, open_slots, touch
 from workers.supervise.ending import Ending
 from workers.supervise.process_group import kill, live_members, process_stat
+from workers.supervise.short_log import keep_short
 from workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
@@ -143,6 +144,7 @@ class WorkerProcess:
         if not self._runs():
             return
         touch(self._slots)
+        self._keep_log_short()
         if now >= self._kill_at_s:
             self.kill()
         elif not self._because:
@@ -257,6 +259,11 @@ class WorkerProcess:
                     log.seek(max(self._log_from, log.seek(0, os.SEEK_END) - LONGEST_OUTPUT))
                     return log.read().decode(errors="replace")
         return ""
+
+    def _keep_log_short(self) -> None:
+        with suppress(OSError):  # the log may have been deleted
+            if self._log is not None:
+                self._log_from = keep_short(self._log, self._log_from)
 
     def _write(self, stacks: str) -> None:
         """Write to where the worker's stderr goes."""

@@ -1,0 +1,37 @@
+"""Keeps the log of a worker short while the worker, and what its environment starts, append to it.
+
+Rule: of a log that has grown beyond `MOST` bytes, whole lines at its beginning and at its end stay, and a line says that
+what stood between them is gone. Whoever appends need not know of it: the file stays the same, and is open for appending.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+MOST = 16 << 20  # bytes
+BEGINNING, END = 1 << 20, 4 << 20  # what stays
+GONE = b"[millrace: the log became too long, and what stood here was removed]\n"
+
+
+def keep_short(log: Path, position: int) -> int:
+    """Shorten the log if it is too long. Returns where that is now which was at `position`. Raises `OSError`.
+
+    What is written while this removes the rest may be lost.
+    """
+    if log.stat().st_size <= MOST:
+        return position
+    file = os.open(log, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        size = os.fstat(file).st_size
+        beginning = os.pread(file, BEGINNING, 0)
+        kept = beginning.rfind(b"\n") + 1 or len(beginning)
+        end = os.pread(file, END, size - END)
+        end = end[end.find(b"\n") + 1 :]
+        os.ftruncate(file, kept)
+        os.write(file, GONE + end)
+    finally:
+        os.close(file)
+    if position <= kept:
+        return position
+    return kept + len(GONE) + max(0, position - (size - len(end)))
