@@ -100,7 +100,11 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["train", "CartPole-v1", "--transport", "udp"], "transport: expected one of inproc, ipc, tcp, got udp"),
         (["train", "CartPole-v1", "--core", "rnn"], "core: expected one of lstm, gru, none, got rnn"),
         (["train", "CartPole-v1", "--net", "64", "x"], "net: expected int, got 64 x"),
-        (["train", "CartPole-v1", "--env-kwargs", "a"], "env_kwargs: expected NAME VALUE NAME VALUE ..., got a"),
+        (
+            ["train", "CartPole-v1", "--env-kwargs", "a"],
+            "env_kwargs: expected NAME VALUE NAME VALUE ..., got a; "
+            "a text that begins with a dash is written behind a sign: a=-x",
+        ),
         (
             ["train", "CartPole-v1", "--shared-net=1"],
             "train: --shared-net=1: expected --shared-net or --no-shared-net",
