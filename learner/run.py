@@ -129,7 +129,7 @@ class OpenRun:
 
     def _check_time(self) -> None:
         if self.setup.interrupts.time_is_up(self.between.files.longest_save_s):
-            raise Interrupted(self.setup.folder.path)
+            raise Interrupted(self.setup.folder.shown)
 
 
 def open_run(

@@ -71,12 +71,12 @@ class RunSetup:
     def check_interrupt(self) -> None:
         """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""
         if self.interrupts.received:
-            raise stopped(self.folder.path if self.resumed else None)
+            raise stopped(self.folder.shown if self.resumed else None)
 
     def check_running(self) -> None:
         """Raises `Interrupted` if the user has interrupted the run, and `RunTakenOver` if another process trains it."""
         if self.interrupts.received:
-            raise Interrupted(self.folder.path)
+            raise Interrupted(self.folder.shown)
         if self.folder.lock is not None:
             self.folder.lock.check()
 
@@ -88,6 +88,7 @@ def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]
     Raises `UsageError`, also if another process trains the run.
     """
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
+    folder.stay()
     try:
         with RunLock(folder.path) as folder.lock, kept_log(folder.path):
             for line in () if resume is None else resume.differences:

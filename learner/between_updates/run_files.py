@@ -41,7 +41,7 @@ class RunFiles:
         """Removes the rows of updates that the checkpoint of a resumed run knows nothing of. Raises `RunError`."""
         self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
         self._state, self._evaluations, self._attributes = run.tally.state, evaluations, attributes
-        self.path = one_line(str(run.folder.path))
+        self.path = one_line(str(run.folder.shown))
         self.checkpoint = ""
         """Path of the newest checkpoint that this process has written."""
         self.longest_save_s = 0.0
@@ -133,7 +133,7 @@ class RunFiles:
     def continues(self) -> str:
         """One line that says where a resumed run continues, and which updates are lost."""
         state, lost = self._state, self._metrics.removed
-        line = f"run {self._folder.path} continues at {state.env_steps:,} env steps, after update {state.version:,}"
+        line = f"run {self._folder.shown} continues at {state.env_steps:,} env steps, after update {state.version:,}"
         if lost:
             line += f"; {lost:,} later update{'s were' if lost > 1 else ' was'} not saved, and must be made again"
         return line
@@ -145,7 +145,7 @@ class RunFiles:
         """
         if not self._state.version:
             return ""
-        folder = self._folder.path
+        folder = self._folder.shown
         if self._saved_env_steps is None:
             return f"no checkpoint could be written to {shlex.quote(str(folder))}"
         newest = f"{self._saved_env_steps:,} env steps are saved"

@@ -154,6 +154,7 @@ class RunFolder:
     def __init__(self, path: Path, made: Path | None = None) -> None:
         """`made`: if the folder is new, the topmost folder that was made for it."""
         self.path, self._made = path, made
+        self._is_relative = False
         self._workers_elsewhere = False  # as `write_config` was told last
         self.started_from = ""
         """As in `RunFormat`."""
@@ -213,6 +214,21 @@ class RunFolder:
         if (path / RUN_FILE).exists():
             check_format(path)
         return RunFolder(path)
+
+    def stay(self) -> None:
+        """From now on it is the same folder also if the program, or an environment in it, changes its current folder."""
+        self._is_relative = not self.path.is_absolute()
+        self.path = self.path.absolute()
+        self._made = None if self._made is None else self._made.absolute()
+
+    @property
+    def shown(self) -> Path:
+        """Its path as it was given, if that still leads there."""
+        try:
+            here = Path.cwd()
+        except OSError:  # it was deleted
+            return self.path
+        return self.path.relative_to(here) if self._is_relative and self.path.is_relative_to(here) else self.path
 
     def remove(self) -> None:
         """Remove the folder, and the parent folders made for it that nothing else is in.

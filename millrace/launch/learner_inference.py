@@ -79,7 +79,7 @@ def train(
             env.hub.status_of_run = run.hub.status
             run.announce(env.address, config.advertise, listening.endpoint.keyring)
             run.train(1)
-        return folder.path
+        return folder.shown
 
 
 def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSettings:

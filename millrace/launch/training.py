@@ -78,4 +78,4 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
             open_run(setup, endpoint.link, processes, watch, observer).train(workers)
-        return folder.path
+        return folder.shown

@@ -203,6 +203,32 @@ def test_what_was_given_as_an_object_is_given_again(tmp_path: Path, monkeypatch:
     assert millrace.evaluate(run.path, 2, env=pole, **PLAY).episodes == 2
 
 
+class Wanders(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Changes the current folder of its process, as some simulators do."""
+
+    def reset(self, **keywords: Any) -> Any:
+        os.chdir("elsewhere" if Path("elsewhere").is_dir() else ".")
+        return super().reset(**keywords)
+
+
+@pytest.mark.parametrize("who", ["environment", "callback"])
+def test_a_run_stays_in_its_folder_whoever_changes_the_current_one(
+    who: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # it is the current one again afterwards
+    (tmp_path / "elsewhere").mkdir()
+    given: dict[str, Any] = {"wrappers": [Wanders]} if who == "environment" else {}
+    callbacks = [lambda progress: os.chdir(tmp_path / "elsewhere")] if who == "callback" else []
+    run = millrace.train("CartPole-v1", run_dir="runs", steps=200, callbacks=callbacks, **given, **SMALL)
+    assert Path.cwd() == tmp_path / "elsewhere"
+    assert run.path.parent == tmp_path / "runs"
+    files = {"policy.safetensors", "summary.json", "metrics.jsonl", "checkpoints", "tensorboard"}
+    assert files <= {path.name for path in run.path.iterdir()}
+    assert not [*Path.cwd().iterdir()]
+    monkeypatch.chdir(tmp_path)
+    assert run.resume(steps=300, callbacks=callbacks).summary is not None
+
+
 @pytest.mark.parametrize("kind", ["svg", "png"])
 def test_plot_is_a_picture_and_the_file_of_the_command(run: millrace.Run, tmp_path: Path, kind: str) -> None:
     picture = run.plot(tmp_path / f"python.{kind}")
