@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from protocol.alive import CallTimeouts
 from workers.supervise import short_log, worker_process
 from workers.supervise.short_log import GONE, keep_short
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
@@ -93,7 +92,7 @@ def test_a_supervisor_keeps_the_log_of_a_loud_simulator_short(tmp_path: Path, mo
     worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0", log))
     monkeypatch.setattr(worker, "_runs", lambda: True)
     os.waitid(os.P_PID, worker.pid, os.WEXITED | os.WNOWAIT)
-    worker.enforce(CallTimeouts(), time.monotonic())
+    worker.enforce(time.monotonic())
     monkeypatch.undo()
     assert log.read_bytes().startswith(b"line 0\n")
     assert log.stat().st_size < 2_000
