@@ -10,15 +10,18 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from learner.interrupts import Interrupts, Stopped
 from millrace.dashboard.known_runs import KnownRuns
 from millrace.dashboard.live import Lookout
 from millrace.dashboard.server import DashboardServer
 from millrace.dashboard.site import Site
 from protocol.errors import UserFacingError
 
+LOOK_FOR_SIGNALS_S = 0.1
 LINGER_S = 2.5  # so that pages which are open show the end
 
 
@@ -28,9 +31,22 @@ def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[st
     What trains on this machine goes first: the process is nicer than any other.
     """
     os.nice(19)
-    with Lookout() as lookout:
+    with Lookout() as lookout, Interrupts() as interrupts:
         site = Site(KnownRuns(folders, time.time), lookout.look)
-        asyncio.run(DashboardServer(site.answer).serve(host, port, listening))
+        asyncio.run(_until_stopped(DashboardServer(site.answer).serve(host, port, listening), interrupts))
+    if interrupts.received:
+        raise Stopped
+
+
+async def _until_stopped(serving: Coroutine[None, None, None], interrupts: Interrupts) -> None:
+    """Serve until a signal has come. It is looked for: an exception in a handler would end whatever runs at that moment."""
+    task = asyncio.ensure_future(serving)
+    while not interrupts.received and not task.done():
+        await asyncio.wait([task], timeout=LOOK_FOR_SIGNALS_S)
+    if not task.done():
+        task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
 
 
 def _end_with_input() -> None:

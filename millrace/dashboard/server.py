@@ -52,6 +52,9 @@ class DashboardServer:
                 listening(f"http://{host if host not in WILDCARDS else '127.0.0.1'}:{port}/{self.token}/")
                 await server.serve_forever()
         finally:
+            for connection in self._open:
+                connection.cancel()
+            await asyncio.gather(*self._open)  # before the thread that they wait for is gone
             self._pages.shutdown(wait=False, cancel_futures=True)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -181,3 +181,30 @@ def test_a_port_in_use_is_one_line() -> None:
         port = other.getsockname()[1]
         with pytest.raises(UsageError, match=rf"bind 127.0.0.1:{port}: cannot listen there"):
             asyncio.run(DashboardServer(lambda request: PageAnswer(b"")).serve("127.0.0.1", port, print))
+
+
+def test_when_it_ends_no_connection_is_left_that_would_ask_for_more_pages() -> None:
+    asked, goes_on = threading.Event(), threading.Event()
+
+    def make(request: PageRequest) -> PageAnswer:
+        asked.set()
+        goes_on.wait(TIMEOUT_S)
+        return PageAnswer(b"page")
+
+    async def play() -> None:
+        server, address = DashboardServer(make), asyncio.Queue[str]()
+        serving = asyncio.create_task(server.serve("127.0.0.1", 0, address.put_nowait))
+        url = urlsplit(await asyncio.wait_for(address.get(), TIMEOUT_S))
+        _, writer = await asyncio.open_connection(url.hostname, url.port)
+        writer.write(f"GET {url.path} HTTP/1.1\r\nHost: {url.netloc}\r\n\r\n".encode())
+        assert await asyncio.to_thread(asked.wait, TIMEOUT_S)
+        serving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await serving
+        assert not server._open
+        writer.close()
+
+    try:
+        asyncio.run(play())
+    finally:
+        goes_on.set()
