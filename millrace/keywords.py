@@ -321,7 +321,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     --prior.
     """
     n_step: int
-    """dqn, sac, td3: Number of rewards in a target before it bootstraps."""
+    """dqn, sac, td3: Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there
+    are several.
+    """
     tau: float
     """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one,
     such as 0.005, take target_every 1 (polyak averaging).

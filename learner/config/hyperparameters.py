@@ -199,7 +199,7 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     prior_steps: Free[Natural] = 0
     """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
     n_step: Free[Count] = 1
-    """Number of rewards in a target before it bootstraps."""
+    """Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there are several."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
     """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
     normalize_rewards: Fixed[bool] = False
