@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 import time
 from collections.abc import Iterable
 from contextlib import suppress
@@ -18,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 from learner.config.presets import environment_name
 from learner.report.metrics_tail import newest_row
 from learner.report.sentences import ending, per_second
+from learner.run_folder.last_line import resume_command
 from learner.run_folder.lease import Owner
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
 from learner.run_folder.regular_files import reason
@@ -136,7 +136,7 @@ def read_line(path: Path, now: float) -> RunLine:
 
 def headline(line: RunLine) -> str:
     """One sentence: how the run ended, or that it died, and how to continue it. Of one that trains, how far it is."""
-    resume = f"continue it with: millrace train --resume {one_line(shlex.quote(str(line.path)))}"
+    resume = f"continue it with: {one_line(resume_command(line.path, elsewhere=False))}"
     match line.state:
         case "training":
             left = "" if line.left_s is None else f", about {duration(line.left_s)} left"

@@ -55,7 +55,7 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
 
 def per_second(steps: float) -> str:
     """Env steps per second. Few of them have digits after the point, so that a slow simulator does not look dead."""
-    return f"{steps:,.0f}" if steps >= 9.95 or not steps else f"{steps:.2g}"
+    return f"{steps:.2g}" if 0.001 <= steps < 9.95 else f"{steps:,.0f}"
 
 
 def lag_in_words(mean: float, largest: int, used: int) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from protocol.bounds import MAX_TEXT, one_line
 from protocol.errors import UserFacingError, first_line
+from protocol.flags.program_name import typed_name
 
 OURS = {"learner", "millrace", "protocol", "workers"}
 """Our packages"""
@@ -20,7 +21,7 @@ OURS = {"learner", "millrace", "protocol", "workers"}
 
 def resume_command(run: Path, *, elsewhere: bool) -> str:
     """What to type in a shell to go on with a run. `elsewhere`: its workers are started elsewhere, not by the learner."""
-    return f"millrace {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
+    return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
 
 
 def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, elsewhere: bool = False) -> str:

@@ -39,6 +39,9 @@ NOT_IN_WORKERS = {
 def main(argv: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
+    if argv[:1] == ["--debug"]:  # every command takes it among its own flags
+        end = argv.index("--") if "--" in argv else len(argv)
+        argv = [*argv[1:end], "--debug", *argv[end:]]
     with suppress(OSError):  # the current folder may have been deleted
         here = Path.cwd()
         if any(map(is_run_folder, (here, *here.parents))):

@@ -6,6 +6,7 @@ import msgspec
 
 from learner.config.presets import algorithms_and_environments, named_presets
 from protocol.flags.parse import parse_flags
+from protocol.flags.program_name import typed_name
 
 
 class PresetsFlags(msgspec.Struct, frozen=True):
@@ -17,8 +18,8 @@ def run(argv: list[str]) -> int:
     parse_flags(PresetsFlags, argv, "presets")
     print("Used unless --preset says otherwise, by environment and algorithm:\n")
     for algo, env in algorithms_and_environments():
-        print(f"  millrace train {env} --algo {algo}")
+        print(f"  {typed_name()} train {env} --algo {algo}")
     print("\nComplete runs, by name:\n")
     for name, preset in named_presets().items():
-        print(f"  millrace train --preset {name:24}  {preset.about}")
+        print(f"  {typed_name()} train --preset {name:24}  {preset.about}")
     return 0

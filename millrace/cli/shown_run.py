@@ -16,6 +16,7 @@ from learner.run_folder.results import ALL_STEPS_DONE
 from learner.run_folder.run_folder import RunFolder
 from learner.standard_streams import unfailing
 from millrace.terminal import progress_view
+from protocol.flags.program_name import typed_name
 from protocol.logs.notices import log_notice
 
 if TYPE_CHECKING:
@@ -73,4 +74,4 @@ def next_commands(run: Path, summary: Summary | None, command: str) -> list[str]
     commands = [f"dashboard {where}", f"evaluate {where}{against}"]
     if summary is not None and summary.stop_reason == ALL_STEPS_DONE:
         commands.append(f"{command} --resume {where} --steps {float(f'{2 * summary.env_steps:.2g}'):.0f}")
-    return ["next:", *(f"  millrace {line}" for line in commands)]
+    return ["next:", *(f"  {typed_name()} {line}" for line in commands)]

@@ -377,9 +377,10 @@ def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, 
     failing(monkeypatch, ZeroDivisionError("division\nby zero"))
     line = refusal(capsys, "train", "CartPole-v1", exit_code=1)
     assert line == "internal error: ZeroDivisionError: division; --debug shows the traceback"
-    assert main(["train", "CartPole-v1", "--debug"]) == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["millrace: internal error: ZeroDivisionError: division", "Traceback (most recent call last):"]
+    for argv in (["train", "CartPole-v1", "--debug"], ["--debug", "train", "CartPole-v1"]):
+        assert main(argv) == 1
+        lines = capsys.readouterr().err.splitlines()
+        assert lines[:2] == ["millrace: internal error: ZeroDivisionError: division", "Traceback (most recent call last):"]
 
 
 def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
