@@ -25,7 +25,7 @@ from learner.report.run_lines import RunLine, algorithm_label, duration, headlin
 from learner.report.sentences import bottleneck, per_second, went_wrong
 from learner.run_folder.json_log import LoggedLine
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY
+from learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
 from millrace.dashboard.live import LaneSample, Seen
 from protocol.arrays import Doubles
 from protocol.bounds import escaped
@@ -277,19 +277,23 @@ def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segme
     return found
 
 
-def evaluations(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The newest evaluations, and which was the best of all."""
+def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> str:
+    """The newest evaluations, and which was the best of all.
+
+    `kept`: that of a run that has ended, as its results have it. It may be of the final policy, which has no row here.
+    """
     returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
     if not len(returns):
         return ""
     best = int(returns[:, 1].argmax())
-    at, highest = returns[best]
+    at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
     length_at = dict(lengths.tolist())
-    about = f"The best of {len(returns)} was at {at:,.0f} env steps, with a mean return of {return_text(highest)}."
+    which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"
+    about = f"{which} was at {at:,.0f} env steps, with a mean return of {return_text(highest)}."
     lines = [
         f'<tr><th scope="row" class="number">{steps:,.0f}</th><td class="number">{return_text(value)}</td>'
-        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td><td>{"the best" * (i == best)}</td></tr>'
-        for i, (steps, value) in enumerate(returns)
+        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td><td>{"the best" if steps == at else ""}</td></tr>'
+        for steps, value in returns
     ]
     heads = "".join(f'<th scope="col" class="number">{name}</th>' for name in ("Env steps", "Return", "Episode length"))
     table = f"<table><thead><tr>{heads}<th></th></tr></thead><tbody>{''.join(lines[: -MOST_LINES - 1 : -1])}</tbody></table>"

@@ -16,6 +16,7 @@ from learner.metric_names import METRICS, described, label
 from learner.run_folder.json_log import kept_log
 from learner.run_folder.lease import Owner
 from learner.run_folder.metrics_log import METRICS_FILE
+from learner.run_folder.results import Best, Evaluation
 from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
 from millrace.dashboard.http import PageAnswer, answer_parts, parsed
@@ -152,6 +153,10 @@ def test_the_newest_evaluations_are_a_table_that_marks_the_best() -> None:
     assert "285 1.0 7.0 280 0.0 7.0" in said
     assert "the best" not in said.partition("Return")[2]
     assert "40 9.0 7.0 the best" in Safe(run_page.evaluations(rows[:6])).text
+    again = Evaluation(episodes=10, return_mean=9.0, return_std=0.0, length_mean=7.0)
+    of_all = Safe(run_page.evaluations(rows[:6], Best(env_steps=60, chosen_by=9.5, evaluation=again))).text
+    assert "The best of all, that at the end included, was at 60 env steps, with a mean return of 9.5." in of_all
+    assert "7.0 the best" not in of_all
     assert run_page.evaluations([{"time/total_timesteps": 10}]) == ""
 
 
