@@ -25,6 +25,8 @@ class WrongAnswer(Exception):
 
 def reset_answer(answer: Any) -> tuple[Any, Mapping[str, Any]]:
     """What `reset` returned: the observation and the info. Raises `WrongAnswer`."""
+    if type(answer) is tuple and len(answer) == 2 and type(answer[1]) is dict:  # what nearly all return is read fast
+        return answer
     if isinstance(answer, tuple | list) and len(answer) == 2 and (answer[1] is None or isinstance(answer[1], Mapping)):
         return answer[0], answer[1] or {}
     raise WrongAnswer(f"its reset returned {in_words(answer)}; {OF_RESET}: end it with `return observation, {{}}`")

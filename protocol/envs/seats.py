@@ -196,7 +196,7 @@ class ParallelSeats(SeatedEnv):
         self._present = [agent for agent in self.agents if agent in self.env.agents]
         try:
             for agent in self._present:
-                self._shows(found, agent, observations[agent], _info_of(infos, agent))
+                self._shows(found, agent, observations[agent], infos.get(agent))
         except RETURNED_WRONGLY as error:
             self._explain(error, self._present, observations=observations)
             raise
@@ -228,7 +228,9 @@ class ParallelSeats(SeatedEnv):
         here = set(self.env.agents)
         for agent in given:
             seat = self.seat_of[agent]
-            complete[seat], reward[seat], told[seat] = True, float(rewards[agent]), _info_of(infos, agent)
+            info = infos.get(agent, _NO_INFO)
+            complete[seat], reward[seat] = True, float(rewards[agent])
+            told[seat] = info if type(info) is dict else _info(agent, info)
             terminates[seat], truncates[seat] = bool(terminated[agent]), bool(truncated[agent])
             # The last observation of a task that has ended may be missing: nobody learns from it.
             if not terminates[seat] or observations.get(agent) is not None:
@@ -243,7 +245,7 @@ class ParallelSeats(SeatedEnv):
             outside[self.seat_of[agent]] = float(rewards[agent])
         here -= self._gone
         for agent in here - given.keys():
-            self._shows(found, agent, observations[agent], _info_of(infos, agent))
+            self._shows(found, agent, observations[agent], infos.get(agent))
         self._present = [agent for agent in self.agents if agent in here]
         return not self._present
 
@@ -257,9 +259,10 @@ class ParallelSeats(SeatedEnv):
                 got = ", ".join(map(str, by_agent)) or "none"
                 raise WrongAnswer(f"{what}: expected agent {missing[0]} among them, got {got}") from error
 
-    def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Mapping[str, Any]) -> None:
+    def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Any) -> None:
         seat = self.seat_of[agent]
-        found.observations[seat], found.infos[seat], found.acts[seat] = self._seen(seat, observation), info, True
+        found.observations[seat], found.acts[seat] = self._seen(seat, observation), True
+        found.infos[seat] = _info(agent, info)
 
 
 class TurnSeats(SeatedEnv):
@@ -280,9 +283,11 @@ class TurnSeats(SeatedEnv):
 
     def _next(self, found: SeatStep) -> bool:
         """Let agents whose part has ended leave, and find who has the move. Returns whether nobody is left."""
-        while not self._gone.issuperset(self.env.agents):
+        while (left := self.env.agents) and not (self._gone and self._gone.issuperset(left)):
             agent = self.env.agent_selection
-            seat = self._seat_with_the_move(agent)
+            if agent in self._gone or agent not in self.seat_of:
+                raise self._wrong_selection(agent)
+            seat = self.seat_of[agent]
             answer = self.env.last()
             try:
                 observation, reward, terminated, truncated, info = answer
@@ -302,7 +307,7 @@ class TurnSeats(SeatedEnv):
             elif not terminated and (self._waits[seat] or not truncated):  # it acts on it, or learns from its value
                 raise WrongAnswer(f"agent {agent}: expected an observation unless it is terminated, got None")
             self._waits[seat] = False
-            found.infos[seat] = _info_of({agent: info}, agent)
+            found.infos[seat] = info if type(info) is dict else _info(agent, info)
             if not (terminated or truncated):
                 found.acts[seat] = True
                 return False
@@ -313,15 +318,13 @@ class TurnSeats(SeatedEnv):
             raise WrongAnswer(f"agent {who} left, expected it to be selected once more when its part had ended")
         return True
 
-    def _seat_with_the_move(self, agent: Any) -> int:
-        if agent in self._gone:
-            raise WrongAnswer(
-                f"agent_selection: expected an agent whose part has not ended, got {agent} again; after its end, step(None) "
-                "selects another one"
-            )
+    def _wrong_selection(self, agent: Any) -> WrongAnswer:
         if agent not in self.seat_of:
-            raise WrongAnswer(f"agent_selection: expected one of possible_agents, got {agent}")
-        return self.seat_of[agent]
+            return WrongAnswer(f"agent_selection: expected one of possible_agents, got {agent}")
+        return WrongAnswer(
+            f"agent_selection: expected an agent whose part has not ended, got {agent} again; after its end, step(None) "
+            "selects another one"
+        )
 
     def pending(self) -> list[float]:
         """[A] what agents have got since they moved who do not have the move, as far as PettingZoo's base class sums it."""
@@ -330,11 +333,8 @@ class TurnSeats(SeatedEnv):
         return [float(earned.get(agent, 0.0)) if agent in waits else 0.0 for agent in self.agents]
 
 
-def _info_of(infos: Mapping[Any, Any], agent: Any) -> Mapping[str, Any]:
+def _info(agent: Any, info: Any) -> Mapping[str, Any]:
     """The info of an agent; an empty one if there is none."""
-    info: Mapping[str, Any] = infos.get(agent, _NO_INFO)
-    if type(info) is dict:
-        return info
     if info is not None and not isinstance(info, Mapping):
         raise WrongAnswer(f"info of agent {agent}: expected a dict, got {type(info).__name__}")
     return info or _NO_INFO

@@ -1,7 +1,8 @@
 """What a rollout must be: arrays of the run's shapes and dtypes, values of its spaces, and the law of a row. Pure.
 
 Rule: whatever an environment can break is found by the worker that has the environment, before it sends: values by
-`workers/copies/value_checks.py`, the law by `check_law`. The learner checks it all again, because a worker may be hostile.
+`workers/copies/value_checks.py`, the law of seats by `protocol/envs/seats.py`. The learner checks it all again, because a
+worker may be hostile.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from protocol.rollout import Episode, Rollout
 from protocol.rows.array_checks import Axes, Expected, place_of, wrong_arrays, wrong_observation
 from protocol.specs import ActionSpec, RunSpec
 
-LARGEST_REWARD = float(np.finfo(np.float32).max)
+LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
+"""No larger number is finite as a float32: returns are sums of rewards before they are rounded."""
 
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
@@ -49,13 +51,8 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(why)
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
-    check_law(rollout, run)
-
-
-def check_law(rollout: Rollout, run: RunSpec) -> None:
-    """Check the law of a row, masks and episodes of a rollout whose arrays are right. Raises `BadRollout`, with one line."""
     if rollout.mask is not None:
-        _check_mask(rollout.mask, rollout, run.policy.action, run.sent_axes)
+        _check_mask(rollout.mask, rollout, action, axes)
     ended = rollout.terminated | rollout.truncated
     if rollout.resets is not None:
         _check_seats(rollout.valid, ended, rollout.resets, run)
@@ -67,7 +64,7 @@ def check_law(rollout: Rollout, run: RunSpec) -> None:
         count = int(np.count_nonzero(ended & rollout.valid))
     if len(rollout.episodes) != count:
         raise BadRollout(f"episodes: expected {count}, got {len(rollout.episodes)}")
-    steps_so_far = (rollout.sequence + 1) * run.rollout_steps  # of this incarnation of the lane
+    steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
     for episode in rollout.episodes:
         if why := wrong_episode(episode, run, steps_so_far):
             raise BadRollout(f"episode: {why}")

@@ -445,8 +445,13 @@ def test_environments_that_are_right_are_used(make: Callable[[], Any]) -> None:
     assert collected(make) == evaluated(make) == described(make) == ""
 
 
-def test_whatever_the_rule_is_a_worker_sends_no_rollout_that_breaks_the_law(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_largest_rewards_make_a_return_that_the_learner_takes() -> None:
+    """They are rounded to the largest float32 number, and their sum before that is larger."""
+    assert collected(lambda: One(reward=3.4028235e38 * (1 + 1e-8))) == ""
+
+
+def test_whatever_its_reason_is_a_worker_sends_no_episode_that_the_learner_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.collect.seat_rows.whole_episode", lambda *_: Episode(1e300, 1, 0.0, (0.0, 0.0)))
-    assert collected(Two).startswith("lane 0, episode: expected a finite return of 1 to 8 float32 rewards")
+    assert collected(Two).startswith("lane 0, copy 0, episode: expected a finite return of 1 to ")
     monkeypatch.setattr("workers.evaluate.evaluator.whole_episode", lambda *_: Episode(1.0, 51, 0.0, (0.0, 0.0)))
     assert evaluated(Two).startswith("while the policy was evaluated: copy 0, episode: expected a finite return of 1 to 50")

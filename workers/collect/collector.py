@@ -21,13 +21,12 @@ from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_converter_of
 from protocol.envs.vectorized import make_native
 from protocol.envs.which_copy import EnvCopy
-from protocol.errors import BadRollout, EnvironmentFailed, PolicyFailed
+from protocol.errors import EnvironmentFailed, PolicyFailed
 from protocol.messages import Weights
 from protocol.policy.called_policy import CalledPolicy
 from protocol.policy.masks import stored_leaves
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
-from protocol.rows.rollout_checks import check_law
 from protocol.specs import RunSpec
 from workers.acting import RolloutActions, acting_of
 from workers.activity import ENV_CALLS, MAKING, activity
@@ -317,7 +316,7 @@ class Collector:
         lane.obs = tuple(array[-1].copy() for array in obs)
         lane.state = rows.state[i].copy()
         resets, sent = None if lane.seats is None else lane.seats.resets, lane.sent
-        rollout = Rollout(
+        return Rollout(
             session=session,
             lane=lane.number,
             ticket=assignment.ticket,
@@ -336,11 +335,6 @@ class Collector:
             extras=tuple(extra[:, sent] for extra in acted.extras),
             resets=resets,
         )
-        try:
-            check_law(rollout, self._run)
-        except BadRollout as error:
-            raise environment_failed(lane.number, str(error)) from error
-        return rollout
 
 
 def _truncate_lost(rows: _CollectedRows, i: int, lane: CollectedLane, t: int, lost: npt.NDArray[np.bool_]) -> None:

@@ -12,11 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.arrays import Array, Bools, Doubles, Floats
+from protocol.bounds import LARGEST
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
+from protocol.rows.rollout_checks import wrong_episode
 from protocol.specs import RunSpec
 from workers.copies.env_copies import SeatColumns, StepResult
+from workers.copies.env_errors import environment_failed
 from workers.copies.facts import Facts
 from workers.copies.value_checks import check_rewards
 from workers.opponents import Match, Opponent, OtherTeams, whole_episode
@@ -103,6 +106,8 @@ class SeatRows:
         of_seats: list[float] = self._return[n].tolist()
         seconds = now_s - float(self._start_s[n])
         episode = whole_episode(self._run, self.others, n, of_seats, int(self._length[n]), seconds, facts.get(n, ()))
+        if why := wrong_episode(episode, self._run, LARGEST):
+            raise environment_failed(self._lane, f"copy {n}, episode: {why}")
         self._return[n], self._length[n], self._start_s[n] = 0.0, 0, now_s
         return episode
 
