@@ -16,7 +16,7 @@ from protocol.bounds import LARGEST
 from protocol.policy.recurrent import zero_state
 from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode
-from protocol.rows.rollout_checks import wrong_episode
+from protocol.rows.rollout_checks import LARGEST_REWARD, wrong_episode
 from protocol.specs import RunSpec
 from workers.copies.env_copies import SeatColumns, StepResult
 from workers.copies.env_errors import environment_failed
@@ -98,7 +98,8 @@ class SeatRows:
 
     def _add(self, outside: Doubles, t: int) -> None:
         """Add rewards [N · A] of step t that are in no row to the returns. No later check sees them."""
-        check_rewards(self._lane, outside[None], self._run.row_axes, t)
+        if not np.abs(outside).max() < LARGEST_REWARD:  # false for NaN too
+            check_rewards(self._lane, outside[None], self._run.row_axes, t)
         self._return += outside.reshape(self._return.shape)
 
     def _ended(self, n: int, facts: Facts, now_s: float) -> Episode:
