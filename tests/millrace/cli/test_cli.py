@@ -103,7 +103,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (
             ["train", "CartPole-v1", "--env-kwargs", "a"],
             "env_kwargs: expected NAME VALUE NAME VALUE ..., got a; "
-            "a text that begins with a dash is written behind a sign: a=-x",
+            "a text that begins with a dash is written in quotes: a '\"-x\"'",
         ),
         (
             ["train", "CartPole-v1", "--shared-net=1"],
