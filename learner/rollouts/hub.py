@@ -366,11 +366,22 @@ class Hub:
         self._observer(self)
 
     def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        if isinstance(message, Evaluated):
-            worker = worker_name(peer).decode(errors="replace")
-            self._failures.evaluated(worker if self.coordinator.evaluation.beside else None)
-        if not isinstance(message, Rollout):
-            return self.coordinator.receive(peer, message, now)
+        match message:
+            case Rollout():
+                return self._take_rollout(peer, message, now)
+            case Evaluated():
+                return self._take_evaluated(peer, message, now)
+        return self.coordinator.receive(peer, message, now)
+
+    def _take_evaluated(self, peer: bytes, message: Evaluated, now: float) -> list[Outgoing]:
+        evaluation = self.coordinator.evaluation
+        before = evaluation.episodes_played
+        out = self.coordinator.receive(peer, message, now)
+        if evaluation.episodes_played > before:  # of a ticket that this worker played
+            self._failures.evaluated(worker_name(peer).decode() if evaluation.beside else None)
+        return out
+
+    def _take_rollout(self, peer: bytes, message: Rollout, now: float) -> list[Outgoing]:
         try:
             validate(message, self.coordinator.run)
         except BadRollout as error:

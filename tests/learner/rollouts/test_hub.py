@@ -12,12 +12,13 @@ import pytest
 from learner.members.held_up import LONG_S
 from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.errors import RunError
 from protocol.logs.long_wait import AGAIN_S
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Weights
-from protocol.rollout import rollout_bytes
+from protocol.messages import PROTOCOL_VERSION, Evaluated, Heartbeat, Hello, Weights
+from protocol.rollout import Episode, rollout_bytes
 from protocol.wire.codec import decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.weight_dtypes import ActingDtype, to_float32
@@ -157,3 +158,21 @@ def test_between_short_minibatches_it_listens_now_and_then() -> None:
     link.now += PULSE_S / 2
     hub.pulse()
     assert not link.inbox
+
+
+def test_only_an_answer_that_is_used_shows_that_the_environment_works() -> None:
+    """Else anybody who may join could keep a run alive whose environment fails again and again."""
+    link, hub, _ = hub_with_a_worker()
+    hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32), deal=False)
+    shown = list[str | None]()
+    hub._failures.evaluated = shown.append  # type: ignore[method-assign]
+    hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
+    (ticket,) = hub.coordinator.evaluation.held
+    answer = Evaluated(1, ticket, (Episode(0.0, 1, 0.0),), (False,))
+    strangers = [(b"w7", answer), (b"w0", msgspec.structs.replace(answer, ticket=ticket + 1))]
+    for peer, message in [*strangers, (b"w0", answer)]:
+        assert shown == []
+        link.inbox.append((peer, message))
+        link.now += PULSE_S
+        hub.pulse()
+    assert shown == [None]
