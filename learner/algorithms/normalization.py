@@ -146,12 +146,13 @@ class ObservationNormalizer:
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""
-        return self._moments.state_dict() | {"first": torch.tensor(self._first)}
+        first = {"first": torch.tensor(self._first)} if len(self._first) else {}
+        return self._moments.state_dict() | first
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state)
-        first, D = state.get("first", torch.empty(0)), len(self._is_float64)  # a policy alone has none
+        first, D = state.get("first", torch.empty(0)), len(self._is_float64)
         if len(first) and (len(first) >= FEW or first.shape[1:] != (D,)):
             raise ValueError(f"observations: expected fewer than {FEW} first rows of {D} numbers, got {list(first.shape)}")
         self._first = first.numpy().astype(np.float64).reshape(len(first), D)
