@@ -165,7 +165,7 @@ def test_only_an_answer_that_is_used_shows_that_the_environment_works() -> None:
     link, hub, _ = hub_with_a_worker()
     hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32), deal=False)
     shown = list[str | None]()
-    hub._failures.evaluated = shown.append  # type: ignore[method-assign]
+    hub._failures.evaluated = shown.append  # type: ignore[method-assign, assignment]
     hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
     (ticket,) = hub.coordinator.evaluation.held
     answer = Evaluated(1, ticket, (Episode(0.0, 1, 0.0),), (False,))
