@@ -29,7 +29,7 @@ from protocol.messages import EpisodeRows, Evaluate, Evaluated, versions_of
 from protocol.random_streams import Purpose, env_seed
 from protocol.rollout import Episode
 from protocol.rows.played import reason_to_reject
-from protocol.rows.rollout_checks import LARGEST_REWARD, wrong_facts
+from protocol.rows.rollout_checks import wrong_episode
 from protocol.specs import RunSpec
 
 FIRST_TICKET = 1 << 52
@@ -331,17 +331,11 @@ class EvaluationDealer:
 
     def _wrong(self, answer: Evaluated, seeds: int) -> str:
         assert self._plan is not None
-        most = self._plan.most_steps
         if len(answer.episodes) != seeds or len(answer.cut) != seeds:
             return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
         for episode in answer.episodes:
-            if why := wrong_facts(episode, self._run):
+            if why := wrong_episode(episode, self._run, self._plan.most_steps):
                 return f"episode: {why}"
-            if episode.length > most:
-                return f"expected episodes of at most {most} steps, got {episode.length}"
-            rewards = episode.length * self._run.seats_of_copy
-            if not abs(episode.reward) <= rewards * LARGEST_REWARD:  # false for NaN too
-                return f"expected a return that {rewards} rewards can give, got {episode.reward}"
         opponents, _ = self._matches(answer.ticket)
         if self._run.teams and tuple(episode.opponent for episode in answer.episodes) != opponents:
             return f"expected the opponents {opponents}, got {[episode.opponent for episode in answer.episodes]}"

@@ -15,6 +15,7 @@ from learner.members.join_limiter import AT_ONCE, PER_S, JoinLimiter
 from learner.members.member_log import OF_A_KEY, OF_A_WORKER, MemberLog
 from learner.members.member_server import TURN_S
 from learner.members.membership import MAX_MEMBERS, REMEMBERED
+from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from learner.rollouts.weight_age import WORKERS, WeightAge
@@ -363,7 +364,10 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
             noisy.hub.gather()
             noisy.hub.publish(noisy.coordinator.version + 1, PARAMETERS, BUFFERS)
         elif between != "nothing":
-            noisy.hears("honest", Evaluated(session, 0, (), ()))
+            noisy.hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
+            (asked,) = noisy.coordinator.evaluation.held
+            noisy.hears("honest", Evaluated(session, asked, (Episode(0.0, 1, 0.0),), (False,)))
+            noisy.coordinator.evaluation.end()
     if between == "nothing":
         with pytest.raises(EnvironmentFailed, match="boom; failure 2 in a row; max_env_failures allows 1 in a row"):
             noisy.hub._turn(0.0)
