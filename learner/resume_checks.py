@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from learner.between_updates.stop_rules import reason_to_stop
+from learner.between_updates.stop_rules import BY_THE_POLICY_OF, reason_to_stop
 from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
 from learner.config.layers import config_of_run
@@ -110,7 +110,7 @@ def _is_finished(config: Config, folder: RunFolder) -> bool:
         evaluation_return=summary.evaluation.return_mean if summary.ended_by is None else summary.ended_by,
         training_return=summary.return_mean_100,
     )
-    return reason == summary.stop_reason
+    return reason == summary.stop_reason.partition(BY_THE_POLICY_OF)[0]
 
 
 def _differences(before: Config, config: Config, changed: Sequence[Change]) -> list[str]:

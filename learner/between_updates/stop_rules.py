@@ -5,6 +5,8 @@ from __future__ import annotations
 from learner.config.config import Config
 from learner.run_folder.results import ALL_STEPS_DONE
 
+BY_THE_POLICY_OF = " by the policy of "  # follows the reason if training went on while the policy was evaluated
+
 
 def reason_to_stop(
     config: Config,
@@ -22,7 +24,7 @@ def reason_to_stop(
     """
     target = config.target_return
     if target is not None and evaluation_return is not None and evaluation_return >= target:
-        by = "" if evaluated_before is None else f" by the policy of {evaluated_before:,} env steps"
+        by = "" if evaluated_before is None else f"{BY_THE_POLICY_OF}{evaluated_before:,} env steps"
         return f"target return {target:g} reached{by}"
     target = config.target_mean_return
     if target is not None and training_return is not None and training_return >= target:

@@ -285,7 +285,7 @@ def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> 
     returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
     if not len(returns):
         return ""
-    best = int(returns[:, 1].argmax())
+    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # of equally good ones the newest, as the run keeps it
     at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
     length_at = dict(lengths.tolist())
     which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"

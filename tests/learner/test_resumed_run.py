@@ -114,6 +114,10 @@ def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> Non
 
     folder.write_summary(summary())
     assert is_finished(config, folder.path)
+    beside = "target return 400 reached by the policy of 600 env steps"
+    folder.write_summary(summary(stop_reason=beside, ended_by=401.0))
+    assert is_finished(config, folder.path), "by an evaluation beside training"
+    folder.write_summary(summary())
     for more in ({"steps": 900 + per_update}, {"target_return": 100.0}):
         assert not is_finished(resolve(resume=folder.path, **more), folder.path), f"{more}: another reason, or none"
     for unfinished in ({"evaluation": None}, {"stop_reason": "interrupted"}, {"env_steps": 1000 - per_update}):

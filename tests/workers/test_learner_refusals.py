@@ -334,8 +334,6 @@ FOUND_BY_THE_WORKER: dict[str, tuple[Case, ...]] = {
             lambda: One(action=spaces.Tuple([spaces.Discrete(2)] * (MAX_LEAVES + 1))),
             "action space: expected at most",
         ),
-    ),
-    "{}: expected at most {} arrays, got {}": (
         Case(
             described, lambda: One(action=spaces.Tuple([TWO_PARTS] * MAX_LEAVES)), "action space: expected at most 48 arrays"
         ),
