@@ -21,7 +21,7 @@ from learner.between_updates.tally import Tally
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
-from learner.config.costs import large_observations
+from learner.config.costs import large_observations, minibatch_rows
 from learner.config.validation import unused_setting
 from learner.conversations import open_hub
 from learner.members.process_callbacks import ProcessCallbacks
@@ -34,7 +34,7 @@ from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_setup import KnownEnvironment, RunSetup
 from learner.run_spec import run_spec
 from learner.run_state import RunState, restore, start_from
-from learner.torch_setup import minibatch_rows, threads, torch_device, updates_use_all_cores
+from learner.torch_setup import threads, torch_device, updates_use_all_cores
 from learner.train import train
 from protocol.address import advertised_address, own_address
 from protocol.bounds import one_line

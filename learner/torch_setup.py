@@ -111,15 +111,6 @@ def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> Thread
     return ThreadChoice(count, line)
 
 
-def minibatch_rows(config: Config) -> int:
-    """Number of rows of a minibatch, by the settings: all rows of an update if none divides them."""
-    batch_size = getattr(config.algorithm, "batch_size", None)
-    if isinstance(batch_size, int):
-        return batch_size
-    minibatches = getattr(config.algorithm, "minibatches", 1)
-    return config.envs * config.algorithm.rollout_steps // (minibatches if isinstance(minibatches, int) else 1)
-
-
 def updates_use_all_cores(config: Config) -> bool:
     """Whether updates use all cores while workers collect; then the workers of this machine should have a lower priority.
 

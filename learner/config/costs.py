@@ -12,11 +12,20 @@ from gymnasium.wrappers import TimeLimit
 from learner.config.config import Config
 from learner.config.evaluation_size import evaluation_size
 from protocol.envs.description import DescribedEnv, class_name
-from protocol.policy.layout import multiply_adds
+from protocol.policy.arithmetic import multiply_adds
 from protocol.specs import PolicySpec
 
 MANY_MULTIPLY_ADDS = 1 << 24  # of one observation; Atari's four frames of 84 x 84 take half of it
 PASSES = 3  # a gradient costs twice as much as the pass forward
+
+
+def minibatch_rows(config: Config) -> int:
+    """Number of rows of a minibatch, by the settings: all rows of an update if none divides them."""
+    batch_size = getattr(config.algorithm, "batch_size", None)
+    if isinstance(batch_size, int):
+        return batch_size
+    minibatches = getattr(config.algorithm, "minibatches", 1)
+    return config.envs * config.algorithm.rollout_steps // (minibatches if isinstance(minibatches, int) else 1)
 
 
 def large_observations(config: Config, policy: PolicySpec) -> str:
@@ -24,7 +33,7 @@ def large_observations(config: Config, policy: PolicySpec) -> str:
     if (of_one := multiply_adds(policy)) < MANY_MULTIPLY_ADDS:
         return ""
     numbers = sum(math.prod(leaf.shape) for leaf in policy.observation)
-    rows = getattr(config.algorithm, "batch_size", config.algorithm.rollout_steps * config.envs)
+    rows = minibatch_rows(config)
     smaller = (
         '--wrappers "gymnasium.wrappers:ResizeObservation(shape=(84, 84))"'
         if any(leaf.is_image for leaf in policy.observation)

@@ -114,22 +114,6 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
     return tuple(acting), (*critic, *_linear("critic.out", last, 1, 1.0))
 
 
-def multiply_adds(spec: PolicySpec) -> int:
-    """Those of one pass of all networks over one observation. An encoder, or a policy, of the user counts 0."""
-    if spec.own is not None:
-        return 0
-    fields = [field for part in parameter_layout(spec) for field in part if not field.name.startswith("encoder.")]
-    total = sum(math.prod(field.shape) for field in fields if len(field.shape) == 2)
-    for leaf in spec.observation if spec.encoder is None else ():
-        if leaf.is_image:
-            stack, (channels, height, width), _ = convolutions(leaf)
-            for conv in stack:
-                height, width = ((side - conv.kernel) // conv.stride + 1 for side in (height, width))
-                total += height * width * conv.channels * channels * conv.kernel**2
-                channels = conv.channels
-    return total
-
-
 def _trunk(spec: PolicySpec) -> str:
     """Name prefix of the hidden layers that are needed to act."""
     return "q" if spec.head == "q" else "shared" if spec.shared_net else "actor"

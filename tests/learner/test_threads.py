@@ -17,9 +17,10 @@ from msgspec.structs import replace
 import millrace
 from learner import torch_setup
 from learner.between_updates.crowded_cores import CrowdedCores
+from learner.config.costs import minibatch_rows
 from learner.config.layers import resolve
 from learner.run_folder.run_format import POLICY_ARRAYS
-from learner.torch_setup import minibatch_rows, one_thread, threads
+from learner.torch_setup import one_thread, threads
 from millrace.launch.local_worker_options import worker_cores
 from protocol.machine.waiting_threads import VARIABLE as WAIT
 from protocol.policy.encoder import describe_encoder

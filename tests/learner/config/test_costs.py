@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gymnasium
 import numpy as np
-import pytest
-import torch
 from gymnasium.spaces import Box, Discrete
 from gymnasium.wrappers import TimeLimit
 
@@ -16,8 +13,6 @@ from learner.config.costs import endless_evaluations, large_observations
 from learner.config.layers import resolve
 from protocol.envs.description import describe_env, read_description
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.policy.layout import multiply_adds
-from protocol.policy.networks import network_of
 from protocol.specs import PolicySpec
 from workers.envs.toy import Countdown
 
@@ -25,28 +20,6 @@ from workers.envs.toy import Countdown
 def policy_for(shape: tuple[int, ...], dtype: str, net: tuple[int, ...] = (64, 64)) -> PolicySpec:
     space: Box[Any] = Box(0, 255, shape, np.dtype(dtype).type)
     return PolicySpec(observation_leaves(space), action_spec(Discrete(4)), net=net)
-
-
-def test_multiply_adds_are_those_of_its_layers() -> None:
-    assert multiply_adds(policy_for((7,), "float32", (5, 3))) == 2 * (7 * 5 + 5 * 3) + 3 * 4 + 3 * 1
-
-
-def test_multiply_adds_of_an_image_are_those_that_torch_makes() -> None:
-    spec = policy_for((84, 84, 4), "uint8")
-    convolutions: Any = torch.nn.functional.conv2d
-    sizes: list[int] = []
-
-    def counted(image: Any, weight: Any, *rest: Any, **more: Any) -> Any:
-        out = convolutions(image, weight, *rest, **more)
-        sizes.append(out[0].numel() * math.prod(weight.shape[1:]))
-        return out
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.nn.functional, "conv2d", counted)
-        network: Any = network_of(spec)
-        network.params(torch.zeros(1, 0), [torch.zeros(1, 84, 84, 4, dtype=torch.uint8)])
-    assert len(sizes) == 3
-    assert multiply_adds(spec) == sum(sizes) + 64 * 7 * 7 * 128 + 2 * (128 * 64 + 64 * 64) + 64 * 4 + 64
 
 
 def test_what_a_minibatch_of_large_observations_costs_is_said() -> None:
