@@ -83,7 +83,7 @@ class SharingSupervisor:
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a worker steps. It counts the env steps of a rollout when that is complete, which may take minutes.
+    """How fast a worker steps. A step may take minutes, and a client may count those of a rollout when that is complete.
 
     So the speed is that between the last two heartbeats with more steps, until the next one is overdue.
     """
