@@ -23,13 +23,13 @@ from gymnasium import spaces
 from protocol.bounds import MAX_NAME, one_line
 from protocol.envs.answers import OF_STEP, WrongAnswer, in_words, reset_answer, wrong_step
 from protocol.envs.found_names import attribute
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 
 SEAT, STATE = "seat", "state"
 """Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""
 MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters, so that the name of an agent's return is not cut
 _NO_INFO: Mapping[str, Any] = {}
-RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError
+RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError, OverflowError
 """What dicts without an agent, and what are no dicts and no numbers, raise where they are read."""
 
 
@@ -299,7 +299,7 @@ class TurnSeats(SeatedEnv):
                     found.terminated[seat], found.truncated[seat] = bool(terminated), bool(truncated)
                 else:
                     found.outside[seat] = float(reward)
-            except (TypeError, ValueError):
+            except RETURNED_WRONGLY:
                 _check_numbers(agent, reward=reward, terminated=terminated, truncated=truncated)
                 raise
             if observation is not None:  # a copy: the seat shows it until it has the move again
@@ -345,8 +345,8 @@ def _check_numbers(agent: Any, **numbers: Any) -> None:
     for what, value in numbers.items():
         try:
             float(value) if what == "reward" else bool(value)
-        except (TypeError, ValueError) as error:
-            raise WrongAnswer(f"{what} of agent {agent}: expected a number, got {one_line(repr(value), 80)}") from error
+        except RETURNED_WRONGLY as error:
+            raise WrongAnswer(f"{what} of agent {agent}: expected a number, got {one_line(safe_repr(value), 80)}") from error
 
 
 def has_seats(made: object) -> bool:

@@ -48,7 +48,7 @@ def _what_it_did(cause: BaseException) -> str:
     raised_by = (frames[-1].line or "") if frames else ""
     says = first_line(cause, "")
     advice = _about_action(says, raised_by) or _about_answer(says, raised_by)
-    return f"its environment raised {type(cause).__name__}: {says}{advice}"
+    return f"its environment raised {type(cause).__name__}: {says or 'no message'}{advice}"
 
 
 def _about_action(says: str, raised_by: str) -> str:

@@ -58,7 +58,7 @@ class LeafWriter:
                 if array.shape == self._shape and (array.dtype == self._dtype or self._keeps_values(array)):
                     joined[...] = array.reshape(self._joined_shape)
                     return
-        except (TypeError, ValueError):  # the loop below finds what is wrong, if anything is
+        except Exception:  # the loop below finds what is wrong, if anything is: an object of the user's raises anything
             pass
         row = joined.reshape(self._shape)
         if len(values) != len(row):
@@ -72,6 +72,9 @@ class LeafWriter:
             array = np.asarray(value)
         except ValueError:  # rows of different lengths
             array = np.asarray(None)
+        except Exception as error:  # such as a tensor of PyTorch that requires a gradient
+            got = f"a {type(value).__name__} that numpy cannot read: {first_line(error)}"
+            raise CopyFailed(n, line=f"{self._leaf.name}: expected an array, got {got}") from error
         if array.shape != self._leaf.shape or not self._keeps_values(array):
             self._refuse(n, array)
         row[n] = array
@@ -163,7 +166,7 @@ def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
     reward, terminated, truncated = arrays
     try:
         reward[row], terminated[row], truncated[row] = values
-    except (TypeError, ValueError):
+    except Exception:  # the loop finds what is wrong: an int may be too large, and an object of the user's raises anything
         for name, array, of_copies in zip(("reward", "terminated", "truncated"), arrays, values, strict=True):
             for n, value in enumerate(of_copies):
                 array[row][n] = one_number(name, n, value)

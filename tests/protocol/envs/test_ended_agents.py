@@ -177,6 +177,7 @@ def at(moves: int, **parts: Any) -> Any:
         (at(1, info=[]), "info of agent b: expected a dict, got list"),
         (at(1, reward="much"), "reward of agent b: expected a number, got 'much'"),
         (at(2, reward=None), "reward of agent a: expected a number, got None"),
+        (at(1, reward=10**400), f"reward of agent b: expected a number, got {str(10**400)[:79]}…"),
         (at(2, truncated=np.ones(2)), "truncated of agent a: expected a number, got array([1., 1.])"),
         (
             lambda answer: answer[:4],
@@ -202,6 +203,10 @@ def test_what_nobody_needs_may_be_missing() -> None:
         ({"infos": []}, "infos: expected a dict by agent, got list"),
         ({"infos": {"a": [1]}}, "info of agent a: expected a dict, got list"),
         ({"rewards": {"a": None, "b": 1.0}}, "reward of agent a: expected a number, got None"),
+        (
+            {"rewards": {"a": 1.0, "b": 10**400}},
+            f"reward of agent b: expected a number, got {str(10**400)[:79]}…",
+        ),
         ({"rewards": {"a": 1.0, "b": 1.0, "c": 1.0}}, "rewards: expected some of possible_agents, got c"),
         ({"terminated": {"a": False, "b": np.zeros(2)}}, "terminated of agent b: expected a number, got array([0., 0.])"),
     ],

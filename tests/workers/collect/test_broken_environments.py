@@ -163,6 +163,49 @@ def test_an_observation_that_does_not_fit_is_refused_before_it_is_kept(good: int
     )
 
 
+class NoArray:
+    """Raises where it is to become an array, as a tensor that requires a gradient."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise RuntimeError("call detach()\nfirst")
+
+
+@pytest.mark.parametrize("shape", [(1,), ()], ids=str)
+@pytest.mark.parametrize("good", [0, 1, 4], ids=["reset", "first step", "later step"])
+def test_an_observation_that_numpy_cannot_read_is_named_with_its_copy(good: int, shape: tuple[int, ...]) -> None:
+    said = answer(good, NoArray(), space=gymnasium.spaces.Box(-1, 1, shape, np.float32))
+    when = f"step {good - 1}" if good else "first reset"
+    got = "a NoArray that numpy cannot read: call detach()"
+    assert said == f"lane 0, copy 0, {when}: observation: expected an array, got {got}"
+
+
+def test_an_exception_without_a_text_is_said_to_have_none() -> None:
+    class Stops(Countdown):
+        def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+            raise StopIteration
+
+    run = run_around(Stops(), T=6)
+    with pytest.raises(EnvironmentFailed, match=r"step 0: its environment raised StopIteration: no message$"):
+        collect(random_collector(run, loop_over([Stops])), run)
+
+
+class NoNumber:
+    """Raises where it is to become a number."""
+
+    def __float__(self) -> float:
+        raise RuntimeError("no number")
+
+    def __repr__(self) -> str:
+        return "<no number>"
+
+
+@pytest.mark.parametrize(("reward", "got"), [(10**400, "1000"), (NoNumber(), "<no number>")])
+@pytest.mark.parametrize("good", [1, 4], ids=["first step", "later step"])
+def test_a_reward_that_no_float_holds_is_named_with_its_copy(good: int, reward: Any, got: str) -> None:
+    said = answer(good, np.zeros(1, np.float32), reward)
+    assert said.startswith(f"lane 0, copy 0, step {good - 1}: reward: expected a number, got {got}")
+
+
 @pytest.mark.parametrize(
     ("space", "observation"),
     [
