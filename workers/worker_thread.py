@@ -14,6 +14,7 @@ from protocol.bounds import one_line
 from protocol.env_spec import AllowedCode
 from protocol.wire.worker_link import WorkerLink
 from workers.activity import Activity, ActivityReader, share_activity
+from workers.conversation.connection_rules import LEARNER_STARTED_IT_S, wait_limits_s
 from workers.conversation.session import Leave, Session
 from workers.supervise.ending import Ending
 from workers.worker import MakeActors, Worker, WorkerOptions, identity, make_local_actors
@@ -44,7 +45,8 @@ class WorkerThread:
 
     def _run(self, address: str, context: zmq.Context[Any]) -> None:
         share_activity(self._page)
-        session = Session(self._identity, time.monotonic())
+        join_timeout_s, rejoin_timeout_s = wait_limits_s(LEARNER_STARTED_IT_S, stay=False)
+        session = Session(self._identity, time.monotonic(), join_timeout_s=join_timeout_s, rejoin_timeout_s=rejoin_timeout_s)
         link = WorkerLink(address, self.name, context)
         options = WorkerOptions(
             code=AllowedCode.CALLABLES, stop_requests=lambda: self._stop_requests, make_actors=self._make_actors

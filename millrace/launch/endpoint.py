@@ -17,6 +17,7 @@ from learner.members.process_callbacks import ProcessCallbacks
 from millrace.launch.local_worker_options import FlagsOfWorker, private_address, temporary_keys
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
+from workers.conversation.connection_rules import LEARNER_STARTED_IT_S
 from workers.slots import copies_per_machine
 from workers.supervise.supervisor import STOP_WITHIN_S, Running, Supervisor
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
@@ -69,7 +70,7 @@ class Endpoint(Bound):
             if self.link.address.startswith("inproc://"):
                 return WorkerThread(self.link.address, name, self.context, evaluates=evaluates(name))
             own, log_file = flags(name)
-            own = [*own, "--evaluate"] if evaluates(name) else own
+            own = [*own, "--join-timeout-s", str(LEARNER_STARTED_IT_S), *(["--evaluate"] if evaluates(name) else [])]
             if (descriptors := handed(name)) is not None:
                 own = [*own, "--handed", ",".join(map(str, descriptors))]
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, own, descriptors or ()))

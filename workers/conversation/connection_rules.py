@@ -14,6 +14,8 @@ from protocol.keys.keys import Token
 
 REJOIN_TIMEOUT_S = 600.0
 """How long, at least, a worker that had joined waits for its learner to come back."""
+LEARNER_STARTED_IT_S = math.inf
+"""How long a worker waits that its learner has started: it ends with the learner, which may be stopped (Ctrl-Z) or busy."""
 
 
 def wait_limits_s(join_timeout_s: float, *, stay: bool) -> tuple[float, float]:

@@ -1,0 +1,57 @@
+"""How the workers of a run on this machine are started."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from learner.members.bind_settings import BindSettings
+from millrace.launch.endpoint import open_endpoint
+from millrace.launch.local_worker_options import no_flags
+from protocol.flags.parse import parse_flags
+from workers import worker_thread
+from workers.conversation.connection_rules import wait_limits_s
+from workers.conversation.session import Session, WorkerIdentity
+from workers.flags import WorkerFlags
+from workers.supervise import worker_process
+
+WITHIN_S = 60.0
+
+
+def test_a_worker_process_waits_for_its_learner_as_long_as_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The learner may be stopped (Ctrl-Z), or in a callback, before the worker has joined. It ends with the learner."""
+    commands: list[list[str]] = []
+
+    def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+        commands.append(command)
+        return subprocess.Popen(["sh", "-c", "exit 0"], **how)
+
+    monkeypatch.setattr(worker_process, "popen", popen)
+    with ExitStack() as stack:
+        endpoint = open_endpoint(BindSettings(), "ipc", stack)
+        stack.enter_context(endpoint.workers(2, no_flags, evaluating=1))
+    for command, evaluates in zip(commands, (False, True), strict=True):
+        flags = parse_flags(WorkerFlags, command[command.index("workers") + 1 :], "worker")
+        assert wait_limits_s(flags.join_timeout_s, stay=flags.stay) == (math.inf, math.inf)
+        assert flags.evaluate == evaluates
+
+
+def test_a_worker_thread_waits_for_its_learner_as_long_as_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[tuple[float, float]] = []
+
+    def session(who: WorkerIdentity, now: float, *, join_timeout_s: float, rejoin_timeout_s: float) -> Session:
+        limits.append((join_timeout_s, rejoin_timeout_s))
+        return Session(who, now, join_timeout_s=join_timeout_s, rejoin_timeout_s=rejoin_timeout_s)
+
+    monkeypatch.setattr(worker_thread, "Session", session)
+    with ExitStack() as stack:
+        endpoint = open_endpoint(BindSettings(), "inproc", stack)
+        supervisor, _ = stack.enter_context(endpoint.workers(1, no_flags, WITHIN_S))
+        supervisor.stop(WITHIN_S)
+        supervisor.poll()
+        assert supervisor.count == 0
+    assert limits == [(math.inf, math.inf)]
