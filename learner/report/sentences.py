@@ -2,7 +2,8 @@
 
 Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
 the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits. If they add up
-to more, both wait for some workers.
+to more, both wait at once: for some workers, or for messages on their way. This is said only if the learner waits for longer
+than it works, because otherwise faster workers or messages would change little.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
-BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once: for other workers
+BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -40,8 +41,10 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
         return ""
     waits, idle = learner["wait"] / training_s, worker["wait"] / collecting_s
     worker_s = sum(seconds or 0.0 for name, seconds in stages.items() if name.startswith("worker_"))
-    if learner["wait"] / all_s + worker["wait"] / worker_s > 1 + BOTH_WAIT:
-        return f"Workers wait for slower ones: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
+    both_wait = learner["wait"] / all_s + worker["wait"] / worker_s > 1 + BOTH_WAIT
+    if both_wait and learner["wait"] > learner["update"] + learner["other"]:
+        which = f"the learner for {waits:.0%} of the time, and workers for {idle:.0%}"
+        return f"Both sides wait, for slower workers or for messages: {which}."
     if abs(waits - idle) < ABOUT_EQUAL:
         return f"No part is the slowest: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
     if waits > idle:

@@ -24,7 +24,11 @@ IN_TURN = "Updates are the slowest part: the learner updates for 80% of the time
         ),
         (  # half of the workers are done at once
             {"wait": 8.0, "update": 2.0}, {"step": 4.0, "wait": 6.0},
-            "Workers wait for slower ones: the learner waits for 80% of the time, and workers for 60%.",
+            "Both sides wait, for slower workers or for messages: the learner for 80% of the time, and workers for 60%.",
+        ),
+        (  # one worker, and many short rollouts: the time of their messages counts as waiting on both sides
+            {"wait": 2.0, "update": 7.0, "other": 1.0}, {"step": 1.0, "wait": 9.0},
+            "Updates are the slowest part: the learner updates for 70% of the time, and workers wait for 90%.",
         ),
         (  # at the same time: the learner updates for most of it, and yet it waits for the workers, which never wait
             {"wait": 4.0, "update": 6.0}, {"act": 2.0, "step": 8.0},
