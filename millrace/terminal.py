@@ -207,7 +207,7 @@ class PlainLines(ProgressView):
     def show(self, progress: Progress) -> None:
         """Print one line. Which part is the slowest, and what went wrong, is said at the end."""
         ended = bool(progress.stop_reason)
-        said = bottleneck(progress.waiting, progress.stages if ended else {})
+        said = bottleneck("", progress.stages) if ended else bottleneck(progress.waiting, {})
         parts = [main_figures(progress), said, went_wrong(progress.ledger) if ended else ""]
         self.print_line(" | ".join(filter(None, parts)))
 

@@ -116,7 +116,7 @@ WAITING = (
 def test_a_plain_line_says_who_waits_and_the_last_one_the_slowest_part(capsys: pytest.CaptureFixture[str]) -> None:
     PlainLines().show(replace(PROGRESS, waiting=WAITING))
     assert capsys.readouterr().out.endswith(f" | update 243 | The learner has been {WAITING}.\n")
-    PlainLines().show(replace(PROGRESS, stop_reason="all steps done"))
+    PlainLines().show(replace(PROGRESS, waiting=WAITING, stop_reason="all steps done"))  # nobody waits any more
     assert capsys.readouterr().out.endswith(f" | update 243 | {SLOWEST} | {LOST}\n")
 
 
