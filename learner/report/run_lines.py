@@ -138,6 +138,8 @@ def headline(line: RunLine) -> str:
     """One sentence: how the run ended, or that it died, and how to continue it. Of one that trains, how far it is."""
     resume = f"continue it with: {one_line(resume_command(line.path, elsewhere=False))}"
     match line.state:
+        case "training" if not line.env_steps:  # its folder has no numbers yet, but it works
+            return "Training: before its first update."
         case "training":
             left = "" if line.left_s is None else f", about {duration(line.left_s)} left"
             return f"Training: {line.done} done, {per_second(line.steps_per_s)} env steps per second{left}."

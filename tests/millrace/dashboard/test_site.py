@@ -160,6 +160,12 @@ def test_the_newest_evaluations_are_a_table_that_marks_the_best() -> None:
     assert run_page.evaluations([{"time/total_timesteps": 10}]) == ""
 
 
+def test_of_equally_good_evaluations_the_newest_is_the_best_as_in_the_run() -> None:
+    returns = {10: 1.0, 20: 9.0, 30: 9.0, 40: 8.0}
+    rows = [{"time/total_timesteps": at, "eval/mean_reward": found} for at, found in returns.items()]
+    assert "The best of 4 was at 30 env steps, with a mean return of 9.0." in Safe(run_page.evaluations(rows)).text
+
+
 def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
     run = a_run(tmp_path, finished=False)
     waits = "waiting 12 s for lane 1 (worker w1 on far: in reset for 11 s)"
@@ -185,7 +191,11 @@ def test_before_the_first_update_it_shows_what_workers_have_made(tmp_path: Path)
         status(worker()), version=0, env_steps=45, steps_per_s=1.9, waiting=waits, stages={"learner_wait": 23.4}
     )
     with RunLock(run):
-        said = Pages(tmp_path, seen=Seen(known)).said(f"run/{key_of(run)}")
+        pages = Pages(tmp_path, seen=Seen(known))
+        said, all_runs = pages.said(f"run/{key_of(run)}"), pages.said()
+        silent = Pages(tmp_path, seen=Seen(problem="its learner does not answer")).said(f"run/{key_of(run)}")
+    assert "training – before its first update – " in all_runs
+    assert "Training: before its first update. Who waits for whom is not known" in silent
     assert f"1.9 env steps per second, about 14 h 36 min left. The learner has been {waits}." in said
     assert "Env steps of 100,000 45 Env steps per second 1.9 Updates 0 Time of training 23.4 s" in said
 
