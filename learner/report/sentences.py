@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
 BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once
+LEAST_PER_S = 1e-4  # an env step in three hours; a smaller speed is 0
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -58,7 +59,7 @@ def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
 
 def per_second(steps: float) -> str:
     """Env steps per second. Few of them have digits after the point, so that a slow simulator does not look dead."""
-    return f"{steps:.2g}" if 0.001 <= steps < 9.95 else f"{steps:,.0f}"
+    return f"{steps:.2g}" if LEAST_PER_S <= steps < 9.95 else f"{steps:,.0f}"
 
 
 def lag_in_words(mean: float, largest: int, used: int) -> str:
