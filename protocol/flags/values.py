@@ -25,6 +25,9 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
         return None
     match get_origin(field.kind):
         case origin if origin is dict:
+            if wrong := [name for name in words[::2] if "=" in name]:
+                apart = wrong[0].replace("=", " ", 1)
+                raise UsageError(f"{field.name}: expected NAME VALUE, got {wrong[0]}; write them apart: {apart}")
             if len(words) % 2:
                 hint = f"; a text that begins with a dash is written in quotes: {shlex.quote(words[-1])} '\"-x\"'"
                 raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}{hint}")

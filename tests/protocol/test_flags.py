@@ -96,6 +96,8 @@ def test_words_become_values(words: str, expected: dict[str, Any] | None) -> Non
             "table: expected NAME VALUE NAME VALUE ..., got a; "
             "a text that begins with a dash is written in quotes: a '\"-x\"'",
         ),
+        ("--table a=1", "table: expected NAME VALUE, got a=1; write them apart: a 1"),
+        ("--table a 1 b=2 c=3", "table: expected NAME VALUE, got b=2; write them apart: b 2"),
         ("--inner \udce9", "inner: expected text in UTF-8, got '\\udce9'"),
         ("--sizes 3 \udce9", "sizes: expected text in UTF-8, got 3 '\\udce9'"),
         ("--gentle=yes", "do: --gentle=yes: expected --gentle or --no-gentle"),
