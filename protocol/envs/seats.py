@@ -378,7 +378,7 @@ def with_state(env: Any) -> Any:
 
 
 def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
-    """That of `env.state()`. Raises `UsageError` if it has none."""
+    """That of `env.state()`. Raises `UsageError` if it has none, and none follows from what it returns."""
     try:
         space: gymnasium.Space[Any] | None = getattr(env, "state_space", None)
         if space is not None:
@@ -387,6 +387,11 @@ def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
         state = np.asarray(env.state())
     except (NotImplementedError, AttributeError) as error:
         raise UsageError(f"environment {name}: critic_keys state: expected a method state(), and it has none") from error
+    if state.dtype.kind not in "fi":  # bytes, for example, may be brightnesses, flags or counts
+        raise UsageError(
+            f"environment {name}: critic_keys state: expected state() to return an array of floats or signed integers, got "
+            f"{state.dtype}; give the environment a state_space, which says what they mean"
+        )
     return spaces.Box(-np.inf, np.inf, state.shape, state.dtype.type)
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
+from protocol.arrays import Array
 from protocol.envs.answers import WrongAnswer
-from protocol.envs.seats import seated
+from protocol.envs.seats import seated, with_state
+from protocol.errors import UsageError
 from tests.support.users_code.seat_envs import RockPaperScissors
 
 
@@ -59,3 +62,26 @@ def test_the_last_observation_of_a_task_that_has_ended_may_be_missing() -> None:
     env = seated(Wrong("observations", {}), "game")
     env.reset(seed=1)
     assert env.step([0, 0])[2]
+
+
+class Stated(RockPaperScissors):
+    """Has a state without a space."""
+
+    def __init__(self, state: Array) -> None:
+        super().__init__()
+        self._state = state
+
+    def state(self) -> Array:
+        return self._state
+
+
+def test_a_state_without_a_space_has_no_bounds() -> None:
+    seen: Any = seated(with_state(Stated(np.zeros(2, np.float32))), "Stated").observation_space
+    space = seen["state"]
+    assert (space.shape, space.dtype, space.is_bounded()) == ((2,), np.float32, False)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, bool, object])
+def test_a_state_whose_dtype_does_not_say_what_it_means_needs_a_space(dtype: Any) -> None:
+    with pytest.raises(UsageError, match=r"Stated: critic_keys state: .* got .*; give the environment a state_space"):
+        seated(with_state(Stated(np.zeros(2, dtype))), "Stated")
