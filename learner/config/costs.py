@@ -52,8 +52,9 @@ def endless_evaluations(config: Config, evaluation: DescribedEnv) -> str:
     if limited or not (config.eval_every or config.eval_episodes):
         return ""
     size = evaluation_size(config)
+    episodes = f"{size.episodes} episode{'s' * (size.episodes != 1)}"
     limit = "" if evaluation.seats else ' --wrappers "gymnasium.wrappers:TimeLimit(max_episode_steps=1000)" or'
     return (
-        f"no time limit of {config.env} is known: where episodes do not end, an evaluation of {size.episodes} takes "
+        f"no time limit of {config.env} is known: if episodes do not end, an evaluation of {episodes} takes "
         f"{size.max_steps:,} env steps; limit it by{limit} --eval-max-steps"
     )
