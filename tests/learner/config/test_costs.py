@@ -44,10 +44,10 @@ def test_an_evaluation_whose_episodes_may_not_end_is_said_before() -> None:
         return endless_evaluations(resolve("my_module:Plant", **settings), found)
 
     assert line(Countdown(), eval_every=1_000) == (
-        "no time limit of my_module:Plant is known: if episodes do not end, an evaluation of 100 episodes takes 1,000,000 env "
-        'steps; limit it by --wrappers "gymnasium.wrappers:TimeLimit(max_episode_steps=1000)" or --eval-max-steps'
+        "no time limit of my_module:Plant is known: if episodes do not end, an evaluation of 100 episodes takes 1,000,000 "
+        'env steps; limit it by --wrappers "gymnasium.wrappers:TimeLimit(max_episode_steps=1000)" or --eval-max-steps'
     )
-    assert "an evaluation of 2 takes 500 env steps" in line(Countdown(), eval_episodes=2, eval_max_steps=500)
+    assert "an evaluation of 2 episodes takes 500 env steps" in line(Countdown(), eval_episodes=2, eval_max_steps=500)
     assert line(Countdown()) == "", "the evaluation at the end is no longer than training"
     assert line(TimeLimit(Countdown(), 50), eval_every=1_000) == ""
     assert line(gymnasium.make("CartPole-v1"), eval_every=1_000) == ""
