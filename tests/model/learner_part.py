@@ -51,10 +51,10 @@ SAVED: dict[type, set[str]] = {
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"run", "worker_timeout_s", "evaluation"},
+    TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes"},
     RolloutDealer: {"_absent", "opponents"},
     SentWeights: set(),
-    Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare"}
+    Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare", "has_policy_code"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
         "joined_s",
@@ -64,7 +64,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity",
         "activity_s",
     }
-    | {"in_env_code_s", "speed", "stepped", "supervisor"},
+    | {"in_env_code_s", "speed", "first_step_s", "ended_steps", "supervisor"},
     TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},

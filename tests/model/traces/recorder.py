@@ -27,7 +27,8 @@ COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent
 METHODS = {
     "TicketCoordinator": (
         *COMMON,
-        *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation", "drain"),
+        *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation"),
+        *("share_evaluation", "drain"),
     ),
     "RolloutDealer": ("take", "not_used", "incarnations"),
     "EvaluationDealer": ("end",),
@@ -39,6 +40,7 @@ METHODS = {
     ),
 }
 NOT_RECORDED = {  # it changes nothing, or nobody calls it
+    "TicketCoordinator": {"collected", "steps_of_update"},
     "DescribeCoordinator": {"drain", "status"},
     "Session": {"is_unwanted", "missing_versions"},
 }

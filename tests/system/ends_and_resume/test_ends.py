@@ -232,17 +232,19 @@ def test_a_run_whose_folder_is_gone_continues_in_a_new_one(
 
 
 def test_a_run_folder_that_is_made_again_has_the_best_policy(tmp_path: Path) -> None:
-    def watch(progress: Progress) -> None:
-        if progress.updates == 12 and not progress.waiting.startswith(
-            "evaluating"
-        ):  # after the best evaluation: the later ones are no better
-            shutil.rmtree(progress.run)
+    made_again = list[bool]()
 
-    folder = run(tmp_path, watch, eval_every=64)
-    best = summary(folder)["best"]
-    assert best["chosen_by"] == 10.0
-    assert best["env_steps"] < read_rows(folder / "metrics.jsonl")[0]["time/total_timesteps"]
-    assert (folder / "best.safetensors").is_file()
+    def watch(progress: Progress) -> None:
+        match progress.updates:
+            case 10:  # after the one evaluation before the end
+                shutil.rmtree(progress.run)
+            case 11:
+                made_again.append((Path(progress.run) / "best.safetensors").is_file())
+
+    folder = run(tmp_path, watch, eval_every=256)
+    assert made_again == [True]
+    assert read_rows(folder / "metrics.jsonl")[0]["time/iterations"] > 8, "the rows of that evaluation are gone"
+    assert summary(folder)["best"]["chosen_by"] == 10.0
 
 
 @pytest.mark.parametrize(
