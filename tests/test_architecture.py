@@ -41,7 +41,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "members": set[str](),
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},
-    "run_folder": set[str](),
+    "run_folder": {"rehearsed_pickle"},
     "recording": {"run_folder", "rollouts", "policy_player"},
     "report": {"config", "run_folder"},
 }

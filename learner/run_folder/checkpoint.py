@@ -4,6 +4,7 @@ Rule: a checkpoint is there whole or not at all; the newest whole one is used; a
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
 first. Each element of a tensor must be in the file: one with a stride of 0 is a few bytes there, but any number once copied.
+And what the loader would call is rehearsed, because it could fill the memory (`learner/rehearsed_pickle.py`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from learner.rehearsed_pickle import rehearse
 from learner.run_folder.atomic_write import TEMPORARY, write_atomically
 from learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
 from protocol.errors import CheckpointError, UsageError
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 FORMAT = 1
 FOLDER = "checkpoints"
 SUFFIX = ".pt"
+ZIP_BEGINS = b"PK\x03\x04"  # where a file begins otherwise, torch reads a pickle before the archive
+PICKLE = "data.pkl"  # how the name of an archive's pickle ends; torch finds it in capital letters, too
 MOST_VIEWS = 16  # of the same numbers: an algorithm may save parts of a tensor besides the whole
 
 
@@ -104,12 +108,16 @@ def _read(path: Path) -> Checkpoint:
 
     try:
         with os.fdopen(open_regular(path), "rb") as file:
+            if file.read(len(ZIP_BEGINS)) != ZIP_BEGINS:
+                raise _Unreadable("it is no archive that torch.save wrote")
             with zipfile.ZipFile(file) as archive:
                 if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
                     raise _Unreadable("it is compressed, and torch writes none that is")  # a few bytes could fill the memory
-                damaged = archive.testzip()
-            if damaged is not None:
-                raise _Unreadable(f"checksum of {damaged} does not match")
+                if (damaged := archive.testzip()) is not None:
+                    raise _Unreadable(f"checksum of {damaged} does not match")
+                for entry in archive.infolist():
+                    if entry.filename.lower().endswith(PICKLE):
+                        rehearse(archive.read(entry))
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             record = torch.load(file, map_location="cpu", weights_only=True)
@@ -179,11 +187,18 @@ def _check_plain(value: object, where: str) -> None:
             for index, inner in enumerate(value):
                 _check_plain(inner, f"{where}[{index}]")
         case torch.Tensor():
+            if type(value) not in (torch.Tensor, torch.nn.Parameter) or vars(value):
+                raise UsageError(
+                    f"checkpoint: {where}: expected a tensor without attributes, got a {type(value).__name__} with more; "
+                    "mend state_dict, as by detach()"
+                )
             if not _is_whole(value):
                 raise UsageError(
                     f"checkpoint: {where}: expected a tensor with memory for each of its elements, got a sparse or an "
                     "expanded one; mend state_dict, as by clone()"
                 )
+        case bytes() if not value:
+            raise UsageError(f"checkpoint: {where}: expected bytes, got none, which torch cannot read back; mend state_dict")
         case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
             got = f"{type(value).__module__}.{type(value).__name__}"
             raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; mend state_dict")

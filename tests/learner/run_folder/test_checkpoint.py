@@ -1,12 +1,14 @@
 """Checkpoints: whole or not at all, newest whole one wins, no code in them."""
 
+import codecs
 import errno
 import os
 import pickle
 import resource
 import shutil
 import signal
-from collections.abc import Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -177,6 +179,71 @@ def test_reading_runs_no_code(tmp_path: Path) -> None:
         checkpoint.load(path)
 
 
+class Calls:
+    """Is pickled as a call of this function."""
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
+        self._call = function, arguments
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._call
+
+
+TEXT = "x" * 1000
+PAIRS = [(n, n) for n in range(100)]
+
+
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        Calls(bytearray, 1000),
+        [Calls(codecs.encode, TEXT, "latin1") for _ in range(20)],
+        Calls(codecs.encode, TEXT, "utf-32"),
+        Calls(OrderedDict, PAIRS),
+        Calls(torch.Tensor, 1000),
+        Calls(torch.UntypedStorage, 1000),
+        Calls(torch._utils._rebuild_device_tensor_from_cpu_tensor, torch.zeros(2), torch.float64, "cpu", False),
+        {1, 2},
+    ],
+    ids=["bytearray", "one text often", "four bytes a letter", "container", "tensor", "storage", "copy", "set"],
+)
+def test_what_torch_would_make_of_a_few_bytes_is_refused_before_it_is_made(tmp_path: Path, hostile: object) -> None:
+    """Such as a gigabyte in a file of 353 bytes. What is made here is small, so that the loader alone would take it."""
+    path = tmp_path / "model.pt"
+    torch.save({"format": 1, "env_steps": 3, "state": {"x": hostile}}, path)
+    with pytest.raises(CheckpointError, match=r"expected a pickle of tensors and plain data|more bytes objects than fit"):
+        checkpoint.load(path)
+
+
+def test_the_pickle_that_torch_reads_is_the_one_that_is_rehearsed(tmp_path: Path) -> None:
+    """In a file that begins otherwise, it is not that of the archive; in an archive, its name may be in capital letters."""
+    path = checkpoint.save(tmp_path, {"x": 1}, 100, keep=1)
+    whole = path.read_bytes()
+    path.write_bytes(pickle.dumps({"format": 1, "env_steps": 100, "state": {"x": 2}}, protocol=2) + whole)
+    with pytest.raises(CheckpointError, match="it is no archive that torch"):
+        checkpoint.load(path)
+    torch.save({"format": 1, "env_steps": 3, "state": {"x": Calls(bytearray, 1000)}}, path)
+    path.write_bytes(path.read_bytes().replace(b"/data.pkl", b"/DATA.pkl"))
+    with pytest.raises(CheckpointError, match=r"got builtins\.bytearray|got __builtin__\.bytearray"):
+        checkpoint.load(path)
+
+
+def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
+    dtypes = [torch.float64, torch.bfloat16, torch.bool, torch.int64, torch.uint16, torch.complex64, torch.float8_e4m3fn]
+    saved: dict[str, Any] = {
+        "tensors": [torch.zeros(3, dtype=dtype) for dtype in dtypes],
+        "parameter": torch.nn.Parameter(torch.ones(2)),
+        "plain": [(), (1,), (1, 2), (1, 2, 3), (1, 2, 3, 4), 2**70, -1, 300, 70_000, 0.5, True, False, None, "ä", [], {}],
+        "bytes": [b"a", b"\xff" * 300, b"a"],
+        "many": list(range(2000)),
+    }
+    checkpoint.save(tmp_path, saved, 100, keep=1)
+    found = checkpoint.newest(tmp_path)[0].state
+    assert all(map(torch.equal, found.pop("tensors"), saved.pop("tensors")))
+    assert torch.equal(found.pop("parameter"), saved.pop("parameter"))
+    assert found == saved
+
+
 def cycle() -> list[Any]:
     within: list[Any] = [torch.ones(3).expand(10**12, 3)]
     within.append(within)
@@ -218,6 +285,12 @@ def test_views_come_back(tmp_path: Path) -> None:
 def test_an_expanded_tensor_is_refused_before_it_is_written(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"state\['flat'\]: expected a tensor with memory for each of its elements"):
         checkpoint.save(tmp_path, {"flat": torch.zeros(1).expand(30)}, 100, keep=3)
+
+
+@pytest.mark.parametrize("stray", [b"", torch.nn.Buffer(torch.ones(1))], ids=["no bytes", "attributes"])
+def test_a_state_that_torch_would_read_otherwise_is_not_written(tmp_path: Path, stray: object) -> None:
+    with pytest.raises(UsageError, match=r"state\['inner'\]\[0\]: expected (bytes|a tensor without attributes), got"):
+        checkpoint.save(tmp_path, {"inner": [stray]}, 100, keep=3)
 
 
 @pytest.mark.parametrize("stray", [np.float64(1.0), np.zeros(3), {1, 2}, np.random.default_rng(0)])

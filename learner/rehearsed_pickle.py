@@ -1,0 +1,93 @@
+"""What the pickle in a checkpoint would call, found before torch's loader calls it. Pure: bytes in.
+
+Rule: a pickle may hold only what torch.save writes for tensors and plain data. torch's loader for files of strangers
+(`weights_only`) runs no code of theirs; yet it calls `bytearray` with any length, and copies a container or a text as often
+as it is told to, so a few bytes could fill the memory. Here the pickle is followed, and nothing of it is made.
+"""
+
+from __future__ import annotations
+
+import pickletools
+from typing import NamedTuple
+
+VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
+CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
+TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+ADD = {"APPEND": 1, "SETITEM": 2}
+"""Opcodes, as pickletools explains them, and how many items of the stack they take. torch.save writes protocol 2."""
+
+REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
+"""They make a view of a storage. How large that is, is checked when it is there."""
+HOOKS = "collections OrderedDict"  # of a tensor: it has none
+BYTES = "_codecs encode"  # a bytes object is written as text
+CALLED = REBUILD | {HOOKS, BYTES}
+TYPES = ("torch ", "torch.storage ")  # how the names of storages and dtypes begin, which nobody calls
+
+
+class Unfit(Exception):
+    """The pickle holds something else. The text says what."""
+
+
+class _Function(NamedTuple):
+    name: str
+
+
+def rehearse(content: bytes) -> None:
+    """Follow a pickle to its end. Raises `Unfit`, or what `pickletools` and an empty stack raise for damaged bytes."""
+    stack, marks, notes = list[object](), list[int](), dict[int, object]()
+    bytes_left = len(content)
+    for opcode, argument, _ in pickletools.genops(content):
+        match opcode.name, argument:
+            case "PROTO" | "STOP", _:
+                pass
+            case "MARK", _:
+                marks.append(len(stack))
+            case name, _ if name in VALUES:
+                stack.append(argument)
+            case name, _ if name in CONTAINERS:
+                stack.append(None)
+            case name, _ if name in TUPLES:
+                _gather(stack, len(stack) - TUPLES[name])
+            case "TUPLE", _:
+                _gather(stack, marks.pop())
+            case "APPENDS" | "SETITEMS", _:
+                del stack[marks.pop() :]
+            case name, _ if name in ADD:
+                del stack[-ADD[name] :]
+            case "BINPUT" | "LONG_BINPUT", int(note):
+                notes[note] = stack[-1]
+            case "BINGET" | "LONG_BINGET", int(note):
+                stack.append(notes[note])
+            case "BINPERSID", _:  # a storage: torch reads what is in the file
+                stack[-1] = None
+            case "GLOBAL", str(name) if name in CALLED or name.startswith(TYPES):
+                stack.append(_Function(name))
+            case "REDUCE", _:
+                arguments, called = stack.pop(), stack.pop()
+                bytes_left -= _cost(called, arguments)
+                if bytes_left < 0:
+                    raise Unfit("it has more bytes objects than fit into the file")
+                stack.append(None)
+            case name, _:
+                got = str(argument).replace(" ", ".") if name == "GLOBAL" else f"the opcode {name}"
+                raise Unfit(f"expected a pickle of tensors and plain data, got {got}")
+
+
+def _gather(stack: list[object], first: int) -> None:
+    """Make a tuple of what stands on the stack from there on."""
+    stack[first:] = [tuple(stack[first:])]
+
+
+def _cost(called: object, arguments: object) -> int:
+    """How many bytes a call makes beside tensors. Raises `Unfit` for a call that torch.save does not write."""
+    match called, arguments:
+        case _Function(name), tuple() if name in REBUILD:
+            return 0
+        case _Function(name), () if name == HOOKS:
+            return 0
+        case _Function(name), (str(text), "latin1") if name == BYTES:
+            return len(text)
+        case _Function(name), _:
+            raise Unfit(f"expected a pickle of tensors and plain data, got a call of {name.replace(' ', '.')}")
+        case _:
+            raise Unfit("expected a pickle of tensors and plain data, got a call of what is no function")
