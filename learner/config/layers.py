@@ -20,6 +20,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.other_names import in_place_of
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
+from learner.run_folder.regular_files import MOST_TEXT_BYTES
 from learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError, did_you_mean
@@ -155,9 +156,13 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
-    """Read a TOML file of settings."""
+    """Read a TOML file of settings. It may be a link or a pipe, because the user names it, and a device that never ends."""
     try:
-        return parse_toml(file.read_text("utf-8"), str(file))
+        with file.open("rb") as opened:
+            content = opened.read(MOST_TEXT_BYTES + 1)
+        if len(content) > MOST_TEXT_BYTES:
+            raise UsageError(f"config file {file} cannot be read: expected at most {MOST_TEXT_BYTES:,} bytes, got more")
+        return parse_toml(content.decode(), str(file))
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise UsageError(f"config file {file} cannot be read: {why}") from error

@@ -251,8 +251,12 @@ class RunFolder:
                 left.unlink()
 
     def remove_summary(self) -> None:
-        """A run that had ended goes on: its summary is no longer true."""
-        (self.path / SUMMARY_FILE).unlink(missing_ok=True)
+        """A run that had ended goes on: its summary is no longer true. Raises `RunError` if it stays."""
+        path = self.path / SUMMARY_FILE
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise RunError(f"{path} cannot be removed: {reason(error)}; remove it, then resume the run") from error
 
     def keep(self) -> None:
         """The run has begun: `remove` does nothing from now on."""

@@ -178,6 +178,7 @@ def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
         ({"encoder": "caf\udce9:x"}, "encoder: expected text in UTF-8, got 'caf\\udce9:x'"),
         ({"bind": "0.0.0.0:5555"}, "address 0.0.0.0:5555: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT"),
         ({"file": Path("/no/such.toml")}, "config file /no/such.toml cannot be read: No such file or directory"),
+        ({"file": Path("/dev/zero")}, "config file /dev/zero cannot be read: expected at most 4,194,304 bytes, got more"),
     ],
 )
 def test_bad_values_are_refused_in_one_line(keywords: dict[str, Any], says: str) -> None:

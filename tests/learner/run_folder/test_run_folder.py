@@ -341,3 +341,10 @@ def test_a_description_of_which_no_policy_can_be_made_is_one_line(tmp_path: Path
     (tmp_path / "policy.json").write_text(json.dumps(changed(card, wrong)))
     with pytest.raises(UsageError, match=f"cannot be read: .*{said}"):
         RunFolder(tmp_path).read_policy()
+
+
+def test_a_summary_that_cannot_be_removed_is_one_line(tmp_path: Path) -> None:
+    folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path)))
+    (folder.path / "summary.json").mkdir()
+    with pytest.raises(RunError, match=r"summary\.json cannot be removed: .*directory; remove it, then resume the run"):
+        folder.remove_summary()
