@@ -48,7 +48,7 @@ class RunFiles:
         """How long the longest checkpoint took to write, in this process."""
         self.on_saved: Callable[[], None] = lambda: None
         """Called after a checkpoint was written."""
-        self._metrics = MetricsLog(run.folder.path, self._state.env_steps)
+        self._metrics = MetricsLog(run.folder.path, self._state.env_steps, self._state.version)
         self._saved: tuple[object, ...] | None = None  # what `_position` was in the newest checkpoint
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
 

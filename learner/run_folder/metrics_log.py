@@ -40,9 +40,16 @@ class MetricsLog:
     Every row goes to metrics.jsonl. TensorBoard gets a row per `EVENTS_EVERY_S`, every row with an evaluation, and the last.
     """
 
-    def __init__(self, folder: Path, from_env_steps: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
-        """`from_env_steps`: env steps of the checkpoint that the run goes on from; later rows are removed.
+    def __init__(
+        self,
+        folder: Path,
+        from_env_steps: int = 0,
+        from_update: float = math.inf,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`from_env_steps`, `from_update`: of the checkpoint that the run goes on from; later rows are removed.
 
+        An update whose rows only reset env copies adds no env step, so both are needed.
         Raises `RunError`, with a one-line message, if the files cannot be written.
         """
         table = folder / METRICS_FILE
@@ -53,7 +60,11 @@ class MetricsLog:
         try:
             if table.exists():
                 rows = read_rows(table)
-                kept = [row for row in rows if row[ENV_STEPS_KEY] <= from_env_steps]
+                kept = [
+                    row
+                    for row in rows
+                    if row[ENV_STEPS_KEY] <= from_env_steps and (row.get(UPDATES_KEY) or 0) <= from_update
+                ]
                 self.removed = len(rows) - len(kept)
                 write_atomically(table, lambda file: file.writelines(_json_line(row) for row in kept))
             self._table = _RecordFile(folder, METRICS_FILE)

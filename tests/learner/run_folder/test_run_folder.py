@@ -242,6 +242,19 @@ def test_a_resumed_run_takes_back_what_its_checkpoint_does_not_know(tmp_path: Pa
     assert scalars(tmp_path, "rollout/ep_rew_mean") == [(100, 1.0), (200, 1.0), (250, 2.0), (350, 2.0)]
 
 
+def test_a_resumed_run_takes_back_updates_that_only_reset_env_copies(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path)
+    for update, steps in ((1, 1), (2, 2), (3, 2), (4, 2), (5, 3)):
+        log.write(Progress(updates=update, env_steps=steps), {})
+    log.close()
+    log = MetricsLog(tmp_path, from_env_steps=2, from_update=2)
+    assert log.removed == 3
+    for update in (3, 4):
+        log.write(Progress(updates=update, env_steps=2), {})
+    log.close()
+    assert [row["time/iterations"] for row in read_rows(tmp_path / "metrics.jsonl")] == [1, 2, 3, 4]
+
+
 def test_rows_that_the_disk_refuses_are_written_later(tmp_path: Path) -> None:
     log = MetricsLog(tmp_path)
     log.write(Progress(updates=1, env_steps=100), {})
