@@ -12,6 +12,7 @@ from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
 from protocol.space_spec import Shape
 from protocol.wire.weight_dtypes import ActingDtype
 
+WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # those of more than float32's 24 bits
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
 
 
@@ -35,6 +36,11 @@ class Leaf(msgspec.Struct, frozen=True):
     def name(self) -> str:
         """As errors name it."""
         return f"observation {self.path}".strip()
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it is a Box of numbers that float32 may not tell apart, such as a time in seconds since 1970."""
+        return self.kind == "box" and self.dtype in WIDE_DTYPES
 
     @property
     def is_image(self) -> bool:

@@ -80,13 +80,13 @@ class ObservationNormalizer:
         self._enabled = spec.normalize_observations
         leaves = leaf_of_features(spec)
         self._box_features = np.array([leaf.kind == "box" for leaf in leaves], bool)
-        self._is_float64 = np.array([leaf.dtype == "float64" for leaf in leaves], bool)
+        self._is_wide = np.array([leaf.is_wide for leaf in leaves], bool)
         self._moments = self._no_moments()
         self._first: Doubles = np.empty((0, len(leaves)))  # [K, D] the rows counted so far, while they are few
         assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
 
     def _no_moments(self) -> RunningMoments:
-        return RunningMoments((len(self._is_float64),), np.where(self._is_float64, ROUNDING_64, ROUNDING_32))
+        return RunningMoments((len(self._is_wide),), np.where(self._is_wide, ROUNDING_64, ROUNDING_32))
 
     def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
         """Features [..., D] of leaves [..., *leaf], the same as a network takes them, and the images among the leaves.
@@ -134,13 +134,13 @@ class ObservationNormalizer:
     def buffers(self) -> Floats:
         """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.
 
-        A float64 feature may vary by less than its mean is rounded by, such as a time in seconds: its standard deviation is
+        A wide feature may vary by less than its mean is rounded by, such as a time in seconds: its standard deviation is
         that about the rounded mean, so that normalized values have a mean square of 1 and are not at the bounds.
         """
         if not self._enabled:
             return np.empty(0, np.float32)
         mean = np.where(self._box_features, self._moments.mean, 0).astype(np.float32)
-        off = np.where(self._is_float64, mean - self._moments.mean, 0)
+        off = np.where(self._is_wide, mean - self._moments.mean, 0)
         std = np.where(self._box_features, np.hypot(self._moments.std, off), 1)
         return np.concatenate([mean, std.astype(np.float32)])
 
@@ -152,7 +152,7 @@ class ObservationNormalizer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state)
-        first, D = state.get("first", torch.empty(0)), len(self._is_float64)
+        first, D = state.get("first", torch.empty(0)), len(self._is_wide)
         if len(first) and (len(first) >= FEW or first.shape[1:] != (D,)):
             raise ValueError(f"observations: expected fewer than {FEW} first rows of {D} numbers, got {list(first.shape)}")
         self._first = first.numpy().astype(np.float64).reshape(len(first), D)

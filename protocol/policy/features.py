@@ -35,7 +35,7 @@ def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
     Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32, or
-    float64 if the policy normalizes and an array of the observation is float64: `normalize` makes float32 of them.
+    float64 if the policy normalizes and an array of the observation is wide: `normalize` makes float32 of them.
     """
     plain = [(leaf, array) for leaf, array in zip(spec.observation, leaves, strict=True) if not leaf.is_image]
     parts = [_features(leaf, array, spec.normalize_observations) for leaf, array in plain]
@@ -47,7 +47,7 @@ def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     return np.concatenate(parts, -1)
 
 
-def _features(leaf: Leaf, array: Array, keeps_float64: bool) -> Array:
+def _features(leaf: Leaf, array: Array, keeps_digits: bool) -> Array:
     lead = array.shape[: array.ndim - len(leaf.shape)]
     if leaf.sizes:
         flat = array.reshape(*lead, len(leaf.sizes))
@@ -57,7 +57,7 @@ def _features(leaf: Leaf, array: Array, keeps_float64: bool) -> Array:
     flat = array.reshape(*lead, math.prod(leaf.shape))
     if leaf.divisor != 1:
         return flat * np.float32(1 / leaf.divisor)
-    return flat if keeps_float64 and leaf.dtype == "float64" else flat.astype(np.float32, copy=False)
+    return flat.astype(np.float64 if keeps_digits and leaf.is_wide else np.float32, copy=False)
 
 
 @lru_cache(maxsize=64)
@@ -74,6 +74,6 @@ def leaf_of_features(spec: PolicySpec) -> list[Leaf]:
 def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:
     """(x − mean) / std, clipped to ±10, float32. It is computed in the dtype of x.
 
-    So a float64 observation keeps the digits by which it differs from the mean, however large both are.
+    So a wide observation keeps the digits by which it differs from the mean, however large both are.
     """
     return np.asarray(np.clip((x - mean) / std, -CLIP, CLIP)).astype(np.float32, copy=False)

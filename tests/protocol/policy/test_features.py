@@ -198,6 +198,18 @@ def test_a_float64_observation_keeps_the_digits_by_which_it_differs_from_the_mea
     np.testing.assert_allclose(found, [[[1.0, -1.0], [2.0, 1.0]]], rtol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", ["int32", "uint32", "int64", "uint64"])
+def test_so_do_whole_numbers_that_float32_cannot_tell_apart(dtype: str) -> None:
+    now = 1_700_000_000  # seconds since 1970: float32 has steps of 128 here
+    kind: Any = np.dtype(dtype).type
+    spec = policy_of(gymnasium.spaces.Box(0, 2**31 - 1, (1,), kind), normalize_observations=True)
+    x = np.arange(now, now + 100, dtype=kind)[:, None, None]
+    normalizer = ObservationNormalizer(spec)
+    normalizer.update(features(spec, [x]), np.ones((100, 1), bool))
+    found = normalize(features(spec, [x]), *np.split(normalizer.buffers(), 2))
+    assert len(np.unique(found)) == 100
+
+
 def test_statistics_of_float64_observations_are_those_of_all_their_digits() -> None:
     spec = policy_of(Clock().observation_space, normalize_observations=True)
     normalizer = ObservationNormalizer(spec)

@@ -134,11 +134,11 @@ class Policy {
     double value = observation_.dtype == "float32"   ? static_cast<const float*>(obs)[i]
                    : observation_.dtype == "float64" ? static_cast<const double*>(obs)[i]
                    : observation_.dtype == "uint8"   ? static_cast<const unsigned char*>(obs)[i] * scale_
-                                                     : static_cast<float>(static_cast<const std::int64_t*>(obs)[i]);
+                                                     : static_cast<double>(static_cast<const std::int64_t*>(obs)[i]);
     if (!normalize_) return static_cast<float>(value);
     double mean = buffers_[i], std = buffers_[inputs_ + i];
-    double scaled = observation_.dtype == "float64" ? (value - mean) / std  // in the dtype of the observation
-                                                    : (static_cast<float>(value) - buffers_[i]) / buffers_[inputs_ + i];
+    bool wide = observation_.dtype == "float64" || observation_.dtype == "int64";  // float32 may not tell its numbers apart
+    double scaled = wide ? (value - mean) / std : (static_cast<float>(value) - buffers_[i]) / buffers_[inputs_ + i];
     return static_cast<float>(std::min(std::max(scaled, -10.0), 10.0));
   }
   static float as_float(const Array& array, std::size_t i) {  // float32, or bfloat16 sent as uint16
