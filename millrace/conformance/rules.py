@@ -415,7 +415,7 @@ ROUNDED = Rule(
 )
 NORMALIZED = Rule(
     "Collector profile",
-    "If normalized: (x − mean) / std, clipped to ±10, computed in the dtype of the observation",
+    "If normalized: (x − mean) / std, clipped to ±10, computed in float64 for float64 and for integers of 32 or 64 bits",
     "read means and standard deviations of all features from `Weights.buffers`, and clip what comes of them",
 )
 ATTRIBUTES = Rule(
