@@ -24,7 +24,7 @@ from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.results import EvaluatedPolicy, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Floats
-from protocol.bounds import Natural, Real, Seconds, one_line
+from protocol.bounds import Natural, Past, Real, Seconds, one_line
 from protocol.errors import BadMessage, CheckpointError, UsageError
 from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Episode
@@ -41,11 +41,11 @@ BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 class RunState(msgspec.Struct, kw_only=True):
     """All counters of a run. The defaults are those of a new run."""
 
-    version: Natural = 0
-    env_steps: Natural = 0
+    version: Past = 0
+    env_steps: Past = 0
     wall_s: Seconds = 0.0
     ledger: Ledger = msgspec.field(default_factory=Ledger)
-    incarnations: list[Natural] = []
+    incarnations: list[Past] = []
     """The next incarnation of each lane."""
     episodes: list[Episode] = []
     """Those of the `EpisodeWindow`."""
@@ -92,12 +92,12 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
                 setattr(state, name, tuple(array.numpy() for array in policy))
         algorithm.load_state_dict(found.state["algorithm"])
         _check_policies(state, algorithm.weights())
+        state.ledger.end_outstanding()
     except MISFITS as error:
         raise CheckpointError(
-            f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
+            f"checkpoint {found.path}: expected the state of this configuration, got another ({one_line(str(error))}); "
             "resume it with the settings it was made with"
         ) from error
-    state.ledger.end_outstanding()
     return state
 
 

@@ -39,7 +39,7 @@ from millrace.arguments import checked
 from millrace.keywords import RolloutKeywords
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
-from millrace.saved_state import ServiceState, digest, read, write
+from millrace.saved_state import ServiceState, digest, read, unreadable, write
 from protocol.arrays import Array, Ints
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
@@ -163,7 +163,6 @@ class RolloutService:
         state: ServiceState | None = None
         if restore is not None:
             state, self.restored = read(Path(restore))
-            state.ledger.end_outstanding()
             past = state.ledger, state.incarnations
             self._version, self.env_steps = max(state.version - 1, -1), state.env_steps
         self.config: RolloutConfig = config
@@ -192,7 +191,10 @@ class RolloutService:
             if state is not None:
                 _check_restored(state, spec.id, self.run.policy, str(restore))
                 if state.normalizer is not None:
-                    self.normalizer.restore(state.normalizer)
+                    try:
+                        self.normalizer.restore(state.normalizer)
+                    except Exception as error:  # dicts, numpy and torch raise many types for what no normalizer has
+                        raise unreadable(str(restore), error) from error
         except BaseException:
             self._resources.close()
             raise

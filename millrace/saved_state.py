@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.atomic_write import write_file
+from learner.run_folder.regular_files import open_regular, reason
 from protocol.arrays import Array
+from protocol.bounds import LARGEST, Past, one_line
 from protocol.errors import CheckpointError, UsageError
 from protocol.specs import PolicySpec
 
@@ -29,11 +33,11 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     """id or name of the environment"""
     policy: str
     """digest of the policy's specification"""
-    version: int
+    version: Annotated[int, Meta(ge=-1, le=LARGEST >> 2)]
     """of the newest weights that were published"""
-    env_steps: int
+    env_steps: Past
     ledger: Ledger
-    incarnations: list[int]
+    incarnations: list[Past]
     """the next incarnation of each lane"""
     normalizer: dict[str, Any] | None = None
     """the state of the normalizer, as plain data; None if it was not used"""
@@ -61,17 +65,26 @@ def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
-    """The state, and the user's arrays by name. Raises `CheckpointError`."""
+    """The state, and the user's arrays by name. Its ledger has no outstanding tickets. Raises `CheckpointError`."""
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged file open
+        descriptor = open_regular(path.resolve())
+        # Opened here, because numpy leaves a damaged file open.
+        with os.fdopen(descriptor, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
                 raise ValueError("it is compressed, and no file of ours is")  # a few bytes could fill the memory
             arrays = {name: file[name] for name in file.files}
         state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
+        state.ledger.end_outstanding()
     except Exception as error:  # zipfile, numpy and msgspec raise a dozen types for damaged files
-        raise CheckpointError(
-            f"{path}: expected a file that RolloutService.save wrote, cannot read it: {error}; restore an older one"
-        ) from error
+        raise unreadable(path, error) from error
     if state.format != FORMAT:
         raise CheckpointError(f"{path}: expected format {FORMAT}, got {state.format}; use the millrace that wrote it")
     return state, arrays
+
+
+def unreadable(path: Path | str, error: Exception) -> CheckpointError:
+    """The error for a file that no `RolloutService.save` wrote."""
+    why = one_line(reason(error))
+    return CheckpointError(
+        f"{path}: expected a file that RolloutService.save wrote, cannot read it: {why}; restore an older one"
+    )

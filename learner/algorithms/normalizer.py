@@ -105,7 +105,7 @@ class Normalizer:
         return kept
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`."""
+        """Go on from a `state`. Raises whatever one leads to that is of another form or not finite."""
         self._observations.load_state_dict(_tensors(state["observations"]))
         if "gamma" in state:
             scaler = RewardScaler(state["gamma"])
@@ -118,6 +118,13 @@ def _plain(moments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tensors(moments: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: value if name == "count" else torch.tensor(np.asarray(value, np.float64)) for name, value in moments.items()
-    }
+    found: dict[str, Any] = {}
+    for name, value in moments.items():
+        if name == "count":
+            found[name] = value
+            continue
+        array = np.asarray(value, np.float64)
+        if not np.isfinite(array).all():
+            raise ValueError(f"normalizer: {name}: expected finite numbers")
+        found[name] = torch.tensor(array)
+    return found

@@ -10,28 +10,30 @@ from __future__ import annotations
 
 import msgspec
 
+from protocol.bounds import Past
+
 
 class Ledger(msgspec.Struct, kw_only=True):
     """Counts since the run began; a checkpoint carries them."""
 
-    issued: int = 0
-    used: int = 0
+    issued: Past = 0
+    used: Past = 0
     """tickets whose rollout an update used"""
-    lost: int = 0
+    lost: Past = 0
     """tickets whose worker was lost, left or sent an unusable rollout (a new ticket was dealt), or whose update failed"""
 
-    transitions_received: int = 0
-    transitions_used: int = 0
-    transitions_duplicate: int = 0
+    transitions_received: Past = 0
+    transitions_used: Past = 0
+    transitions_duplicate: Past = 0
     """transitions of rollouts that arrived a second time"""
-    transitions_late: int = 0
+    transitions_late: Past = 0
     """transitions of rollouts of a session that had ended, or of an update that failed"""
-    transitions_invalid: int = 0
+    transitions_invalid: Past = 0
     """transitions of rollouts that broke the row format or did not fit the run"""
 
-    messages_bad: int = 0
+    messages_bad: Past = 0
     """messages that could not be read"""
-    late_actions: int = 0
+    late_actions: Past = 0
     """actions that came too late for a program that owns its loop, which then took one of its own"""
 
     @property
@@ -46,7 +48,12 @@ class Ledger(msgspec.Struct, kw_only=True):
         return self.transitions_received - self.transitions_used - dropped
 
     def end_outstanding(self) -> None:
-        """The learner that dealt the outstanding tickets is gone. So are they, and the rollouts that were not yet used."""
+        """The learner that dealt the outstanding tickets is gone. So are they, and the rollouts that were not yet used.
+
+        Raises `ValueError` for counts from a file that no run can have.
+        """
+        if min(self.outstanding, self.transitions_waiting) < 0:
+            raise ValueError("ledger: expected as many tickets and transitions as became of them, got fewer")
         self.lost += self.outstanding
         self.transitions_late += self.transitions_waiting
 

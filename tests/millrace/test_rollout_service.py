@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
+import os
 import re
 import threading
 import time
@@ -246,6 +248,49 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
         file.write_bytes(damaged)
         with pytest.raises(CheckpointError, match=r"state\.npz"):
             millrace.RolloutService("CartPole-v1", restore=file, **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"version": 2**53}, "Expected `int` <= "),
+        ({"env_steps": -1}, "Expected `int` >= 0"),
+        ({"incarnations": [2**53] * 4}, "Expected `int` <= "),
+        ({"ledger": {"issued": 2**53}}, "Expected `int` <= "),
+        ({"ledger": {"used": 5}}, "ledger: expected as many tickets and transitions as became of them, got fewer"),
+        ({"normalizer": {}}, "'observations'"),
+        ({"normalizer": {"observations": {"count": 3, "mean": [None] * 4, "squares": [1] * 4}}}, "expected finite numbers"),
+        ({"normalizer": {"observations": {"count": 3, "mean": [0, 0], "squares": [1] * 4}}}, "could not be broadcast"),
+        ({"normalizer": {"observations": {"count": 3, "mean": "x", "squares": 1}}}, "could not convert string to float"),
+    ],
+)
+def test_a_state_that_no_service_can_have_is_one_line(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    """With such numbers no order would reach a worker, and `gather` would wait for a rollout until its timeout."""
+    file = tmp_path / "state.npz"
+    with service() as made:
+        made.save(file)
+    with np.load(file) as saved:
+        state = json.loads(saved["millrace"].tobytes()) | change
+    np.savez(file, millrace=np.frombuffer(json.dumps(state).encode(), np.uint8))
+    with pytest.raises(CheckpointError) as caught, service(restore=file):
+        pass
+    assert str(caught.value).startswith(f"{file}: expected a file that RolloutService.save wrote, cannot read it: ")
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_in_the_place_of_a_saved_state_is_refused_and_a_link_followed(tmp_path: Path) -> None:
+    with service() as made:
+        made.save(tmp_path / "state.npz")
+    (tmp_path / "newest.npz").symlink_to("state.npz")
+    with service(restore=tmp_path / "newest.npz") as made:
+        assert made.version == -1
+    os.mkfifo(tmp_path / "pipe.npz")
+    with (
+        pytest.raises(CheckpointError, match=r"pipe\.npz: .*: expected a file, got a"),
+        service(restore=tmp_path / "pipe.npz"),
+    ):
+        pass
 
 
 def test_calls_from_another_thread_and_after_the_end_are_refused() -> None:
