@@ -16,7 +16,7 @@ from learner.algorithms import Algorithm
 from learner.algorithms.algorithm import Start
 from learner.config.config import Config
 from learner.resume_checks import first_difference, policy_to_start_from
-from learner.rollouts.ledger import Ledger
+from learner.rollouts.ledger import Ledger, Past
 from learner.rollouts.opponent_pool import PoolState
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import AttributesState, EnvAttributes
@@ -24,7 +24,7 @@ from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.results import EvaluatedPolicy, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Floats
-from protocol.bounds import Natural, Past, Real, Seconds, one_line
+from protocol.bounds import Natural, Real, Seconds, one_line
 from protocol.errors import BadMessage, CheckpointError, UsageError
 from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Episode

@@ -13,11 +13,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from learner.rollouts.ledger import Ledger
+from learner.rollouts.ledger import Ledger, Past
 from learner.run_folder.atomic_write import write_file
 from learner.run_folder.regular_files import open_regular, reason
 from protocol.arrays import Array
-from protocol.bounds import LARGEST, Past, one_line
+from protocol.bounds import LARGEST, one_line
 from protocol.errors import CheckpointError, UsageError
 from protocol.specs import PolicySpec
 

@@ -36,8 +36,6 @@ Natural = Annotated[int, Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, Meta(ge=1, le=LARGEST)]
 Whole = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
 Version = Annotated[int, Meta(ge=-1, le=LARGEST)]
-Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
-"""A count from a file, from which a run goes on: what it counts then still fits into messages."""
 Pid = Annotated[int, Meta(ge=0, le=2**31)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Real = Annotated[float, Meta(ge=-1.7976931348623157e308, le=1.7976931348623157e308)]

@@ -8,9 +8,15 @@ Both equations hold at every moment. `outstanding` tickets are with a worker, or
 
 from __future__ import annotations
 
-import msgspec
+from typing import Annotated
 
-from protocol.bounds import Past
+import msgspec
+from msgspec import Meta
+
+from protocol.bounds import LARGEST
+
+Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
+"""A count from a file, from which a run goes on: what it counts then still fits into messages."""
 
 
 class Ledger(msgspec.Struct, kw_only=True):
