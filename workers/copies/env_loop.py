@@ -17,9 +17,10 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
-from protocol.envs.answers import reset_answer, wrong_step
+from protocol.bounds import one_line
+from protocol.envs.answers import STEP, reset_answer, wrong_step
 from protocol.envs.which_copy import FIRST_COPY, EnvCopy
-from protocol.errors import UsageError
+from protocol.errors import UsageError, safe_repr
 from workers.activity import (
     DOING,
     ENV_CALLS,
@@ -39,6 +40,7 @@ CopyInfos = list[tuple[int, dict[str, Any]]]
 Pulse = Callable[[], None]
 """Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
 
+CHECKED_STEPS = 2  # in which an environment shows what it returns as numbers; the first may be a reset
 PULSE_S = 0.05  # a loop over slow copies calls `pulse` this often
 
 
@@ -168,8 +170,22 @@ class EnvLoop:
         numbers[ENV_CALLS] += len(chosen) - counted
         seconds[SINCE_S] = now_s
         numbers[DOING] = WAITING
+        if self.steps < CHECKED_STEPS:
+            self._check_numbers(chosen)
         self.steps += 1
         return infos
+
+    def _check_numbers(self, copies: Iterable[int]) -> None:
+        """Raise `CopyFailed` for a text as a number, and for no reward: numpy would take them for True, 1 or NaN."""
+        for n in copies:
+            for name, value in (
+                ("reward", self.reward[n]),
+                ("terminated", self.terminated[n]),
+                ("truncated", self.truncated[n]),
+            ):
+                if isinstance(value, str | bytes) or (value is None and name == "reward"):
+                    wrong = f"{name}: expected a number, got {one_line(safe_repr(value), 80)}"
+                    raise CopyFailed(n, f"step {self.steps}", f"{wrong}; its step must return ({STEP})")
 
     def close(self) -> None:
         """Close every copy. What a copy raises is ignored."""

@@ -350,6 +350,29 @@ def test_a_reward_that_is_no_number_is_refused(reward: Any, said: str) -> None:
     assert answer(3, np.zeros(1, np.float32), reward).startswith(f"lane 0, {said}")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "got"),
+    [
+        ("reward", None, "None"),  # a step without a reward: numpy would make NaN of it
+        ("reward", "1", "'1'"),
+        ("terminated", "no", "'no'"),  # it would be True
+        ("truncated", b"", "b''"),
+    ],
+)
+def test_what_numpy_would_take_for_a_number_is_refused_in_the_first_step(name: str, value: Any, got: str) -> None:
+    class Slips(Countdown):
+        def step(self, action: Any) -> Any:
+            observation, *numbers, info = super().step(action)
+            numbers[("reward", "terminated", "truncated").index(name)] = value
+            return observation, *numbers, info
+
+    run = run_around(Slips(), T=6)
+    with pytest.raises(EnvironmentFailed) as caught:
+        collect(random_collector(run, loop_over([Slips])), run)
+    expects = "its step must return (observation, reward, terminated, truncated, info)"
+    assert str(caught.value) == f"lane 0, copy 0, step 0: {name}: expected a number, got {got}; {expects}"
+
+
 @pytest.mark.parametrize("copies", [1, 3])
 @pytest.mark.parametrize("reward", [np.array([2.5]), [2.5], np.array([[2.5]], np.float32), np.float64(2.5), np.array(2.5)])
 def test_a_reward_of_one_element_is_a_number(reward: Any, copies: int) -> None:
