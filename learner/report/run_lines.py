@@ -61,8 +61,15 @@ class RunLine(NamedTuple):
         return one_line(self.path.resolve().name, MAX_NAME)
 
     @property
+    def begins(self) -> bool:
+        """Whether it trains, and nobody knows how far it is: its folder has no numbers before the first update."""
+        return self.state == "training" and not (self.updates or self.env_steps)
+
+    @property
     def done(self) -> str:
         """How much of it is done, or why it ended before."""
+        if self.begins:
+            return "before its first update"
         if self.summary is not None and (reason := self.summary.stop_reason) != self.state:
             return "100%" if reason == ALL_STEPS_DONE else one_line(reason, MOST_REASON)
         return f"{math.floor(100 * min(1.0, self.env_steps / self.total_steps)) if self.total_steps > 0 else 0}%"
@@ -138,8 +145,8 @@ def headline(line: RunLine) -> str:
     """One sentence: how the run ended, or that it died, and how to continue it. Of one that trains, how far it is."""
     resume = f"continue it with: {one_line(resume_command(line.path, elsewhere=False))}"
     match line.state:
-        case "training" if not line.env_steps:  # its folder has no numbers yet, but it works
-            return "Training: before its first update."
+        case "training" if line.begins:
+            return f"Training: {line.done}."
         case "training":
             left = "" if line.left_s is None else f", about {duration(line.left_s)} left"
             return f"Training: {line.done} done, {per_second(line.steps_per_s)} env steps per second{left}."

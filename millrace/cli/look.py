@@ -30,9 +30,9 @@ def _cells(line: RunLine) -> dict[str, str]:
         "environment": line.env,
         "algorithm": algorithm_label(line.algo),
         "return": "-" if line.return_mean is None else f"{line.return_mean:,.1f}",
-        "env steps": f"{line.env_steps:,.0f}",
+        "env steps": "-" if line.begins else f"{line.env_steps:,.0f}",
         "done": line.done,
-        "steps/s": per_second(line.steps_per_s),
+        "steps/s": "-" if line.begins else per_second(line.steps_per_s),
         "started": line.started,
     }
 

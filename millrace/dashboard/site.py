@@ -188,13 +188,12 @@ def _run_row(line: RunLine, home: str) -> str:
     about = f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}" if line.env else line.problem
     name = f'<th scope="row"><a href="{home}run/{key}">{escape(about)}</a><small>{escape(line.name)}</small></th>'
     score = "–" if line.return_mean is None else return_text(line.return_mean)
-    begins = line.state == "training" and not line.updates  # its folder has no numbers yet, but it works
     left = "" if line.left_s is None else f"<small>{duration(line.left_s)} left</small>"
     cells = [
         f'<td><b class="state {line.state}">{line.state}</b></td>',
         f'<td class="number">{score}</td>',
-        f'<td class="number">{"<small>before its first update</small>" if begins else escape(line.done) + left}</td>',
-        f'<td class="number late">{"–" if begins else per_second(line.steps_per_s)}</td>',
+        f'<td class="number">{escape(line.done)}{left}</td>',
+        f'<td class="number late">{"–" if line.begins else per_second(line.steps_per_s)}</td>',
         f'<td class="late">{line.started}</td>',
     ]
     return f'<tr id="run-{key}">{choose}{name}{"".join(cells)}</tr>'

@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from learner.run_folder.lease import Listens, Owner, decoded
+from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.run_lock import LOCK_FILE, RunLock
 from millrace.cli.main import main
 from millrace.cli.status import status, whom_to_ask
@@ -124,6 +125,11 @@ def test_runs_are_listed_in_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     columns = ["run", "state", "environment", "algorithm", "return", "env steps", "done", "steps/s", "started"]
     assert re.split(r"  +", head) == columns
     assert row.split()[:7] == [run.name, "dead", "CartPole-v1", "PPO", "101.0", "2,000", "2%"]
+    (run / METRICS_FILE).write_text("")
+    with RunLock(run):
+        assert main(["list", str(tmp_path / "runs")]) == 0
+    row = capsys.readouterr().out.splitlines()[1]
+    assert re.split(r"  +", row)[1:8] == ["training", "CartPole-v1", "PPO", "-", "-", "before its first update", "-"]
     (tmp_path / "empty").mkdir()
     assert main(["list", str(tmp_path / "empty")]) == 0
     assert capsys.readouterr().out == "no run is here\n"
