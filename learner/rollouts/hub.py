@@ -226,9 +226,16 @@ class Hub:
         does.
         """
         evaluation, steps_before = self.coordinator.evaluation, self._worker_steps()
+        wait, steps = LongWait(self._clock()), steps_before  # since env steps were made, and how many there were then
 
-        def env_steps() -> int:
-            return max(0, self._worker_steps() - steps_before)  # it falls if a worker is lost
+        def watch_and_log() -> None:
+            nonlocal wait, steps
+            now, steps_now = self._clock(), self._worker_steps()
+            if steps_now != steps:
+                wait, steps = LongWait(now), steps_now
+            elif wait.due(now):
+                log.warning("no env steps for %.0f s: %s", wait.seconds(now), self._server.what_workers_do())
+            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # they fall if a worker is lost
 
         def done() -> bool | None:
             if not evaluation.done and evaluation.beside:
@@ -240,7 +247,7 @@ class Hub:
             self._wait(
                 done,
                 lambda: self._worker_steps() + evaluation.episodes_played,
-                lambda: watch(evaluation.episodes_played, env_steps()),
+                watch_and_log,
                 "no env step of an evaluation was made",
             )
         finally:

@@ -16,7 +16,7 @@ from learner.rollouts.evaluation_dealer import EvaluationPlan
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.errors import RunError
-from protocol.logs.long_wait import AGAIN_S
+from protocol.logs.long_wait import AGAIN_S, FIRST_S
 from protocol.messages import PROTOCOL_VERSION, Evaluated, Heartbeat, Hello, Weights
 from protocol.rollout import Episode, rollout_bytes
 from protocol.wire.codec import decode_to_worker
@@ -115,6 +115,38 @@ def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCa
     ]
     assert [level for level, _ in said] == ["INFO"] * 2 + ["WARNING"], "after 30, 90 and 150 s"
     assert said[-1][1] == "no env steps for 150 s: worker w0 on host: 0.0 steps/s"
+
+
+@pytest.mark.parametrize("answers", [True, False], ids=["it stands still", "it was lost"])
+def test_a_wait_for_an_evaluation_without_env_steps_names_who_is_waited_for(
+    caplog: pytest.LogCaptureFixture, answers: bool
+) -> None:
+    link, hub, heartbeat = hub_with_a_worker()
+    hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32), deal=False)
+    hub.begin_evaluation(EvaluationPlan.of(1, seed=1, copies=1, max_steps=100))
+    steps_until_s = link.now + 100.0
+    ends_s = steps_until_s + FIRST_S + AGAIN_S / 2
+    poll = link.poll
+
+    def poll_while_it_works(timeout_s: float) -> bool:
+        steps = int(10 * min(link.now, steps_until_s))
+        if answers or link.now < steps_until_s:
+            ticket = next(iter(hub.coordinator.evaluation.held))
+            link.inbox.append((b"w0", msgspec.structs.replace(heartbeat, versions=(0,), tickets=(ticket,), steps=steps)))
+        link.now += timeout_s
+        return poll(timeout_s)
+
+    def watch(played: int, env_steps: int) -> None:
+        if link.now > ends_s:
+            raise KeyboardInterrupt
+
+    link.poll = poll_while_it_works  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        hub.end_evaluation(watch)
+    said = [record.getMessage() for record in caplog.records if record.getMessage().startswith("no env steps")]
+    lost = "waiting for a worker to join at fake (the last one silent for 3 s)"
+    (line,) = said
+    assert line.startswith(f"no env steps for 30 s: {'worker w0 on host: 0.' if answers else lost}")
 
 
 def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
