@@ -50,6 +50,7 @@ from learner.run_folder.run_format import (
     POLICY_JSON,
     RUN_FILE,
     check_format,
+    is_run_folder,
     write_format,
 )
 from learner.run_folder.run_lock import RunLock
@@ -198,7 +199,11 @@ class RunFolder:
         if not path.is_dir():
             raise UsageError(f"run {path}: no such folder")
         if not (path / CONFIG_FILE).is_file():
-            raise UsageError(f"run {path}: expected a run folder, got one without {CONFIG_FILE}")
+            hint = ""
+            with suppress(OSError):
+                if inside := sorted(filter(is_run_folder, path.iterdir())):
+                    hint = f"; it holds runs: name one of them, such as {one_line(str(inside[-1]))}"
+            raise UsageError(f"run {path}: expected a run folder, got one without {CONFIG_FILE}{hint}")
         folder = RunFolder(path)
         folder.started_from = check_format(path).started_from
         return folder

@@ -99,6 +99,9 @@ def test_what_is_no_run_folder_is_said(tmp_path: Path) -> None:
         RunFolder.open(tmp_path / "nowhere")
     with pytest.raises(UsageError, match=r"expected a run folder, got one without config\.toml"):
         RunFolder.open(tmp_path)
+    run = RunFolder.create(config(tmp_path)).path
+    with pytest.raises(UsageError, match=rf"it holds runs: name one of them, such as .*/{run.name}$"):
+        RunFolder.open(tmp_path)
     with pytest.raises(UsageError, match=r"cannot be made: Not a directory; choose another --run-dir"):
         (tmp_path / "file").touch()
         RunFolder.create(config(tmp_path / "file"))
