@@ -26,8 +26,10 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
     match get_origin(field.kind):
         case origin if origin is dict:
             if wrong := [name for name in words[::2] if "=" in name]:
-                apart = wrong[0].replace("=", " ", 1)
-                raise UsageError(f"{field.name}: expected NAME VALUE, got {wrong[0]}; write them apart: {apart}")
+                name, _, right = wrong[0].partition("=")
+                looks_like_a_flag = right.startswith("-") and not right[1:2].isdigit()
+                apart = f"{name} {as_text(right) if looks_like_a_flag else right}"
+                raise UsageError(f"{field.name}: expected NAME VALUE, got {wrong[0]}; write them apart: {one_line(apart)}")
             if len(words) % 2:
                 hint = f"; a text that begins with a dash is written in quotes: {shlex.quote(words[-1])} '\"-x\"'"
                 raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}{hint}")

@@ -97,6 +97,8 @@ def test_words_become_values(words: str, expected: dict[str, Any] | None) -> Non
             "a text that begins with a dash is written in quotes: a '\"-x\"'",
         ),
         ("--table a=1", "table: expected NAME VALUE, got a=1; write them apart: a 1"),
+        ("--table a=-x", "table: expected NAME VALUE, got a=-x; write them apart: a '\"-x\"'"),
+        ("--table a=-3", "table: expected NAME VALUE, got a=-3; write them apart: a -3"),
         ("--table a 1 b=2 c=3", "table: expected NAME VALUE, got b=2; write them apart: b 2"),
         ("--inner \udce9", "inner: expected text in UTF-8, got '\\udce9'"),
         ("--sizes 3 \udce9", "sizes: expected text in UTF-8, got 3 '\\udce9'"),
