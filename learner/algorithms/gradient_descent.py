@@ -152,7 +152,8 @@ class GradientDescent(Algorithm):
 
     def load_other_state(self, state: dict[str, Any]) -> None:
         """Continue from `other_state`."""
-        self.env_steps, self.version = state["env_steps"], state["version"]
+        self.env_steps = int(state["env_steps"])
+        self.version = int(state["version"])
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""

@@ -100,4 +100,4 @@ class PPO(ActorCritic):
     def load_other_state(self, state: dict[str, Any]) -> None:
         """See `GradientDescent`."""
         super().load_other_state(state)
-        self.epochs = state["epochs"]
+        self.epochs = int(state["epochs"])

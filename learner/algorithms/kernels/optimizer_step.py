@@ -88,9 +88,15 @@ def state_of(optimizer: Optimizer) -> dict[str, Any]:
 
 def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
     """`optimizer.load_state_dict` of a copy. Raises ValueError for the state of another kind of optimizer, or network."""
+    (own_group,) = optimizer.param_groups
     optimizer.load_state_dict(copy.deepcopy(state))
     (group,) = optimizer.param_groups
     (flat,) = group["params"]
+    if odd := [name for name, value in own_group.items() if type(group.get(name)) is not type(value)]:
+        expected, got = (type(each.get(odd[0])).__name__ for each in (own_group, group))
+        raise ValueError(f"optimizer: {odd[0]}: expected {expected}, got {got}")
+    if optimizer.state.keys() - {flat}:
+        raise ValueError("optimizer: expected the moments of its own numbers, got those of others")
     if _step_of(optimizer) is not None and (kept := optimizer.state.get(flat)):
         own = _initial_state(optimizer, flat, group)
         if {name: each.shape for name, each in own.items()} != {name: each.shape for name, each in kept.items()}:

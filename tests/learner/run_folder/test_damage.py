@@ -362,6 +362,37 @@ def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(
         assert "\n" not in str(why.value)
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("env_steps",), torch.zeros(3)),
+        (("version",), torch.zeros(2, 2)),
+        (("version",), "x"),
+        (("epochs",), torch.zeros(2)),
+        (("optimizer", "param_groups", 0, "betas"), []),
+        (("optimizer", "param_groups", 0, "eps"), [[]]),
+        (("optimizer", "param_groups", 0), {"params": [0], "lr": 0.1}),
+        (("optimizer", "param_groups", 0, "params"), ["x"]),
+    ],
+)
+def test_a_whole_checkpoint_with_numbers_that_no_algorithm_has_is_one_line(
+    whole: Path, tmp_path: Path, place: tuple[Any, ...], value: Any
+) -> None:
+    """Their checksums are right. It is noticed before the run goes on, and not in its next update."""
+    run = tmp_path / "runs" / whole.name
+    shutil.copytree(whole, run)
+    for path in (run / "checkpoints").iterdir():
+        record = torch.load(path, weights_only=True)
+        inner = record["state"]["algorithm"]
+        for step in place[:-1]:
+            inner = inner[step]
+        inner[place[-1]] = value
+        torch.save(record, path)
+    with pytest.raises(UserFacingError, match="expected the state of this configuration, got another") as why:
+        READERS["resume"](run)
+    assert "\n" not in str(why.value)
+
+
 @pytest.mark.parametrize("dtype", ["BF16", "F8_E5M2", "I64", "C64"])
 def test_numbers_of_a_dtype_that_no_policy_has_are_one_line(whole: Path, tmp_path: Path, dtype: str) -> None:
     """The package safetensors raises KeyError for those that numpy lacks."""
