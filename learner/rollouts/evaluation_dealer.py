@@ -7,7 +7,8 @@ above those of rollouts, and the ledger does not count them.
 
 Rule: a worker that claims to play and never answers must not hold the learner for ever, and nobody can tell it from one that
 is slow. So `share` gives the ticket of one that takes long to a second worker as well. The seeds say what is played, so it
-does not matter who answers first: that answer counts. Who was late gets tickets only if nobody else can play.
+does not matter who answers first: that answer counts. Who was late gets tickets only if nobody else can play, until it
+joins again.
 
 Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
 an answer that could not be used, is dropped, and its ticket is played again from the start.
@@ -129,7 +130,7 @@ class EvaluationDealer:
         self._undealt: list[int] = []  # heap: indices of tickets that no worker has
         self._played: dict[int, Evaluated] = {}  # by index of the ticket
         self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by index of a ticket and worker; by episode
-        self._late: set[bytes] = set()  # the workers in whose place a second one has answered
+        self._late: set[int] = set()  # the sessions of workers in whose place a second one has answered
 
     @property
     def pending(self) -> bool:
@@ -238,7 +239,7 @@ class EvaluationDealer:
                 for message in messages:
                     self._on_rows(index * self._plan.copies + episode, message)
         if member is self.second.get(answer.ticket):
-            self._late.add(self.held[answer.ticket].peer)
+            self._late.add(self.held[answer.ticket].session)
         self._end(answer.ticket)
         self._played[index] = answer
         return ""
@@ -284,7 +285,7 @@ class EvaluationDealer:
         With a limit of copies, the first of them, because a worker keeps its copies.
         """
         found = sorted(members, key=lambda member: not member.hello.evaluates)
-        found = [member for member in found if member.peer not in self._late] or found
+        found = [member for member in found if member.session not in self._late] or found
         if self.most_copies is None:
             return found
         return found[: self._most_workers or max(1, self.most_copies // plan.copies)]

@@ -22,4 +22,4 @@ class Ending:
     worked: bool = False
     """Calls of its environment have returned."""
     last_lines: str | None = None
-    """What it wrote last, if it ended by itself before it had joined a run."""
+    """What it wrote last, if it failed before it had joined a run."""

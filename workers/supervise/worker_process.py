@@ -236,7 +236,8 @@ class WorkerProcess:
             line = self._because + (f", at {where}" if where else "")
         elif page.exit_code is not None:
             line = f"ended with exit code {page.exit_code}{last if page.exit_code else ''}"
-            return Ending(page.exit_code, one_line(line), on_purpose=True, worked=worked)
+            last_lines = _end_of(output) if page.exit_code and page.doing == "starting" else None
+            return Ending(page.exit_code, one_line(line), on_purpose=True, worked=worked, last_lines=last_lines)
         elif code < 0:
             line = f"was killed by {_signal_name(-code)}{meanwhile}"
         elif (hung := where_it_hung(output)) is not None:

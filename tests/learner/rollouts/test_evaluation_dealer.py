@@ -229,6 +229,16 @@ def test_a_worker_that_was_late_plays_only_if_nobody_else_does() -> None:
     assert {peer for peer, order in outs if isinstance(order, Evaluate)} == {A}
 
 
+def test_a_worker_that_was_late_plays_again_when_it_has_joined_again() -> None:
+    learner, _, second = shared()
+    learner.says(B, answer(second))
+    learner.coordinator.evaluation.end()
+    learner.balanced(process_ends(learner.coordinator, "a", "killed"))
+    learner.joins(A, host="a", attempt=2)
+    outs = learner.coordinator.begin_evaluation(plan(1, 2, 3, 4))
+    assert {peer for peer, order in outs if isinstance(order, Evaluate)} == {A, B}
+
+
 @pytest.mark.parametrize("lost", [A, B])
 def test_a_ticket_that_two_play_stays_with_one_when_the_other_is_lost(lost: bytes) -> None:
     learner, first, second = shared()

@@ -124,6 +124,20 @@ def test_what_a_worker_wrote_last_is_told_if_it_ended_before_it_had_joined(
     assert worker.ended() == Ending(3, "ended with exit code 3 while it started (line 100)", last_lines=last_lines)
 
 
+@pytest.mark.parametrize(("code", "last_lines"), [(2, "no such key"), (0, None)])
+def test_one_that_leaves_on_purpose_before_it_has_joined_says_why_if_it_failed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int, last_lines: str | None
+) -> None:
+    script = f"echo no such key; exit {code}"
+    monkeypatch.setattr(worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", script], **how))
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0", tmp_path / "w0.log"))
+    os.pwrite(worker._page.fd, (code + 1).to_bytes(8, sys.byteorder), 8 * activity.LEAVES)
+    worker.wait(WITHIN_S)
+    ending = worker.ended()
+    assert ending is not None
+    assert (ending.code, ending.on_purpose, ending.last_lines) == (code, True, last_lines)
+
+
 def test_a_worker_gets_the_token_that_its_supervisor_gives_it_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(TOKEN_VARIABLE, "of another learner")
     ending = ending_of(f"exit ${{#{TOKEN_VARIABLE}}}", monkeypatch)
