@@ -155,10 +155,10 @@ class Supervisor:
             if worker.running is not None and enforce:
                 worker.running.enforce(now)
             if worker.running is not None and (end := worker.running.ended()) is not None:
-                nonce = worker.running.process_nonce
+                name, nonce = worker.running.name, worker.running.process_nonce  # the learner knows it by this name
                 self._record_end(worker, end, now)
                 reason = end.reason + (GIVEN_UP if worker.failed_starts == MOST_FAILED_STARTS else "")
-                ended.append((WorkerExit(worker.name, nonce, one_line(reason), end.failed, end.of_policy), end))
+                ended.append((WorkerExit(name, nonce, one_line(reason), end.failed, end.of_policy), end))
             if worker.restart_s is not None and now >= worker.restart_s and not self._stopping:
                 self._restart(worker, now)
         return ended

@@ -125,6 +125,14 @@ def test_a_worker_that_cannot_be_started_again_now_is_tried_again(monkeypatch: p
     assert machine.host.count == 2
 
 
+def test_an_end_is_told_by_the_name_that_the_learner_knows() -> None:
+    """`millrace worker --name x` has a worker x, whatever its number here."""
+    named = FakeRunning("x")
+    host = Supervisor(lambda number: named, 1, lambda: 0.0)
+    named.end = Ending(-9, "why", failed=True)
+    assert host.poll() == [WorkerExit("x", NONCE, "why", True)]
+
+
 def test_one_that_ends_again_and_again_before_it_has_joined_is_given_up() -> None:
     machine = Machine()
     for _ in range(MOST_FAILED_STARTS - 1):
