@@ -77,8 +77,11 @@ class FailureCount:
 
     def _allowed_within_hour(self, now: float) -> int:
         copy_hours = self._copies * min(1.0, (now - self._began_s) / HOUR_S)
-        worked_s = sum(before_s for _, before_s in self._within_hour)
-        return int(self._allowed * (1 + copy_hours + worked_s / WORK_S))
+        return int(self._allowed * (1 + copy_hours + self._worked_s() / WORK_S))
+
+    def _worked_s(self) -> float:
+        """How long the workers that failed within the hour had worked, all together."""
+        return sum(before_s for _, before_s in self._within_hour)
 
     def _how_often(self, now: float) -> str:
         failures = len(self._within_hour)
@@ -87,7 +90,7 @@ class FailureCount:
             return ""
         self._told_at = 2 * failures
         seconds = now - self._within_hour[0][0]
-        worked_s = sum(before_s for _, before_s in self._within_hour) / failures
+        worked_s = self._worked_s() / failures
         last = self._allowed_within_hour(now) + 1
         return (
             f"the environment has failed {failures} times in {seconds:.0f} s, after {worked_s:.0f} s of work on average; "

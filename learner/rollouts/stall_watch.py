@@ -65,7 +65,7 @@ class StallWatch:
             self._budgets_due_s = now + CHECK_BUDGETS_EVERY_S
             if over := self._over_budget(now):
                 return Standstill(over, "it holds tickets for longer than they can take")
-        overdue = Overdue() if evaluating and self._is_overdue(now) else None
+        overdue = Overdue() if evaluating and self._takes_too_long(now) else None
         if now - self._progress_s <= self._stall_timeout_s:
             return overdue
         coordinator = self._coordinator
@@ -78,8 +78,8 @@ class StallWatch:
             idle = ()
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
 
-    def _is_overdue(self, now: float) -> bool:
-        """Whether no episode of the evaluation has come for too long. Then it is asked again only after as long a time."""
+    def _takes_too_long(self, now: float) -> bool:
+        """Notes how many episodes of the evaluation have come. True if none has for too long; then the time begins again."""
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:
