@@ -103,7 +103,6 @@ IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `lea
 NAME_OF_A_TYPE = r"_?[A-Z][A-Za-z]*[a-z][A-Za-z]*"
 SAME_IN_EVERY_PACKAGE = {"Pulse"}  # a function that is called again and again in a long computation
 NAME_OF_AN_ENVIRONMENT = "Identity"
-MOST_FILES = 16  # in a folder
 MOST_PARAMETERS = 8  # of a function; self and cls do not count
 MAY_TAKE_MORE = {"millrace/launch/vector.py:make_vec"}  # gymnasium's users expect keyword arguments
 
@@ -357,13 +356,6 @@ def test_a_name_of_a_class_or_a_type_stands_for_one_thing() -> None:
 def test_no_folder_is_a_drawer_for_everything() -> None:
     for source in sources(*PACKAGES, "tests"):
         assert not set(Path(source).parts) & {"utils", "common", "misc", "helpers"}, source
-
-
-def test_no_folder_holds_too_many_files() -> None:
-    found: dict[Path, int] = defaultdict(int)
-    for source in sources(*PACKAGES, "tests"):
-        found[Path(source).parent] += not source.endswith("__init__.py")
-    assert not {str(folder): count for folder, count in found.items() if count > MOST_FILES}
 
 
 def test_one_file_derives_all_random_numbers() -> None:

@@ -1,0 +1,91 @@
+"""The border between the core and the extras: the core imports no extra.
+
+`STILL` lists the places where it does: they may only become fewer. An extra may import the core.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.test_architecture import PACKAGES, module, modules_imported, sources
+
+STILL = {
+    ("learner/algorithms/actor_critic.py", "datasets"),
+    ("learner/algorithms/replay/continuous.py", "datasets"),
+    ("learner/between_updates/audience.py", "datasets"),
+    ("learner/between_updates/between_updates.py", "datasets"),
+    ("learner/between_updates/run_files.py", "datasets"),
+    ("learner/between_updates/run_files.py", "monitoring"),
+    ("learner/run.py", "datasets"),
+    ("learner/run_setup.py", "monitoring"),
+    ("millrace/__init__.py", "datasets"),
+    ("millrace/__init__.py", "monitoring"),
+    ("millrace/algorithms.py", "datasets"),
+    ("millrace/cli/status.py", "monitoring"),
+    ("millrace/launch/learner_inference.py", "monitoring"),
+    ("millrace/launch/training.py", "monitoring"),
+    ("millrace/playing.py", "datasets"),
+    ("millrace/runs.py", "datasets"),
+    ("millrace/runs.py", "monitoring"),
+    ("millrace/terminal.py", "monitoring"),
+    ("workers/collect/collector.py", "envs"),
+}
+FOLDER = "millrace/extras/"
+ELSEWHERE = {  # files of an extra that do not yet stand in its folder
+    "conformance": ("millrace/conformance/", "millrace/cli/conform.py"),
+    "launchers": (
+        "millrace/launch/kubernetes.py",
+        "millrace/launch/slurm.py",
+        "millrace/launch/ray.py",
+        "millrace/launch/ray_worker.py",
+        "millrace/launch/launcher_flags.py",
+        "millrace/cli/launch.py",
+    ),
+    "monitoring": (
+        "learner/report/",
+        "learner/metric_names.py",
+        "learner/prometheus.py",
+        "learner/run_folder/metrics_log.py",
+        "millrace/dashboard/",
+        "millrace/integrations/",
+        "millrace/launch/page_beside.py",
+        "millrace/cli/dashboard.py",
+        "millrace/cli/look.py",
+    ),
+    "datasets": ("learner/recording/", "learner/algorithms/cloning/"),
+    "envs": (
+        "workers/envs/atari.py",
+        "workers/envs/double_pendulum.py",
+        "workers/envs/double_pendulum_screen.py",
+        "workers/envs/lqr.py",
+        "workers/envs/toy.py",
+        "workers/copies/envpool_copies.py",
+    ),
+}
+
+
+def extra_of(source: str) -> str | None:
+    """The extra that a file belongs to; None if it belongs to the core."""
+    if source.startswith(FOLDER):
+        return source.removeprefix(FOLDER).split("/")[0].removesuffix(".py")
+    return next((extra for extra, places in ELSEWHERE.items() if source.startswith(places)), None)
+
+
+@pytest.mark.parametrize("extra", ELSEWHERE)
+def test_the_files_of_an_extra_are_known(extra: str) -> None:
+    """So that a file which has moved is not taken for one of the core."""
+    for place in ELSEWHERE[extra]:
+        assert any(source.startswith(place) for source in sources(*PACKAGES)), place
+
+
+def test_the_core_imports_no_extra() -> None:
+    extras = {module(source): extra for source in sources(*PACKAGES) if (extra := extra_of(source)) is not None}
+    crossings = {
+        (source, extras[owner])
+        for source in sources(*PACKAGES)
+        if extra_of(source) is None
+        for name in modules_imported(source)
+        for owner in (name, name.rpartition(".")[0])
+        if owner in extras
+    }
+    assert crossings == STILL
