@@ -36,23 +36,23 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import bars, write
-from protocol.env_spec import EnvSpec
-from protocol.envs.envpool import envpool_spec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.envs.vectorized import make_native
-from protocol.errors import UsageError
-from protocol.policy.distributions import distribution
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.policy.policy import Policy, make_policy
-from protocol.specs import PolicySpec, RunSpec
-from protocol.wire.weight_dtypes import ActingDtype
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.envpool import envpool_spec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.envs.vectorized import make_native
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.wire.weight_dtypes import ActingDtype
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
 
 PROCESSES = 2
 STEPS = 128  # T
 CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
-PONG = EnvSpec("workers.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
+PONG = EnvSpec("millrace.workers.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
 NARROW = ("ours, 1 lane, bfloat16", "native, 1 lane, bfloat16")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from learner.algorithms.kernels import trained_networks
+from millrace.learner.algorithms.kernels import trained_networks
 
 
 class Contest(NamedTuple):

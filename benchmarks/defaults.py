@@ -29,7 +29,7 @@ from rich.table import Table
 
 from benchmarks.scores import return_text
 from benchmarks.writing import RESULTS
-from learner.run_folder.run_folder import RunFolder, as_folder_name
+from millrace.learner.run_folder.run_folder import RunFolder, as_folder_name
 
 ROOT = Path(__file__).parents[1]
 NOW = "defaults"

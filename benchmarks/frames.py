@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from protocol.arrays import Bytes
+from millrace.protocol.arrays import Bytes
 
 SKIP = 4  # screens in a step
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)

@@ -23,10 +23,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from learner.config.layers import resolve
-from learner.run_folder.progress import Progress
 from millrace.launch.training import train
-from protocol.env_spec import EnvSpec
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.env_spec import EnvSpec
 
 WARM_UP = 2  # updates that are not counted: env copies are opened and torch is imported meanwhile
 MODES = ("workers", "learner")

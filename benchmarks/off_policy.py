@@ -24,8 +24,8 @@ from rich.table import Table
 
 import millrace
 from benchmarks.writing import COLORS, DPI, GREY, RESULTS, write
-from learner.report.curve import Curve, common_grid, read_run_files
-from learner.run_folder.run_folder import RunFolder
+from millrace.learner.report.curve import Curve, common_grid, read_run_files
+from millrace.learner.run_folder.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,21 +20,21 @@ import zmq
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from benchmarks.simulated import canned, run_spec
-from protocol.env_spec import EnvSpec
-from protocol.keys.key_folder import Keyring
-from protocol.keys.keys import ClientList, Key, Token
-from protocol.policy.layout import acting_size
-from protocol.policy.policy import make_policy
-from protocol.rollout import Rollout, rollout_bytes
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from protocol.wire.codec import decode_to_learner, encode
-from protocol.wire.compression import Packing
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.socket_options import MAX_FRAME_BYTES
-from protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
-from protocol.wire.worker_link import WorkerLink
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.keys.keys import ClientList, Key, Token
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import Rollout, rollout_bytes
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
+from millrace.protocol.wire.codec import decode_to_learner, encode
+from millrace.protocol.wire.compression import Packing
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
 
 ATARI = RunSpec(
     EnvSpec("ALE/Pong-v5"),

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from learner.interrupts import stopped_by_signals
-from protocol.errors import UsageError
+from millrace.learner.interrupts import stopped_by_signals
+from millrace.protocol.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
 

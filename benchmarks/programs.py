@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.peers import install
-from learner.config.layers import config_of_run
-from learner.run_folder.metrics_log import read_rows
+from millrace.learner.config.layers import config_of_run
+from millrace.learner.run_folder.metrics_log import read_rows
 
 ROOT = Path(__file__).parents[1]
 COMMON: dict[str, Any] = {"env": "CartPole-v1", "eval_every": 5000, "eval_episodes": 20}

@@ -25,8 +25,8 @@ from rich.table import Table
 
 from benchmarks.programs import Contender, run
 from benchmarks.writing import write
-from protocol.policy.networks import ActorCriticNetwork
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 OURS, OVERLAPPED, THEIRS = "millrace", "millrace, --max-lag 1", "SB3, one process"
 SUBPROC = "SB3, SubprocVecEnv"

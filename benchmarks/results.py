@@ -26,14 +26,14 @@ from benchmarks.scores import (
     returns_table,
     write_scores,
 )
-from learner.config.config import TABLES, Config
-from learner.config.layers import config_of_run, resolve
-from learner.config.presets import added, environment_name
-from learner.policy_player import saved_policy
-from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from learner.run_folder.results import Evaluation
-from learner.run_folder.run_folder import RunFolder, Which
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from millrace.learner.config.config import TABLES, Config
+from millrace.learner.config.layers import config_of_run, resolve
+from millrace.learner.config.presets import added, environment_name
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
+from millrace.learner.run_folder.results import Evaluation
+from millrace.learner.run_folder.run_folder import RunFolder, Which
 
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "results.md"
 PAGE_OF_COMMANDS = Path(__file__).with_name("README.md")

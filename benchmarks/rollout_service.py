@@ -25,7 +25,7 @@ from benchmarks.collect import CARTPOLE, PROCESSES, STEPS, Pair
 from benchmarks.writing import write
 from millrace.algorithms import Algorithm, Batch, PolicySpec
 from millrace.policies import PolicyParameters
-from protocol.arrays import Array, Floats
+from millrace.protocol.arrays import Array, Floats
 
 LANES = 4
 WARM_UP_S = 1.0
@@ -130,7 +130,7 @@ def trainer(max_lag: int, envs: int, seconds: float) -> float:
 
 def _initial() -> dict[str, Array]:
     """The initial parameters of `MLP(64, 64)` for CartPole-v1, by name."""
-    from protocol.envs.spaces import action_spec, observation_leaves
+    from millrace.protocol.envs.spaces import action_spec, observation_leaves
 
     made = CARTPOLE.make()
     spec = millrace.MLP(64, 64).spec(observation_leaves(made.observation_space), action_spec(made.action_space))

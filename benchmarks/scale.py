@@ -29,11 +29,11 @@ from rich.table import Table
 
 from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
 from benchmarks.writing import write
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.rollout import stack_rollouts
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.rollout import stack_rollouts
+from millrace.protocol.wire.learner_link import LearnerLink
 
 WORKERS = (10, 100, 1000)
 PROCESSES = 2

@@ -1,4 +1,4 @@
-"""Workers without environments: real sockets, the real `workers.conversation`, one canned rollout for every ticket.
+"""Workers without environments: real sockets, the real `millrace.workers.conversation`, one canned rollout for every ticket.
 
 Many live in one process, so that a thousand fit on a machine. They answer as fast as they can.
 """
@@ -18,12 +18,12 @@ import numpy as np
 import numpy.typing as npt
 import zmq
 
-from protocol.env_spec import EnvSpec
-from protocol.messages import ToLearner
-from protocol.rollout import Rollout
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from protocol.wire.codec import decode_to_worker, encode
-from workers.conversation.session import Leave, RolloutTask, SendMessage, Session, WorkerEffect, WorkerIdentity
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.messages import ToLearner
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
+from millrace.protocol.wire.codec import decode_to_worker, encode
+from millrace.workers.conversation.session import Leave, RolloutTask, SendMessage, Session, WorkerEffect, WorkerIdentity
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 STEPS, COPIES = 32, 8  # T, N: 9 KB

@@ -17,8 +17,8 @@ import numpy as np
 
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import COLORS, DPI, GREY
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.messages import PROTOCOL_VERSION, Collect, Hello
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Hello
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "tickets.png"
 LANES = 3

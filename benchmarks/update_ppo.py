@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.contest import Contest, passes_in_torch, repeated
-from learner.algorithms.minibatches import Minibatch
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import PPOConfig
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms.minibatches import Minibatch
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 CONFIG = PPOConfig(ent_coef=0.01)

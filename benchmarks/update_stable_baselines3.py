@@ -21,13 +21,13 @@ from stable_baselines3 import TD3 as TheirTD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.contest import Contest, passes_in_torch, repeated
-from learner.algorithms.a2c import A2C
-from learner.algorithms.dqn import DQN
-from learner.algorithms.sac import SAC
-from learner.algorithms.td3 import TD3
-from learner.config.hyperparameters import A2CConfig, DQNConfig, SACConfig, TD3Config
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf
+from millrace.learner.algorithms.a2c import A2C
+from millrace.learner.algorithms.dqn import DQN
+from millrace.learner.algorithms.sac import SAC
+from millrace.learner.algorithms.td3 import TD3
+from millrace.learner.config.hyperparameters import A2CConfig, DQNConfig, SACConfig, TD3Config
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf
 
 OFF_POLICY = {"SAC": (SAC, SACConfig, TheirSAC), "TD3": (TD3, TD3Config, TheirTD3)}
 

@@ -29,13 +29,13 @@ from rich.table import Table
 from benchmarks.packing import ATARI, STACKS, atari, encrypted, packing, rounding
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import write
-from protocol.rollout import Rollout, rollout_bytes
-from protocol.rows.rollout_checks import validate
-from protocol.specs import RunSpec
-from protocol.wire.codec import Buffer, encode
-from protocol.wire.compression import Packing
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.worker_link import WorkerLink
+from millrace.protocol.rollout import Rollout, rollout_bytes
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire.codec import Buffer, encode
+from millrace.protocol.wire.compression import Packing
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.worker_link import WorkerLink
 
 TRANSPORTS = ("ipc", "tcp")
 SHARE, PYTHON_US, OVERHEAD, FRAME = 0.8, 40, 1.02, 1.05  # targets

@@ -22,22 +22,22 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from learner.config.layers import resolve
-from learner.env_spaces import EnvSpaces
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from learner.run_spec import run_spec
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import read_description
-from protocol.policy.layout import buffer_size, parameter_layout, total_size
-from protocol.specs import DescribeSpec
-from protocol.wire.learner_link import LearnerLink
-from workers.described_copy import describing
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from millrace.learner.config.layers import resolve
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.run_spec import run_spec
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import read_description
+from millrace.protocol.policy.layout import buffer_size, parameter_layout, total_size
+from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.workers.described_copy import describing
+from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 CASES = {
     "MLP, CartPole-v1": EnvSpec("CartPole-v1"),
-    "image, 12 x 12 x 3": EnvSpec("workers.envs.toy:Spaces-v0", {"observation": "image"}),
+    "image, 12 x 12 x 3": EnvSpec("millrace.workers.envs.toy:Spaces-v0", {"observation": "image"}),
 }
 
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from learner.run_folder.run_format import versions
+from millrace.learner.run_folder.run_format import versions
 
 RESULTS = Path(__file__).parent / "results"
 DPI = 150

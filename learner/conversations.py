@@ -10,22 +10,31 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 
-from learner.config.rollout_config import RolloutConfig
-from learner.env_spaces import EnvSpaces
-from learner.members.describe import DescribeSettings
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.hub import Hub, HubObserver, HubSettings
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.opponent_pool import OpponentPool
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError
-from protocol.policy.layout import acting_size
-from protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, Vector, facts_of_all_seats, seat_returns
-from protocol.wire.codec import check_can_be_sent
-from protocol.wire.compression import has_zstd
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.members.describe import DescribeSettings
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.rollouts.hub import Hub, HubObserver, HubSettings
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.specs import (
+    SCORE,
+    DescribeSpec,
+    ExtraArray,
+    PolicySpec,
+    RunSpec,
+    Vector,
+    facts_of_all_seats,
+    seat_returns,
+)
+from millrace.protocol.wire.codec import check_can_be_sent
+from millrace.protocol.wire.compression import has_zstd
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
 
 
 def describe_spec(

@@ -7,11 +7,11 @@ from typing import Literal, NamedTuple
 
 from gymnasium import spaces
 
-from protocol.envs.action_masks import has_mask, without_mask
-from protocol.envs.description import DescribedEnv
-from protocol.envs.spaces import action_spec, observation_leaves, with_last
-from protocol.errors import UsageError, did_you_mean
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.envs.action_masks import has_mask, without_mask
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.envs.spaces import action_spec, observation_leaves, with_last
+from millrace.protocol.errors import UsageError, did_you_mean
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class EnvSpaces(NamedTuple):

@@ -9,9 +9,9 @@ import sys
 import threading
 from collections.abc import Callable
 
-from learner.algorithms import ALGORITHMS
+from millrace.learner.algorithms import ALGORITHMS
 
-MODULES = ("torch", "learner.run")
+MODULES = ("torch", "millrace.learner.run")
 POLL_S = 0.05
 THREAD = "imports"
 

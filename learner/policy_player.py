@@ -14,23 +14,23 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from learner.config.rollout_config import RolloutConfig
-from learner.conversations import describe_settings, describe_spec, open_hub
-from learner.members.describe import described_by_workers
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
-from learner.rollouts.hub import Hub
-from learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
-from learner.run_folder.run_folder import RunFolder, StoredPolicy, Which
-from protocol.arrays import Floats
-from protocol.bounds import MAX_FACTS
-from protocol.env_spec import EnvLike, EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError
-from protocol.own_module import refuse_modules_in
-from protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.conversations import describe_settings, describe_spec, open_hub
+from millrace.learner.members.describe import described_by_workers
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
+from millrace.learner.run_folder.run_folder import RunFolder, StoredPolicy, Which
+from millrace.protocol.arrays import Floats
+from millrace.protocol.bounds import MAX_FACTS
+from millrace.protocol.env_spec import EnvLike, EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.errors import UsageError
+from millrace.protocol.own_module import refuse_modules_in
+from millrace.protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
+from millrace.protocol.wire.learner_link import LearnerLink
 
 RIVAL, POLICY = 0, 1
 """The versions of the weights."""

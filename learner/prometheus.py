@@ -29,14 +29,14 @@ from prometheus_client.metrics_core import (
 )
 from prometheus_client.registry import Collector
 
-from learner.config.config import Config
-from learner.rollouts.hub import Hub, HubObserver
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import FactMean
-from learner.run_folder.run_format import versions
-from protocol.address import WILDCARDS, is_local
-from protocol.bounds import MAX_FACTS
-from protocol.errors import UsageError
+from millrace.learner.config.config import Config
+from millrace.learner.rollouts.hub import Hub, HubObserver
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import FactMean
+from millrace.learner.run_folder.run_format import versions
+from millrace.protocol.address import WILDCARDS, is_local
+from millrace.protocol.bounds import MAX_FACTS
+from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
 

@@ -12,16 +12,16 @@ from typing import NamedTuple
 
 import msgspec
 
-from learner.between_updates.stop_rules import BY_THE_POLICY_OF, reason_to_stop
-from learner.config.config import Config
-from learner.config.hyperparameters import DQNConfig
-from learner.config.layers import config_of_run
-from learner.config.resume_rules import Change, OnResume, changes, refusal
-from learner.env_spaces import EnvSpaces
-from learner.run_folder.run_folder import RunFolder, StoredPolicy
-from protocol.bounds import one_line
-from protocol.envs.found_names import moved
-from protocol.errors import UsageError
+from millrace.learner.between_updates.stop_rules import BY_THE_POLICY_OF, reason_to_stop
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import DQNConfig
+from millrace.learner.config.layers import config_of_run
+from millrace.learner.config.resume_rules import Change, OnResume, changes, refusal
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.run_folder.run_folder import RunFolder, StoredPolicy
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.found_names import moved
+from millrace.protocol.errors import UsageError
 
 
 class Resumption(NamedTuple):

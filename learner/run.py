@@ -13,39 +13,39 @@ from dataclasses import dataclass, replace
 import msgspec
 import torch
 
-from learner.algorithms import Algorithm, algorithm_class
-from learner.between_updates.between_updates import BetweenUpdates, open_files
-from learner.between_updates.crowded_cores import CrowdedCores
-from learner.between_updates.run_parts import RunParts
-from learner.between_updates.tally import Tally
-from learner.callbacks.callbacks import Callbacks, Watch
-from learner.config.algorithm_names import FOR_PRIOR
-from learner.config.config import Config
-from learner.config.costs import large_observations, minibatch_rows
-from learner.config.validation import unused_setting
-from learner.conversations import open_hub
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.recording.prior_dataset import PriorDataset
-from learner.recording.training_recorder import TrainingRecorder
-from learner.rollouts.hub import Hub, HubObserver
-from learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
-from learner.run_folder.lease import Closed, Listens
-from learner.run_folder.run_folder import Interrupted, RunFolder
-from learner.run_setup import KnownEnvironment, RunSetup
-from learner.run_spec import run_spec
-from learner.run_state import RunState, restore, start_from
-from learner.torch_setup import threads, torch_device, updates_use_all_cores
-from learner.train import train
-from protocol.address import advertised_address, own_address
-from protocol.bounds import one_line
-from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
-from protocol.keys.key_folder import Keyring
-from protocol.logs.notices import log_notice
-from protocol.machine.waiting_threads import SPIN, VARIABLE
-from protocol.policy.flattened_images import flattened_images
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec, RunSpec
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.between_updates.between_updates import BetweenUpdates, open_files
+from millrace.learner.between_updates.crowded_cores import CrowdedCores
+from millrace.learner.between_updates.run_parts import RunParts
+from millrace.learner.between_updates.tally import Tally
+from millrace.learner.callbacks.callbacks import Callbacks, Watch
+from millrace.learner.config.algorithm_names import FOR_PRIOR
+from millrace.learner.config.config import Config
+from millrace.learner.config.costs import large_observations, minibatch_rows
+from millrace.learner.config.validation import unused_setting
+from millrace.learner.conversations import open_hub
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.recording.prior_dataset import PriorDataset
+from millrace.learner.recording.training_recorder import TrainingRecorder
+from millrace.learner.rollouts.hub import Hub, HubObserver
+from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
+from millrace.learner.run_folder.lease import Closed, Listens
+from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.learner.run_setup import KnownEnvironment, RunSetup
+from millrace.learner.run_spec import run_spec
+from millrace.learner.run_state import RunState, restore, start_from
+from millrace.learner.torch_setup import threads, torch_device, updates_use_all_cores
+from millrace.learner.train import train
+from millrace.protocol.address import advertised_address, own_address
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.machine.waiting_threads import SPIN, VARIABLE
+from millrace.protocol.policy.flattened_images import flattened_images
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

@@ -13,27 +13,27 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from learner.config.config import Config
-from learner.config.costs import endless_evaluations
-from learner.conversations import describe_settings, describe_spec
-from learner.env_spaces import EnvSpaces
-from learner.imports_ahead import ImportsAhead
-from learner.interrupts import Interrupts
-from learner.members.describe import described_by_workers
-from learner.members.describe_coordinator import Accept
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.resume_checks import Resumption, check_spaces
-from learner.rollouts.hub import HubObserver
-from learner.run_folder.json_log import kept_log
-from learner.run_folder.run_folder import Interrupted, RunFolder
-from learner.run_folder.run_lock import RunLock
-from protocol.env_spec import EnvSpec
-from protocol.envs.advice.atari_ids import preprocessed
-from protocol.envs.description import DescribedEnv, agents_in_words
-from protocol.errors import UsageError
-from protocol.logs.notices import log_notice
-from protocol.specs import DescribeSpec
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.config.config import Config
+from millrace.learner.config.costs import endless_evaluations
+from millrace.learner.conversations import describe_settings, describe_spec
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.imports_ahead import ImportsAhead
+from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.describe import described_by_workers
+from millrace.learner.members.describe_coordinator import Accept
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.resume_checks import Resumption, check_spaces
+from millrace.learner.rollouts.hub import HubObserver
+from millrace.learner.run_folder.json_log import kept_log
+from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.learner.run_folder.run_lock import RunLock
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.advice.atari_ids import preprocessed
+from millrace.protocol.envs.description import DescribedEnv, agents_in_words
+from millrace.protocol.errors import UsageError
+from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
@@ -176,6 +176,6 @@ def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:
     """Serves metrics at `config.metrics_bind` while it is entered; without an address it imports no HTTP server."""
     if not config.metrics_bind:
         return nullcontext(lambda hub: None)
-    from learner.prometheus import metrics_server
+    from millrace.learner.prometheus import metrics_server
 
     return metrics_server(config)

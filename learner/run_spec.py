@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import msgspec
 
-from learner.algorithms import algorithm_class
-from learner.config.config import Config
-from learner.conversations import rollout_spec
-from learner.env_spaces import EnvSpaces
-from learner.rollouts.opponent_pool import teams_of
-from protocol.bounds import MAX_FACTS
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError
-from protocol.policy.encoder import describe_encoder
-from protocol.specs import SCORE, PolicySpec, RunSpec
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.config.config import Config
+from millrace.learner.conversations import rollout_spec
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.rollouts.opponent_pool import teams_of
+from millrace.protocol.bounds import MAX_FACTS
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
 
 
 def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:

@@ -12,23 +12,23 @@ from typing import Any
 
 import msgspec
 
-from learner.algorithms import Algorithm
-from learner.algorithms.algorithm import Start
-from learner.config.config import Config
-from learner.resume_checks import first_difference, policy_to_start_from
-from learner.rollouts.ledger import Ledger, Past
-from learner.rollouts.opponent_pool import PoolState
-from learner.run_folder import checkpoint
-from learner.run_folder.env_attributes import AttributesState, EnvAttributes
-from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_folder.results import EvaluatedPolicy, Evaluation
-from learner.run_folder.run_folder import RunFolder
-from protocol.arrays import Floats
-from protocol.bounds import Natural, Real, Seconds, one_line
-from protocol.errors import BadMessage, CheckpointError, UsageError
-from protocol.policy.layout import buffer_layout, named_views
-from protocol.rollout import Episode
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms import Algorithm
+from millrace.learner.algorithms.algorithm import Start
+from millrace.learner.config.config import Config
+from millrace.learner.resume_checks import first_difference, policy_to_start_from
+from millrace.learner.rollouts.ledger import Ledger, Past
+from millrace.learner.rollouts.opponent_pool import PoolState
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.env_attributes import AttributesState, EnvAttributes
+from millrace.learner.run_folder.episode_window import EpisodeWindow
+from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.arrays import Floats
+from millrace.protocol.bounds import Natural, Real, Seconds, one_line
+from millrace.protocol.errors import BadMessage, CheckpointError, UsageError
+from millrace.protocol.policy.layout import buffer_layout, named_views
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import PolicySpec
 
 log = logging.getLogger("millrace.learner")
 

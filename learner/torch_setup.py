@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 from threadpoolctl import threadpool_limits
 
-from learner.config.config import Config
-from protocol.errors import UsageError
-from protocol.machine.cpu_cores import usable_cores
-from protocol.policy.arithmetic import multiply_adds
-from protocol.policy.layout import parameter_layout
-from protocol.specs import PolicySpec
+from millrace.learner.config.config import Config
+from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.cpu_cores import usable_cores
+from millrace.protocol.policy.arithmetic import multiply_adds
+from millrace.protocol.policy.layout import parameter_layout
+from millrace.protocol.specs import PolicySpec
 
 MANY_WEIGHTS = 1 << 18  # 512 x 512
 WORTH_A_THREAD = 1 << 25
@@ -55,7 +55,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
     try:
         with ExitStack() as of_this_thread:
             if uses_torch:
-                from protocol.policy.networks import defaults_of_thread
+                from millrace.protocol.policy.networks import defaults_of_thread
 
                 of_this_thread.enter_context(defaults_of_thread())
             yield

@@ -17,16 +17,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from learner.algorithms import Algorithm
-from learner.algorithms.algorithm import numbers
-from learner.between_updates.between_updates import BetweenUpdates
-from learner.between_updates.crowded_cores import CrowdedCores
-from learner.rollouts.hub import Hub
-from learner.rollouts.lanes import AcceptedRollout
-from learner.run_folder.progress import Row
-from protocol.arrays import Floats
-from protocol.errors import RunError
-from protocol.rollout import stack_rollouts
+from millrace.learner.algorithms import Algorithm
+from millrace.learner.algorithms.algorithm import numbers
+from millrace.learner.between_updates.between_updates import BetweenUpdates
+from millrace.learner.between_updates.crowded_cores import CrowdedCores
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.progress import Row
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import RunError
+from millrace.protocol.rollout import stack_rollouts
 
 ADVICE = "try a lower learning_rate, or normalize_observations"
 

@@ -18,8 +18,8 @@ from millrace.import_conflict import check_imports
 
 check_imports()
 
-import protocol.machine.waiting_threads  # noqa: E402, F401  # before torch, if the program imports millrace first
-from protocol.errors import (  # noqa: E402
+import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # before torch, if the program imports millrace first
+from millrace.protocol.errors import (  # noqa: E402
     CheckpointError,
     EnvironmentFailed,
     MillraceError,
@@ -33,22 +33,22 @@ from protocol.errors import (  # noqa: E402
 )
 
 if TYPE_CHECKING:
-    from learner.algorithms.normalizer import Normalizer
-    from learner.callbacks.callback import Callback
-    from learner.recording.record import RecordedDataset
-    from learner.run_folder.progress import Progress
-    from learner.run_folder.results import Evaluation, Summary
     from millrace.launch.page_beside import Dashboard
     from millrace.launch.vector import make_vec
+    from millrace.learner.algorithms.normalizer import Normalizer
+    from millrace.learner.callbacks.callback import Callback
+    from millrace.learner.recording.record import RecordedDataset
+    from millrace.learner.run_folder.progress import Progress
+    from millrace.learner.run_folder.results import Evaluation, Summary
     from millrace.loaded_policy import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
     from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
+    from millrace.protocol.envs.which_copy import EnvCopy
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
-    from protocol.envs.which_copy import EnvCopy
-    from workers.copy_slots import env_copy
-    from workers.envs.reset_ahead import ResetAhead
+    from millrace.workers.copy_slots import env_copy
+    from millrace.workers.envs.reset_ahead import ResetAhead
 
 __all__ = [
     "CNN",
@@ -95,26 +95,26 @@ __all__ = [
 
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
-    "Callback": "learner.callbacks.callback",
+    "Callback": "millrace.learner.callbacks.callback",
     "Dashboard": "millrace.launch.page_beside",
-    "EnvCopy": "protocol.envs.which_copy",
-    "Evaluation": "learner.run_folder.results",
+    "EnvCopy": "millrace.protocol.envs.which_copy",
+    "Evaluation": "millrace.learner.run_folder.results",
     "LoadedPolicy": "millrace.loaded_policy",
     "MLP": "millrace.policies",
-    "Normalizer": "learner.algorithms.normalizer",
+    "Normalizer": "millrace.learner.algorithms.normalizer",
     "OwnPolicy": "millrace.own_policy",
     "Metrics": "millrace.runs",
     "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
-    "Progress": "learner.run_folder.progress",
-    "RecordedDataset": "learner.recording.record",
+    "Progress": "millrace.learner.run_folder.progress",
+    "RecordedDataset": "millrace.learner.recording.record",
     "Recurrent": "millrace.policies",
-    "ResetAhead": "workers.envs.reset_ahead",
+    "ResetAhead": "millrace.workers.envs.reset_ahead",
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
-    "Summary": "learner.run_folder.results",
-    "env_copy": "workers.copy_slots",
+    "Summary": "millrace.learner.run_folder.results",
+    "env_copy": "millrace.workers.copy_slots",
     "evaluate": "millrace.playing",
     "load": "millrace.loaded_policy",
     "make_vec": "millrace.launch.vector",

@@ -11,7 +11,7 @@ import signal
 import sys
 from typing import NoReturn
 
-from learner.interrupts import SIGNALS, stopped_by_signals
+from millrace.learner.interrupts import SIGNALS, stopped_by_signals
 
 
 def command() -> NoReturn:
@@ -25,8 +25,8 @@ def command() -> NoReturn:
     except KeyboardInterrupt:  # it came during the imports, or while `main` printed another error
         sys.stderr.write("millrace: interrupted\n")
         code = 130
-    if "learner.imports_ahead" in sys.modules:
-        from learner.imports_ahead import exit_if_importing
+    if "millrace.learner.imports_ahead" in sys.modules:
+        from millrace.learner.imports_ahead import exit_if_importing
 
         exit_if_importing(code)
     gc.freeze()  # skips the garbage collection of torch's objects at exit, which is a tenth of a short run

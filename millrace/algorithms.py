@@ -56,26 +56,26 @@ Tools:
 
 from __future__ import annotations
 
-from learner.algorithms.a2c import A2C
-from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.algorithm import Algorithm, Start
-from learner.algorithms.cloning.clones import Clones
-from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.dqn import DQN
-from learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
-from learner.algorithms.impala import IMPALA
-from learner.algorithms.minibatches import LossInput, Observations
-from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
-from learner.algorithms.ppo import PPO
-from learner.algorithms.reinforce import REINFORCE
-from learner.algorithms.replay.continuous import Continuous
-from learner.algorithms.replay.mixed_replay import MixedReplay
-from learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
-from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
-from learner.algorithms.returns import EpisodeEnds, gae, vtrace
-from learner.algorithms.sac import SAC
-from learner.algorithms.td3 import TD3
-from learner.config.hyperparameters import (
+from millrace.learner.algorithms.a2c import A2C
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
+from millrace.learner.algorithms.algorithm import Algorithm, Start
+from millrace.learner.algorithms.cloning.clones import Clones
+from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
+from millrace.learner.algorithms.dqn import DQN
+from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
+from millrace.learner.algorithms.impala import IMPALA
+from millrace.learner.algorithms.minibatches import LossInput, Observations
+from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.reinforce import REINFORCE
+from millrace.learner.algorithms.replay.continuous import Continuous
+from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from millrace.learner.algorithms.returns import EpisodeEnds, gae, vtrace
+from millrace.learner.algorithms.sac import SAC
+from millrace.learner.algorithms.td3 import TD3
+from millrace.learner.config.hyperparameters import (
     A2CConfig,
     ActorCriticConfig,
     AlgorithmConfig,
@@ -88,14 +88,14 @@ from learner.config.hyperparameters import (
     SACConfig,
     TD3Config,
 )
-from learner.config.resume_rules import Adaptable, Fixed, Free
-from protocol.errors import UsageError
-from protocol.policy.features import features, normalize
-from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, trainable
-from protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
-from protocol.random_streams import Purpose, torch_seed
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, trainable
+from millrace.protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
+from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 __all__ = [
     "A2C",

@@ -18,7 +18,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, Union, Unpack, get_args, ge
 
 import numpy as np
 
-from protocol.errors import UsageError, usage_error
+from millrace.protocol.errors import UsageError, usage_error
 
 WORDS: dict[Any, str] = {
     str: "text",

@@ -15,18 +15,18 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from learner.run_folder.run_folder import RunFolder
 from millrace.arguments import checked
-from protocol.arrays import Array, Bools, Floats
-from protocol.envs.spaces import action_converter_of
-from protocol.errors import UsageError, check_at_least
-from protocol.policy.distributions import distribution
-from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
-from protocol.policy.policy import make_policy
-from protocol.policy.recurrent import zero_state
-from protocol.random_streams import Purpose, generator
-from protocol.rows.array_checks import wrong_values
-from protocol.specs import Leaf, PolicySpec
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.errors import UsageError, check_at_least
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rows.array_checks import wrong_values
+from millrace.protocol.specs import Leaf, PolicySpec
 
 Observation: TypeAlias = Any
 """An array, a number, or a dict or tuple of observations: what the environment returns, or a vector environment."""

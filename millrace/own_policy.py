@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from millrace.arguments import plain
-from protocol.env_spec import PickledCallable, Scalar, check_arguments
-from protocol.errors import UsageError, safe_repr
-from protocol.policy.called_policy import LOG_PROB
-from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
-from protocol.wire.codec import DTYPES
+from millrace.protocol.env_spec import PickledCallable, Scalar, check_arguments
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.policy.called_policy import LOG_PROB
+from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
+from millrace.protocol.wire.codec import DTYPES
 
 BATCH_NAMES = frozenset(
     {"obs", "action", "reward", "terminated", "truncated", "valid", "state", "lane", "version", "fresh", "episodes", "mask"}

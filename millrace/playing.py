@@ -11,23 +11,23 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
-from learner.config.rollout_config import RolloutConfig
-from learner.policy_player import SavedPolicy, saved_policy, useful_workers
-from learner.recording.record import RecordedDataset
-from learner.recording.record import record as record_dataset
-from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from learner.run_folder.results import Evaluation
-from learner.run_folder.run_folder import RunFolder, Which
 from millrace.arguments import checked
 from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.policy_player import SavedPolicy, saved_policy, useful_workers
+from millrace.learner.recording.record import RecordedDataset
+from millrace.learner.recording.record import record as record_dataset
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
+from millrace.learner.run_folder.results import Evaluation
+from millrace.learner.run_folder.run_folder import RunFolder, Which
+from millrace.protocol.env_spec import EnvLike
+from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.errors import UsageError, did_you_mean
+from millrace.protocol.flags.fields import fields_of
+from millrace.protocol.flags.values import read_value
 from millrace.terminal import count_line
-from protocol.env_spec import EnvLike
-from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError, did_you_mean
-from protocol.flags.fields import fields_of
-from protocol.flags.values import read_value
 
 NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are handed on apart
 ShowPlayed = Callable[[str], None]
@@ -149,7 +149,7 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     if flags.video:
         if flags.inference == "learner":
             raise UsageError("video: expected inference workers, got learner; only a worker that acts renders its episodes")
-        from learner.recording.video import prepare_rendering, record_videos
+        from millrace.learner.recording.video import prepare_rendering, record_videos
 
         prepare_rendering()
     saved = _saved(flags, given)

@@ -15,11 +15,11 @@ import msgspec
 import numpy as np
 
 from millrace.arguments import checked
-from protocol.arrays import Array, Floats
-from protocol.errors import UsageError, check_at_least
-from protocol.policy.layout import Field, acting_size, buffer_layout, named_views, parameter_layout, total_size
-from protocol.random_streams import Purpose, generator
-from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import UsageError, check_at_least
+from millrace.protocol.policy.layout import Field, acting_size, buffer_layout, named_views, parameter_layout, total_size
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
 
 Activation = Literal["tanh", "relu"]
 Core = Literal["lstm", "gru"]

@@ -25,30 +25,30 @@ from typing import TYPE_CHECKING, Any, Self, Unpack
 import gymnasium
 import numpy as np
 
-from learner.config.other_names import in_place_of
-from learner.config.rollout_config import RolloutConfig
-from learner.config.validation import convert_rollout_settings
-from learner.interrupts import Interrupts
-from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from learner.rollouts.lanes import AcceptedRollout
-from learner.rollouts.ledger import Ledger
-from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_folder.progress import Progress, steps_per_second
-from learner.run_folder.results import Evaluation
 from millrace.arguments import checked
 from millrace.keywords import RolloutKeywords
 from millrace.launch.rollouts import start
+from millrace.learner.config.other_names import in_place_of
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.config.validation import convert_rollout_settings
+from millrace.learner.interrupts import Interrupts
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.run_folder.episode_window import EpisodeWindow
+from millrace.learner.run_folder.progress import Progress, steps_per_second
+from millrace.learner.run_folder.results import Evaluation
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
+from millrace.protocol.arrays import Array, Ints
+from millrace.protocol.env_spec import EnvLike, EnvSpec, remembered_name
+from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
+from millrace.protocol.errors import CheckpointError, UsageError, check_at_least, did_you_mean, first_line, safe_repr
+from millrace.protocol.rollout import Batch, stack_rollouts
+from millrace.protocol.specs import PolicySpec
 from millrace.saved_state import ServiceState, digest, read, unreadable, write
-from protocol.arrays import Array, Ints
-from protocol.env_spec import EnvLike, EnvSpec, remembered_name
-from protocol.envs.wrappers import WrapperLike, wrapper_names
-from protocol.errors import CheckpointError, UsageError, check_at_least, did_you_mean, first_line, safe_repr
-from protocol.rollout import Batch, stack_rollouts
-from protocol.specs import PolicySpec
 
 if TYPE_CHECKING:
-    from learner.algorithms.normalizer import Normalizer
+    from millrace.learner.algorithms.normalizer import Normalizer
 
 PULSE_S = 0.005  # how often messages are answered while the user computes
 EVALUATION_COPIES = 4  # episodes that a worker plays side by side
@@ -258,7 +258,7 @@ class RolloutService:
         (4,)
         """
         if self._normalizer is None:
-            from learner.algorithms.normalizer import Normalizer
+            from millrace.learner.algorithms.normalizer import Normalizer
 
             self._normalizer = Normalizer(self.run.policy)
         return self._normalizer

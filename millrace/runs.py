@@ -14,27 +14,27 @@ from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import numpy as np
 
-from learner.callbacks.callbacks import Callbacks
-from learner.config.config import Config
-from learner.config.layers import config_of_run, resolve
-from learner.recording.record import RecordedDataset
-from learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
-from learner.run_folder.newest_run import AUTO, newest_run
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.results import Evaluation, Summary
-from learner.run_folder.run_folder import RunFolder
-from learner.run_folder.run_format import read_config
 from millrace.arguments import checked
 from millrace.keywords import TrainKeywords
+from millrace.learner.callbacks.callbacks import Callbacks
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import config_of_run, resolve
+from millrace.learner.recording.record import RecordedDataset
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
+from millrace.learner.run_folder.newest_run import AUTO, newest_run
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from millrace.learner.run_folder.results import Evaluation, Summary
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_folder.run_format import read_config
 from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvLike, EnvSpec, remembered_name
+from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
+from millrace.protocol.errors import UsageError, UserFacingError
 from millrace.terminal import progress_view
-from protocol.arrays import Array
-from protocol.env_spec import EnvLike, EnvSpec, remembered_name
-from protocol.envs.wrappers import WrapperLike, wrapper_names
-from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
-    from learner.report.picture import Picture
+    from millrace.learner.report.picture import Picture
 
 NOT_FINISHED = "not finished"
 
@@ -184,7 +184,7 @@ class Run(os.PathLike[str]):
         >>> picture.save("curve.svg").name
         'curve.svg'
         """
-        from learner.report.picture import draw
+        from millrace.learner.report.picture import draw
 
         picture = draw([self.path])
         if out is not None:

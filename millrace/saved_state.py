@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from learner.rollouts.ledger import Ledger, Past
-from learner.run_folder.atomic_write import write_file
-from learner.run_folder.regular_files import open_regular, reason
-from protocol.arrays import Array
-from protocol.bounds import LARGEST, one_line
-from protocol.errors import CheckpointError, UsageError
-from protocol.specs import PolicySpec
+from millrace.learner.rollouts.ledger import Ledger, Past
+from millrace.learner.run_folder.atomic_write import write_file
+from millrace.learner.run_folder.regular_files import open_regular, reason
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import LARGEST, one_line
+from millrace.protocol.errors import CheckpointError, UsageError
+from millrace.protocol.specs import PolicySpec
 
 OURS = "millrace"  # name of our entry, JSON as bytes; the user's arrays have other names
 OF_NUMPY = ("file", "allow_pickle")  # arguments of numpy.savez, which an array cannot have as its name

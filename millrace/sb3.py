@@ -19,14 +19,14 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
-from learner.vector_env.env import ZmqVectorEnv
 from millrace.arguments import checked
-from protocol.arrays import Array
-from protocol.env_spec import EnvLike, EnvSpec, Scalar
-from protocol.envs.description import class_name
-from protocol.envs.seats import SeatedEnv
-from protocol.envs.spaces import make_flatten, make_unflatten
-from protocol.errors import UsageError
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
+from millrace.protocol.envs.description import class_name
+from millrace.protocol.envs.seats import SeatedEnv
+from millrace.protocol.envs.spaces import make_flatten, make_unflatten
+from millrace.protocol.errors import UsageError
 
 Indices = int | Iterable[int] | None
 

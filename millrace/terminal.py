@@ -1,7 +1,7 @@
 """Shows the progress of a run: as a live block on a terminal, as one display in a notebook, as lines elsewhere, or as JSON.
 
 Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. Warnings of the log are
-shown above the block. No text is read as markup or controls the terminal. `learner.standard_streams` sees to it that a
+shown above the block. No text is read as markup or controls the terminal. `millrace.learner.standard_streams` sees to it that a
 stream which is full or closed does not end the run.
 """
 
@@ -23,15 +23,15 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from learner.report.sentences import bottleneck, ending, lag_in_words, per_second, went_wrong
-from learner.rollouts.opponent_pool import ELO_KEY
-from learner.run_folder.json_log import JsonLines, progress_line
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import ALL_STEPS_DONE
+from millrace.learner.report.sentences import bottleneck, ending, lag_in_words, per_second, went_wrong
+from millrace.learner.rollouts.opponent_pool import ELO_KEY
+from millrace.learner.run_folder.json_log import JsonLines, progress_line
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import ALL_STEPS_DONE
+from millrace.protocol.bounds import escaped, one_line
+from millrace.protocol.logs.notices import is_notice
+from millrace.protocol.specs import SCORE
 from millrace.sparkline import ASCII, BLOCKS, Sparkline
-from protocol.bounds import escaped, one_line
-from protocol.logs.notices import is_notice
-from protocol.specs import SCORE
 
 REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from protocol.errors import MillraceError
+from millrace.protocol.errors import MillraceError
 
 __all__ = ["AlgorithmMistakes", "check_algorithm"]
 
@@ -44,7 +44,7 @@ def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) ->
 
     Raises `AlgorithmMistakes`, which is an AssertionError, with one line for each mistake.
     """
-    from learner.algorithm_check.mistakes import mistakes
+    from millrace.learner.algorithm_check.mistakes import mistakes
 
     if found := list(mistakes(algorithm, settings, learns=learns)):
         raise AlgorithmMistakes(algorithm.__name__, found)

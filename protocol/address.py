@@ -9,8 +9,8 @@ from __future__ import annotations
 import ipaddress
 import socket
 
-from protocol.bounds import MAX_NAME, one_line
-from protocol.errors import UsageError
+from millrace.protocol.bounds import MAX_NAME, one_line
+from millrace.protocol.errors import UsageError
 
 WILDCARDS = {"*", "0.0.0.0", "[::]", "[::ffff:0.0.0.0]"}
 

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from protocol.bounds import MAX_WORKERS, Line, Name, Natural, Seconds
-from protocol.message_base import Message
+from millrace.protocol.bounds import MAX_WORKERS, Line, Name, Natural, Seconds
+from millrace.protocol.message_base import Message
 
 Doing = Literal[
     "starting", "waiting", "describing", "making", "preparing", "resetting", "stepping", "acting", "evaluating", "closing"

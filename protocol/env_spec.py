@@ -23,11 +23,17 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
-from protocol.bounds import one_line
-from protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of
-from protocol.envs.make_env import made_by_callable, made_by_id, made_without_checker, names_a_function, why_not_made
-from protocol.envs.seats import has_seats, seated
-from protocol.envs.unknown_ids import (
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of
+from millrace.protocol.envs.make_env import (
+    made_by_callable,
+    made_by_id,
+    made_without_checker,
+    names_a_function,
+    why_not_made,
+)
+from millrace.protocol.envs.seats import has_seats, seated
+from millrace.protocol.envs.unknown_ids import (
     find,
     ids_of_gymnasium,
     is_registered,
@@ -35,13 +41,13 @@ from protocol.envs.unknown_ids import (
     registered_by_plugins,
     registers,
 )
-from protocol.envs.which_copy import filled
-from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
-from protocol.errors import UsageError, first_line, safe_repr
+from millrace.protocol.envs.which_copy import filled
+from millrace.protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
+from millrace.protocol.errors import UsageError, first_line, safe_repr
 
 # By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
 # gymnasium imports the module.
-REGISTERING_MODULES = {"millrace": "workers.envs", "ALE": "ale_py"}
+REGISTERING_MODULES = {"millrace": "millrace.workers.envs", "ALE": "ale_py"}
 MAX_CALLABLE_BYTES = 1 << 26
 Scalar = bool | int | float | str
 EnvLike = str | GymnasiumSpec | Callable[..., object]
@@ -245,7 +251,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return env
 
     def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
-        """Make `copies` copies in the environment's own vectorized form; `protocol.envs.vectorized` checks it."""
+        """Make `copies` copies in the environment's own vectorized form; `millrace.protocol.envs.vectorized` checks it."""
         own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, self.kwargs_of_copy()
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 

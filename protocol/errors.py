@@ -31,7 +31,7 @@ from functools import wraps
 from itertools import dropwhile
 from typing import ParamSpec
 
-from protocol.bounds import MAX_TEXT, escaped, one_line
+from millrace.protocol.bounds import MAX_TEXT, escaped, one_line
 
 WordedFrom = ParamSpec("WordedFrom")
 
@@ -124,7 +124,7 @@ class UsageError(UserFacingError):
     >>> import millrace
     >>> millrace.train("CartPole-v1", learning_rat=1e-3)
     Traceback (most recent call last):
-    protocol.errors.UsageError: keyword argument: unknown setting learning_rat; did you mean learning_rate?
+    millrace.protocol.errors.UsageError: keyword argument: unknown setting learning_rat; did you mean learning_rate?
     """
 
     exit_code = 2
@@ -161,7 +161,7 @@ class RunError(UserFacingError):
     >>> import millrace
     >>> millrace.Run(run).plot("no-such-folder/curve.png")
     Traceback (most recent call last):
-    protocol.errors.RunError: no-such-folder/curve.png not written: No such file or directory
+    millrace.protocol.errors.RunError: no-such-folder/curve.png not written: No such file or directory
     """
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protocol.errors import UsageError
+from millrace.protocol.errors import UsageError
 
 
 def expanded(path: str | Path, what: str) -> Path:

@@ -14,11 +14,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from protocol.bounds import one_line
-from protocol.envs.advice.files_as_modules import module_of_file
-from protocol.envs.advice.missing_modules import what_to_install
-from protocol.envs.found_names import attribute
-from protocol.errors import UsageError, did_you_mean, first_line
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.advice.files_as_modules import module_of_file
+from millrace.protocol.envs.advice.missing_modules import what_to_install
+from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.errors import UsageError, did_you_mean, first_line
 
 
 def is_name(text: str) -> bool:

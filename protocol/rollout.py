@@ -8,7 +8,7 @@ Hence, for every copy:
 
 If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay buffer) masks with `valid`.
 
-With several agents, a column is one seat of a copy (`protocol.envs.seats`), and more rows are not valid: those of a seat
+With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and more rows are not valid: those of a seat
 that waits for others, or is not there. A seat's row is the one in which its outcome comes: until then `obs` shows the
 observation in which the seat acted, and `action` and `log_prob` what it did, and the row after it shows what it saw next.
 So the sentence above holds for every valid row, and one rule is added: *a row that is not valid passes through*. What is
@@ -31,9 +31,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from protocol.arrays import Array, Bools, Floats
-from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds, Whole
-from protocol.specs import RunSpec
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds, Whole
+from millrace.protocol.specs import RunSpec
 
 
 class Episode(msgspec.Struct, frozen=True, array_like=True):

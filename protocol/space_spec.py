@@ -13,9 +13,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from protocol.arrays import Array
-from protocol.bounds import Count, Line, Name, Natural, Text, Whole
-from protocol.errors import BadMessage
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import Count, Line, Name, Natural, Text, Whole
+from millrace.protocol.errors import BadMessage
 
 MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in a frame of its own
 MAX_DEPTH = 8
@@ -99,7 +99,7 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     observation: SpaceSpec
     action: SpaceSpec
     metadata: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: `Env.metadata` as far as it is plain data"""
+    """[bytes] uint8, `millrace.protocol.wire.plain_values`: `Env.metadata` as far as it is plain data"""
     spec: Text
     """gymnasium's `EnvSpec` as JSON; empty if the environment has none, or one that JSON cannot hold"""
     longest_episode: Natural

@@ -6,11 +6,11 @@ from typing import Literal
 
 import msgspec
 
-from protocol.alive import CallTimeouts
-from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
-from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
-from protocol.space_spec import Shape
-from protocol.wire.weight_dtypes import ActingDtype
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.bounds import MAX_FACTS, MAX_NAME, one_line
+from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
+from millrace.protocol.space_spec import Shape
+from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # those of more than float32's 24 bits
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
@@ -288,7 +288,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def row_axes(self) -> tuple[str, str | tuple[str, ...]]:
-        """The axes of the rows of a rollout, as errors name them (`protocol.rows.array_checks`)."""
+        """The axes of the rows of a rollout, as errors name them (`millrace.protocol.rows.array_checks`)."""
         return "step", self.seats or "copy"
 
     @property
@@ -328,7 +328,7 @@ def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:
 
 
 SEAT_LEAVES = (Leaf("acts", "box", (), "bool"), Leaf("complete", "box", (), "bool"), Leaf("outside", "box", (), "float64"))
-"""Arrays beside those of the observation, of a vector environment with seats; see `protocol.envs.seats.SeatStep`"""
+"""Arrays beside those of the observation, of a vector environment with seats; see `millrace.protocol.envs.seats.SeatStep`"""
 
 
 class StepSpec(msgspec.Struct, frozen=True, tag=True):

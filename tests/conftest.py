@@ -32,10 +32,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from millrace.workers import copy_slots, slots
+from millrace.workers.slots import FILE_VARIABLE
+from millrace.workers.supervise import worker_process
 from tests.system.stage import preloaded
-from workers import copy_slots, slots
-from workers.slots import FILE_VARIABLE
-from workers.supervise import worker_process
 
 worker_process.popen = preloaded.start_worker  # type: ignore[assignment]
 

@@ -28,8 +28,8 @@ import h5py
 import torch
 from safetensors.numpy import load_file
 
-from learner.algorithm_check.same_bits import first_difference
-from learner.run_folder.metrics_log import METRICS_FILE, read_rows
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 
 ROOT = Path(__file__).parents[1]
 COMMON = "--preset none --seed 3 --lanes 4 --envs 8 --device cpu --torch-threads 1 --worker-timeout-s 60 --run-dir runs"
@@ -41,14 +41,14 @@ RECORDED = "same/training-v0"
 RUNS: dict[str, tuple[str, ...]] = {
     "ppo": (f"train CartPole-v1 --algo ppo {ON_POLICY}",),
     "a2c": (f"train Pendulum-v1 --algo a2c {NORMALIZED} {ON_POLICY}",),
-    "reinforce": (f"train workers.envs.toy:Identity-v0 --algo reinforce {ON_POLICY}",),
+    "reinforce": (f"train millrace.workers.envs.toy:Identity-v0 --algo reinforce {ON_POLICY}",),
     "impala": (f"train CartPole-v1 --algo impala {ON_POLICY}",),
     "dqn": (f"train CartPole-v1 --algo dqn {REPLAY}",),
     "sac": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 {REPLAY}",),
     "td3": (f"train Pendulum-v1 --algo td3 --updates-per-step 0.5 {NORMALIZED} {REPLAY}",),
-    "lstm": (f"train workers.envs.toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
+    "lstm": (f"train millrace.workers.envs.toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
     "images": (
-        f"train workers.envs.toy:Spaces-v0 --env-kwargs observation nested action multibinary --algo ppo {ON_POLICY}",
+        f"train millrace.workers.envs.toy:Spaces-v0 --env-kwargs observation nested action multibinary --algo ppo {ON_POLICY}",
     ),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),

@@ -87,18 +87,18 @@ SLOW_TO_IMPORT = {"torch", "PIL", "resvg_py", "tensorboard"}
 OPTIONAL = {  # packages of an extra or of notebooks
     *("IPython", "ale_py", "envpool", "h5py", "minari", "moviepy", "ray", "stable_baselines3", "zstandard"),
 }
-IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `learner.rollouts.hub` on one machine
+IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `millrace.learner.rollouts.hub` on one machine
     "cloudpickle": "5 ms, for callables only",
     "importlib.metadata": "the version, which few ask for",
-    "learner.imports_ahead": "only if it was imported before",
-    "learner.prometheus": "26 ms, for --metrics-bind only",
-    "learner.recording.video": "27 ms, for --video only",
-    "learner.report.picture": "for plots only",
+    "millrace.learner.imports_ahead": "only if it was imported before",
+    "millrace.learner.prometheus": "26 ms, for --metrics-bind only",
+    "millrace.learner.recording.video": "27 ms, for --video only",
+    "millrace.learner.report.picture": "for plots only",
     "millrace.cli.main": "a signal waits until it is imported",
     "millrace.launch.learner_inference": "it is for --inference learner only",
     "millrace.launch.training": "120 ms, after the flags are known to be right",
     "millrace.playing": "160 ms, after the flags are known to be right",
-    "workers.program": "98 ms, after the flags are known to be right",
+    "millrace.workers.program": "98 ms, after the flags are known to be right",
 }
 NAME_OF_A_TYPE = r"_?[A-Z][A-Za-z]*[a-z][A-Za-z]*"
 SAME_IN_EVERY_PACKAGE = {"Pulse"}  # a function that is called again and again in a long computation
@@ -330,7 +330,7 @@ def test_only_the_command_line_prints() -> None:
 
 
 def test_command_lines_are_made_in_one_way() -> None:
-    """By `protocol.flags`, of a record."""
+    """By `millrace.protocol.flags`, of a record."""
     for source in sources(*PACKAGES):
         assert not imported(source) & {"argparse", "click", "getopt", "optparse", "tyro"}, source
 
@@ -404,9 +404,12 @@ def test_every_public_name_of_millrace_is_documented() -> None:
 @pytest.mark.parametrize(
     ("names", "heavy"),
     [
-        ("workers.__main__", {"numpy", "gymnasium", "torch"}),
-        ("learner.algorithms, learner.config.command_line, learner.policy_player", SLOW_TO_IMPORT),
-        ("learner.report.picture, millrace.cli.main", SLOW_TO_IMPORT),
+        ("millrace.workers.__main__", {"numpy", "gymnasium", "torch"}),
+        (
+            "millrace.learner.algorithms, millrace.learner.config.command_line, millrace.learner.policy_player",
+            SLOW_TO_IMPORT,
+        ),
+        ("millrace.learner.report.picture, millrace.cli.main", SLOW_TO_IMPORT),
     ],
 )
 def test_what_must_start_quickly_imports_nothing_that_is_slow_to_import(names: str, heavy: set[str]) -> None:

@@ -11,11 +11,11 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.cli.commands import COMMANDS, GROUPS
 from millrace.cli.keys import SUBCOMMANDS
 from millrace.cli.launch import LAUNCHERS
 from millrace.cli.main import main
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 
 HEAD = """# Commands
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from prometheus_client.metrics_core import Metric
 
 from benchmarks.markdown_tables import table
-from learner.config.config import Config
-from learner.metric_names import METRICS, label
-from learner.prometheus import MetricsCollector, MetricsSnapshot
-from learner.rollouts.ledger import Ledger
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import FactMean
+from millrace.learner.config.config import Config
+from millrace.learner.metric_names import METRICS, label
+from millrace.learner.prometheus import MetricsCollector, MetricsSnapshot
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import FactMean
 from website.tables import anchored
 
 HEAD = """# Metrics

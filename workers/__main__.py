@@ -13,18 +13,18 @@ import os
 import signal
 import sys
 
-from protocol.address import check_worker_name
-from protocol.bounds import MAX_NAME, one_line
-from protocol.errors import UsageError, UserFacingError
-from protocol.flags.parse import parse_flags
-from protocol.keys.key_folder import read_token
-from protocol.keys.keys import Token
-from workers.conversation.connection_rules import checked_token
-from workers.flags import WorkerFlags
-from workers.shared_weights import SUPPORTED, SharedWeights
-from workers.supervise.learner_notice import AliveSender
-from workers.supervise.supervisor import Supervisor, core_flags
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from millrace.protocol.address import check_worker_name
+from millrace.protocol.bounds import MAX_NAME, one_line
+from millrace.protocol.errors import UsageError, UserFacingError
+from millrace.protocol.flags.parse import parse_flags
+from millrace.protocol.keys.key_folder import read_token
+from millrace.protocol.keys.keys import Token
+from millrace.workers.conversation.connection_rules import checked_token
+from millrace.workers.flags import WorkerFlags
+from millrace.workers.shared_weights import SUPPORTED, SharedWeights
+from millrace.workers.supervise.learner_notice import AliveSender
+from millrace.workers.supervise.supervisor import Supervisor, core_flags
+from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 log = logging.getLogger("millrace.worker")
 
@@ -41,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         _check(flags)
         token = checked_token(flags.address, read_token(flags.token), insecure=flags.insecure)
         if flags.parent:
-            from workers.program import work
+            from millrace.workers.program import work
 
             return work(flags, token, signals)
         return _supervise(flags, token, signals)

@@ -2,7 +2,7 @@
 
 Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes. A call of the
 user's code is named on the worker's page (`workers/activity.py`), so that it has a timeout; policies of ours are not slowed.
-In a masked run, the last array of an observation is the mask of the allowed actions (`protocol.policy.masks`).
+In a masked run, the last array of an observation is the mask of the allowed actions (`millrace.protocol.policy.masks`).
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from protocol.arrays import Array, Floats
-from protocol.errors import PolicyFailed, first_line
-from protocol.policy.called_policy import Acted, CalledPolicy
-from protocol.policy.distributions import distribution
-from protocol.policy.masks import forbid, masked_distribution
-from protocol.policy.policy import Policy
-from protocol.specs import RunSpec
-from workers.activity import ACTING, activity
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import PolicyFailed, first_line
+from millrace.protocol.policy.called_policy import Acted, CalledPolicy
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.masks import forbid, masked_distribution
+from millrace.protocol.policy.policy import Policy
+from millrace.protocol.specs import RunSpec
+from millrace.workers.activity import ACTING, activity
 
 
 class ActedRows(NamedTuple):

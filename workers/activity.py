@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import NamedTuple, get_args
 
-from protocol.alive import OF_POLICY, CallTimeouts, Doing
+from millrace.protocol.alive import OF_POLICY, CallTimeouts, Doing
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000

@@ -13,10 +13,10 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, TypeVar
 
-from protocol.envs.which_copy import EnvCopy, being_made
-from protocol.errors import UsageError
-from workers.activity import CLOSING, activity
-from workers.slots import slots
+from millrace.protocol.envs.which_copy import EnvCopy, being_made
+from millrace.protocol.errors import UsageError
+from millrace.workers.activity import CLOSING, activity
+from millrace.workers.slots import slots
 
 _slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
 Made = TypeVar("Made")

@@ -12,18 +12,18 @@ from contextlib import contextmanager
 
 import gymnasium
 
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import describe_env
-from protocol.envs.envpool import envpool_spec
-from protocol.envs.seats import SeatedEnv
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.envs.vectorized import make_native, vector_alternative
-from protocol.envs.which_copy import FIRST_COPY
-from protocol.errors import EnvironmentFailed, UsageError, first_line
-from protocol.space_spec import EnvDescription
-from protocol.specs import DescribeSpec
-from workers.activity import DESCRIBING, activity
-from workers.copy_slots import close_copy, make_copy
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import describe_env
+from millrace.protocol.envs.envpool import envpool_spec
+from millrace.protocol.envs.seats import SeatedEnv
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.envs.vectorized import make_native, vector_alternative
+from millrace.protocol.envs.which_copy import FIRST_COPY
+from millrace.protocol.errors import EnvironmentFailed, UsageError, first_line
+from millrace.protocol.space_spec import EnvDescription
+from millrace.protocol.specs import DescribeSpec
+from millrace.workers.activity import DESCRIBING, activity
+from millrace.workers.copy_slots import close_copy, make_copy
 
 
 @contextmanager

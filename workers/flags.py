@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from protocol.flags.fields import Flag, NotNegative
+from millrace.protocol.flags.fields import Flag, NotNegative
 
 SecondsFlag = Annotated[NotNegative, Flag("S")]
 HIDDEN = Flag(hidden=True)

@@ -14,17 +14,17 @@ from weakref import WeakValueDictionary
 import msgspec
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.envs.spaces import action_converter_of
-from protocol.messages import Weights
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.policy import Policy, make_policy
-from protocol.policy.recurrent import zero_state
-from protocol.rollout import Episode
-from protocol.specs import OwnPolicySpec, RunSpec
-from protocol.wire.weight_dtypes import to_float32
-from workers.acting import acting_of
-from workers.activity import PREPARING, activity
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.messages import Weights
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import OwnPolicySpec, RunSpec
+from millrace.protocol.wire.weight_dtypes import to_float32
+from millrace.workers.acting import acting_of
+from millrace.workers.activity import PREPARING, activity
 
 
 class Opponent:

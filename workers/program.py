@@ -17,23 +17,23 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from protocol.env_spec import AllowedCode
-from protocol.errors import UserFacingError
-from protocol.keys.keys import Token
-from protocol.wire.shared_memory import InheritedDescriptors
-from protocol.wire.worker_link import WorkerLink
-from workers.activity import Activity, ActivityReader, activity, share_activity
-from workers.conversation.connection_rules import wait_limits_s
-from workers.conversation.session import NO_LEARNER, Session
-from workers.exit_codes import EXIT_NO_LEARNER
-from workers.flags import WorkerFlags
-from workers.security import allowed_code
-from workers.shared_weights import SharedWeightsReader
-from workers.slots import share_slots
-from workers.supervise.process_group import kill, live_members
-from workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
-from workers.watchdog import Watchdog
-from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
+from millrace.protocol.env_spec import AllowedCode
+from millrace.protocol.errors import UserFacingError
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.wire.shared_memory import InheritedDescriptors
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers.activity import Activity, ActivityReader, activity, share_activity
+from millrace.workers.conversation.connection_rules import wait_limits_s
+from millrace.workers.conversation.session import NO_LEARNER, Session
+from millrace.workers.exit_codes import EXIT_NO_LEARNER
+from millrace.workers.flags import WorkerFlags
+from millrace.workers.security import allowed_code
+from millrace.workers.shared_weights import SharedWeightsReader
+from millrace.workers.slots import share_slots
+from millrace.workers.supervise.process_group import kill, live_members
+from millrace.workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
+from millrace.workers.watchdog import Watchdog
+from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
 LOOK_FOR_PARENT_S, LEAVE_WITHIN_S = 0.5, 2.0  # after the supervisor's death

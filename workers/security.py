@@ -7,9 +7,9 @@ environments that are registered here.
 
 from __future__ import annotations
 
-from protocol.address import is_local
-from protocol.env_spec import AllowedCode
-from protocol.keys.keys import Token
+from millrace.protocol.address import is_local
+from millrace.protocol.env_spec import AllowedCode
+from millrace.protocol.keys.keys import Token
 
 
 def allowed_code(address: str, token: Token | None) -> AllowedCode:

@@ -15,8 +15,8 @@ import os
 import struct
 from collections.abc import Collection, Iterator, Sequence
 
-from protocol.alive import SHARED_VERSIONS
-from protocol.wire.wake_up import WakePipe
+from millrace.protocol.alive import SHARED_VERSIONS
+from millrace.protocol.wire.wake_up import WakePipe
 
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 PLACE_BYTES = 1 << 33  # more than any message has; only what was written takes memory

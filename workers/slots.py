@@ -27,8 +27,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from protocol.alive import NO_SLOT
-from protocol.errors import UsageError
+from millrace.protocol.alive import NO_SLOT
+from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.worker")
 

@@ -20,21 +20,21 @@ from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from protocol.bounds import Stages
-from protocol.env_spec import AllowedCode
-from protocol.errors import BadMessage, EnvironmentFailed, PolicyFailed, UsageError, UserFacingError, first_line
-from protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, Weights
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.policy import make_policy
-from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from protocol.wire.codec import decode_to_worker, encode
-from protocol.wire.shared_memory import InheritedDescriptors
-from protocol.wire.weight_dtypes import to_float32
-from protocol.wire.worker_link import WorkerLink
-from workers.activity import PREPARING, WAITING, activity
-from workers.collect.collector import Collector
-from workers.conversation.heartbeat_thread import HeartbeatThread
-from workers.conversation.session import (
+from millrace.protocol.bounds import Stages
+from millrace.protocol.env_spec import AllowedCode
+from millrace.protocol.errors import BadMessage, EnvironmentFailed, PolicyFailed, UsageError, UserFacingError, first_line
+from millrace.protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, Weights
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.wire.codec import decode_to_worker, encode
+from millrace.protocol.wire.shared_memory import InheritedDescriptors
+from millrace.protocol.wire.weight_dtypes import to_float32
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers.activity import PREPARING, WAITING, activity
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.heartbeat_thread import HeartbeatThread
+from millrace.workers.conversation.session import (
     CloseLanes,
     EvaluationTask,
     Leave,
@@ -48,13 +48,13 @@ from workers.conversation.session import (
     WorkerEffect,
     WorkerIdentity,
 )
-from workers.conversation.worker_states import WorkerState
-from workers.described_copy import describing
-from workers.evaluate.evaluator import Evaluator
-from workers.exit_codes import EXIT_UNSUITABLE
-from workers.shared_weights import SharedWeightsReader
-from workers.slots import NoSlot, slots
-from workers.vector_env.stepper import Stepper
+from millrace.workers.conversation.worker_states import WorkerState
+from millrace.workers.described_copy import describing
+from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.exit_codes import EXIT_UNSUITABLE
+from millrace.workers.shared_weights import SharedWeightsReader
+from millrace.workers.slots import NoSlot, slots
+from millrace.workers.vector_env.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 

@@ -9,15 +9,15 @@ from typing import Any
 
 import zmq
 
-from protocol.alive import WorkerActivity
-from protocol.bounds import one_line
-from protocol.env_spec import AllowedCode
-from protocol.wire.worker_link import WorkerLink
-from workers.activity import Activity, ActivityReader, share_activity
-from workers.conversation.connection_rules import LEARNER_STARTED_IT_S, wait_limits_s
-from workers.conversation.session import Leave, Session
-from workers.supervise.ending import Ending
-from workers.worker import MakeActors, Worker, WorkerOptions, identity, make_local_actors
+from millrace.protocol.alive import WorkerActivity
+from millrace.protocol.bounds import one_line
+from millrace.protocol.env_spec import AllowedCode
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers.activity import Activity, ActivityReader, share_activity
+from millrace.workers.conversation.connection_rules import LEARNER_STARTED_IT_S, wait_limits_s
+from millrace.workers.conversation.session import Leave, Session
+from millrace.workers.supervise.ending import Ending
+from millrace.workers.worker import MakeActors, Worker, WorkerOptions, identity, make_local_actors
 
 
 class WorkerThread:

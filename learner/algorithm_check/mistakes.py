@@ -1,4 +1,4 @@
-"""What is wrong with an algorithm: each rule of `learner.algorithms.Algorithm` is one function here, which yields mistakes.
+"""What is wrong with an algorithm: each rule of `millrace.learner.algorithms.Algorithm` is one function here, which yields mistakes.
 
 A mistake is one line. Every rule gets objects of its own, made with the same seed, and copies of the same batches. So one
 broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
@@ -20,8 +20,8 @@ import msgspec
 import numpy as np
 import torch
 
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithm_check.toy_batches import (
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithm_check.toy_batches import (
     ACTIONS,
     CHOICES,
     OBSERVATION,
@@ -32,17 +32,17 @@ from learner.algorithm_check.toy_batches import (
     with_rewards,
     with_waiting_seats,
 )
-from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.actor_critic import ActorCritic
-from learner.algorithms.algorithm import wrong_weights
-from learner.config.algorithm_names import name_of, settings_record
-from learner.config.hyperparameters import AlgorithmConfig
-from learner.torch_setup import one_thread
-from protocol.bounds import one_line
-from protocol.errors import UsageError, first_line
-from protocol.policy.encoder import describe_encoder
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.algorithm import wrong_weights
+from millrace.learner.config.algorithm_names import name_of, settings_record
+from millrace.learner.config.hyperparameters import AlgorithmConfig
+from millrace.learner.torch_setup import one_thread
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import UsageError, first_line
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 
 MOST_STEPS = 64  # of a rollout here
 MOST_WARM_UP = 24  # updates before the first gradient step: an algorithm may fill a replay buffer first
@@ -237,7 +237,7 @@ def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> 
         if not math.isclose(got := found.get(name, math.nan), number, rel_tol=0.02, abs_tol=0.02):
             yield (
                 f"update: rows of a seat that waits change the metric {name} from {number:.4g} to {got:.4g}; take the "
-                "functions of learner.algorithms.returns, with EpisodeEnds.of(batch)"
+                "functions of millrace.learner.algorithms.returns, with EpisodeEnds.of(batch)"
             )
             return
 

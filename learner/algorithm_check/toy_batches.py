@@ -1,6 +1,6 @@
 """Batches for the check of an algorithm, made in this process: noise with ends of both kinds, and the identity environment.
 
-Both keep the row format (`protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use. Pure:
+Both keep the row format (`millrace.protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use. Pure:
 weights and a generator in, a batch out.
 """
 
@@ -11,11 +11,11 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from protocol.arrays import Array, Bools, Floats
-from protocol.policy.distributions import distribution
-from protocol.policy.policy import make_policy
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CHOICES = 4
 OBSERVATION = (Leaf("", "box", (CHOICES,), "float32"),)

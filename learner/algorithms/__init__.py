@@ -1,7 +1,7 @@
 """The learning algorithms. No sockets, no files.
 
-Each algorithm is one class in one file. Its settings are one record in `learner.config.hyperparameters`. `ALGORITHMS` and
-`HYPERPARAMETERS` in `learner.config` list them by name. Importing this module does not import torch; calling
+Each algorithm is one class in one file. Its settings are one record in `millrace.learner.config.hyperparameters`. `ALGORITHMS` and
+`HYPERPARAMETERS` in `millrace.learner.config` list them by name. Importing this module does not import torch; calling
 `algorithm_class` does.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
-import protocol.machine.waiting_threads  # noqa: F401  # before torch: whoever imports an algorithm imports this file first
-from learner.algorithms.algorithm import Algorithm
-from learner.config.algorithm_names import ALGORITHMS, is_own, own_class
+import millrace.protocol.machine.waiting_threads  # noqa: F401  # before torch: whoever imports an algorithm imports this file first
+from millrace.learner.algorithms.algorithm import Algorithm
+from millrace.learner.config.algorithm_names import ALGORITHMS, is_own, own_class
 
 __all__ = ["ALGORITHMS", "Algorithm", "algorithm_class"]
 

@@ -1,12 +1,12 @@
-"""A2C (Mnih et al. 2016, synchronous). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock.
+"""A2C (Mnih et al. 2016, synchronous). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock.
 
 An update is one gradient step on all valid rows of a batch. The batch must have been collected under the newest weights.
 """
 
 from __future__ import annotations
 
-from learner.algorithms.actor_critic import ActorCritic
-from learner.config.hyperparameters import A2CConfig
+from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.config.hyperparameters import A2CConfig
 
 
 class A2C(ActorCritic):

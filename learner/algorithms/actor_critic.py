@@ -16,23 +16,23 @@ import torch
 from msgspec.structs import replace
 from torch import Tensor
 
-from learner.algorithms import losses
-from learner.algorithms.algorithm import Algorithm
-from learner.algorithms.cloning.clones import Clones
-from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
-from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
-from learner.algorithms.kernels.trained_networks import actor_critic_network
-from learner.algorithms.minibatches import LossInput, Minibatch, Observations, flat_tensor
-from learner.algorithms.returns import EpisodeEnds, gae
-from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
-from protocol.arrays import Array, Bools, Floats
-from protocol.errors import RunError, UsageError
-from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
-from protocol.policy.torch_distributions import policy_log_prob
-from protocol.random_streams import Purpose, torch_seed
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms import losses
+from millrace.learner.algorithms.algorithm import Algorithm
+from millrace.learner.algorithms.cloning.clones import Clones
+from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
+from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
+from millrace.learner.algorithms.kernels.trained_networks import actor_critic_network
+from millrace.learner.algorithms.minibatches import LossInput, Minibatch, Observations, flat_tensor
+from millrace.learner.algorithms.returns import EpisodeEnds, gae
+from millrace.learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.errors import RunError, UsageError
+from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from millrace.protocol.policy.torch_distributions import policy_log_prob
+from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Pulse = Callable[[], None]
 
@@ -239,7 +239,7 @@ class ActorCritic(Clones):
     # ---------------------------------------------------------------- weights and checkpoints
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `millrace.protocol.policy.layout` lays them out."""
         return self.net.flat[: self.net.acting_size].cpu().numpy().copy(), self.normalizer.published(self.statistics).copy()
 
     def other_state(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The base of every algorithm: what the training loop of `learner.train` calls, and checks of what it returns.
+"""The base of every algorithm: what the training loop of `millrace.learner.train` calls, and checks of what it returns.
 
 A user's own algorithm may return anything. What cannot be used is said in one line that names the class. No torch is needed
 for this file.
@@ -13,12 +13,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from learner.config.hyperparameters import AlgorithmConfig
-from protocol.arrays import Floats
-from protocol.errors import UsageError, safe_repr
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.config.hyperparameters import AlgorithmConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Start(NamedTuple):

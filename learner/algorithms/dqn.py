@@ -1,4 +1,4 @@
-"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants. Settings: `learner.config.hyperparameters`.
+"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants. Settings: `millrace.learner.config.hyperparameters`.
 
 An update adds a batch to the replay buffer and makes a fixed number of gradient steps, so how often a transition is used is
 a setting and does not depend on speed. ε falls with the number of env steps used and is published with the weights.
@@ -14,18 +14,18 @@ import torch
 from msgspec.structs import replace
 from torch import Tensor
 
-from learner.algorithms import losses
-from learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
-from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
-from learner.algorithms.kernels.trained_networks import q_network
-from learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
-from learner.config.hyperparameters import DQNConfig
-from protocol.arrays import Floats
-from protocol.errors import UsageError
-from protocol.policy.masks import FORBIDDEN
-from protocol.policy.networks import QNetwork
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms import losses
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
+from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
+from millrace.learner.algorithms.kernels.trained_networks import q_network
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
+from millrace.learner.config.hyperparameters import DQNConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.masks import FORBIDDEN
+from millrace.protocol.policy.networks import QNetwork
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 LOSSES = {"huber": losses.huber_loss, "squared": losses.squared_loss}
 

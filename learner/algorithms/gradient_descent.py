@@ -16,14 +16,14 @@ from msgspec.structs import replace
 from torch import Tensor
 from torch.optim import Optimizer
 
-from learner.algorithms.algorithm import Algorithm, Start
-from learner.algorithms.kernels.optimizer_step import load_state, state_of
-from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
-from protocol.arrays import Array, Floats
-from protocol.errors import RunError, UsageError
-from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.algorithm import Algorithm, Start
+from millrace.learner.algorithms.kernels.optimizer_step import load_state, state_of
+from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import RunError, UsageError
+from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 
 UpdateMetrics = dict[str, float]
 

@@ -1,4 +1,4 @@
-"""IMPALA's learner (Espeholt et al. 2018). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock.
+"""IMPALA's learner (Espeholt et al. 2018). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock.
 
 A batch may have been collected under older weights (`max_lag` above 0). V-trace weights each row by the probability ratio of
 its action under the newest policy and the policy that acted. It is computed in time order, before rows are shuffled.
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
-from learner.algorithms.minibatches import Observations, log_probs
-from learner.algorithms.returns import EpisodeEnds, vtrace
-from learner.config.hyperparameters import IMPALAConfig
-from protocol.arrays import Floats
-from protocol.rollout import Batch
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
+from millrace.learner.algorithms.minibatches import Observations, log_probs
+from millrace.learner.algorithms.returns import EpisodeEnds, vtrace
+from millrace.learner.config.hyperparameters import IMPALAConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.rollout import Batch
 
 
 class IMPALA(ActorCritic):

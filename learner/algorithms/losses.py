@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from protocol.arrays import Floats
+from millrace.protocol.arrays import Floats
 
 
 def standardized(advantage: Tensor) -> Tensor:

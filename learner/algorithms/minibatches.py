@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from protocol.arrays import Array, Bools, Floats
-from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
-from protocol.rollout import Batch
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from millrace.protocol.rollout import Batch
 
 Index = Tensor | slice
 

@@ -19,12 +19,12 @@ import numpy.typing as npt
 import torch
 from msgspec.structs import replace
 
-from learner.algorithms.returns import EpisodeEnds, discounted_return
-from protocol.arrays import Array, Doubles, Floats
-from protocol.policy.features import CLIP, feature_size, features, leaf_of_features, normalize
-from protocol.policy.layout import buffer_size
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.returns import EpisodeEnds, discounted_return
+from millrace.protocol.arrays import Array, Doubles, Floats
+from millrace.protocol.policy.features import CLIP, feature_size, features, leaf_of_features, normalize
+from millrace.protocol.policy.layout import buffer_size
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 
 TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
 FAR = 100.0  # standard deviations

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import torch
 
-from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
-from protocol.arrays import Array, Floats
-from protocol.errors import UsageError
-from protocol.policy.features import feature_size, features, normalize
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.features import feature_size, features, normalize
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 
 
 class Normalizer:

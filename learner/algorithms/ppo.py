@@ -1,4 +1,4 @@
-"""PPO (Schulman et al. 2017). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock; seeded.
+"""PPO (Schulman et al. 2017). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock; seeded.
 
 An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows. With
 a recurrent core a minibatch is whole columns of the batch, and may have more. The update is `ActorCritic.update`; here are
@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from learner.algorithms import losses
-from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.gradient_descent import UpdateMetrics, scheduled
-from learner.algorithms.minibatches import LossInput
-from learner.config.hyperparameters import PPOConfig
-from protocol.errors import UsageError
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms import losses
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics, scheduled
+from millrace.learner.algorithms.minibatches import LossInput
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 
 
 class PPO(ActorCritic):

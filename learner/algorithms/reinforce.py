@@ -1,4 +1,4 @@
-"""REINFORCE (Williams 1992). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock.
+"""REINFORCE (Williams 1992). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock.
 
 An update is one gradient step on the rows whose episode ends within the rollout, because the rewards that follow them are
 all known. Other rows are dropped and counted. The return of a truncated episode continues with the baseline's value of its
@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
-from learner.algorithms.minibatches import Observations
-from learner.algorithms.returns import EpisodeEnds, complete, gae
-from learner.config.hyperparameters import REINFORCEConfig
-from protocol.arrays import Floats
-from protocol.rollout import Batch
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
+from millrace.learner.algorithms.minibatches import Observations
+from millrace.learner.algorithms.returns import EpisodeEnds, complete, gae
+from millrace.learner.config.hyperparameters import REINFORCEConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.rollout import Batch
 
 
 class REINFORCE(ActorCritic):

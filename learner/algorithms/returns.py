@@ -1,6 +1,6 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
-Every function follows the row format (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
+Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
 which is the true final observation of a truncated episode. No function adds rewards or values across the end of an episode.
 A row that is not valid gives zero and does not affect other rows, whatever it contains: what is carried passes through it.
 """
@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from protocol.arrays import Bools, Doubles, Floats
-from protocol.rollout import Batch
+from millrace.protocol.arrays import Bools, Doubles, Floats
+from millrace.protocol.rollout import Batch
 
 
 class EpisodeEnds(NamedTuple):

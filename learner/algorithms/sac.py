@@ -11,14 +11,14 @@ import math
 import torch
 from torch import Tensor
 
-from learner.algorithms.algorithm import Start
-from learner.algorithms.gradient_descent import UpdateMetrics
-from learner.algorithms.kernels.optimizer_step import make_optimizer
-from learner.algorithms.replay.continuous import Continuous
-from learner.algorithms.replay.off_policy import CriticLoss, Transitions
-from learner.config.hyperparameters import SACConfig
-from protocol.policy.networks import trainable
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms.algorithm import Start
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics
+from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer
+from millrace.learner.algorithms.replay.continuous import Continuous
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.config.hyperparameters import SACConfig
+from millrace.protocol.policy.networks import trainable
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class SAC(Continuous):

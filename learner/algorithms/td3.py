@@ -9,11 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from learner.algorithms.gradient_descent import UpdateMetrics
-from learner.algorithms.replay.continuous import Continuous
-from learner.algorithms.replay.off_policy import CriticLoss, Transitions
-from learner.config.hyperparameters import TD3Config
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics
+from millrace.learner.algorithms.replay.continuous import Continuous
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.config.hyperparameters import TD3Config
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class TD3(Continuous):

@@ -13,17 +13,17 @@ from typing import Any
 
 import msgspec
 
-from learner.between_updates.run_files import RunFiles
-from learner.between_updates.run_parts import RunParts
-from learner.callbacks.callbacks import Callbacks
-from learner.recording.training_recorder import TrainingRecorder
-from learner.rollouts.hub import HubSnapshot
-from learner.rollouts.lanes import AcceptedRollout
-from learner.run_folder.progress import Progress, Row, named, steps_per_second
-from learner.run_folder.requests import Requests
-from protocol.arrays import Array
-from protocol.errors import RunError
-from protocol.logs.notices import log_notice
+from millrace.learner.between_updates.run_files import RunFiles
+from millrace.learner.between_updates.run_parts import RunParts
+from millrace.learner.callbacks.callbacks import Callbacks
+from millrace.learner.recording.training_recorder import TrainingRecorder
+from millrace.learner.rollouts.hub import HubSnapshot
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.progress import Progress, Row, named, steps_per_second
+from millrace.learner.run_folder.requests import Requests
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import RunError
+from millrace.protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from learner.between_updates.audience import Audience
-from learner.between_updates.evaluations import Evaluations
-from learner.between_updates.run_files import RunFiles
-from learner.between_updates.run_parts import RunParts
-from learner.between_updates.tally import Tally
-from learner.callbacks.callbacks import Callbacks
-from learner.recording.training_recorder import TrainingRecorder
-from learner.run_folder.env_attributes import EnvAttributes
-from learner.run_folder.requests import Requests
+from millrace.learner.between_updates.audience import Audience
+from millrace.learner.between_updates.evaluations import Evaluations
+from millrace.learner.between_updates.run_files import RunFiles
+from millrace.learner.between_updates.run_parts import RunParts
+from millrace.learner.between_updates.tally import Tally
+from millrace.learner.callbacks.callbacks import Callbacks
+from millrace.learner.recording.training_recorder import TrainingRecorder
+from millrace.learner.run_folder.env_attributes import EnvAttributes
+from millrace.learner.run_folder.requests import Requests
 
 
 class BetweenUpdates(NamedTuple):

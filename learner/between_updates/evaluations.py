@@ -15,14 +15,14 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 
-from learner.between_updates.run_parts import RunParts
-from learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
-from learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from learner.run_folder.progress import Row
-from learner.run_folder.results import ALL_STEPS_DONE, EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
-from protocol.arrays import Array, Floats
-from protocol.logs.notices import log_notice
-from protocol.random_streams import Purpose
+from millrace.learner.between_updates.run_parts import RunParts
+from millrace.learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
+from millrace.learner.run_folder.progress import Row
+from millrace.learner.run_folder.results import ALL_STEPS_DONE, EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.random_streams import Purpose
 
 log = logging.getLogger("millrace.learner")
 

@@ -14,22 +14,22 @@ from collections.abc import Callable
 
 import msgspec
 
-from learner.algorithms.algorithm import check_weights
-from learner.between_updates.evaluations import Evaluations
-from learner.between_updates.run_parts import RunParts
-from learner.recording.image_sample import image_samples
-from learner.run_folder import checkpoint
-from learner.run_folder.env_attributes import EnvAttributes
-from learner.run_folder.last_line import resume_command
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress, Row, steps_per_second
-from learner.run_folder.results import Summary
-from learner.run_folder.run_format import versions
-from protocol.arrays import Floats
-from protocol.bounds import one_line
-from protocol.envs.found_names import found_by_others
-from protocol.errors import RunError, first_line
-from protocol.rollout import Batch
+from millrace.learner.algorithms.algorithm import check_weights
+from millrace.learner.between_updates.evaluations import Evaluations
+from millrace.learner.between_updates.run_parts import RunParts
+from millrace.learner.recording.image_sample import image_samples
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.env_attributes import EnvAttributes
+from millrace.learner.run_folder.last_line import resume_command
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.progress import Progress, Row, steps_per_second
+from millrace.learner.run_folder.results import Summary
+from millrace.learner.run_folder.run_format import versions
+from millrace.protocol.arrays import Floats
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.found_names import found_by_others
+from millrace.protocol.errors import RunError, first_line
+from millrace.protocol.rollout import Batch
 
 log = logging.getLogger("millrace.learner")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from learner.algorithms import Algorithm
-from learner.between_updates.tally import Tally
-from learner.config.config import Config
-from learner.rollouts.hub import Hub
-from learner.run_folder.run_folder import RunFolder
-from protocol.specs import RunSpec
+from millrace.learner.algorithms import Algorithm
+from millrace.learner.between_updates.tally import Tally
+from millrace.learner.config.config import Config
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.specs import RunSpec
 
 
 class RunParts(NamedTuple):

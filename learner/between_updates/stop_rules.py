@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from learner.config.config import Config
-from learner.run_folder.results import ALL_STEPS_DONE
+from millrace.learner.config.config import Config
+from millrace.learner.run_folder.results import ALL_STEPS_DONE
 
 BY_THE_POLICY_OF = " by the policy of "  # follows the reason if training went on while the policy was evaluated
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from learner.between_updates.stop_rules import reason_to_stop
-from learner.config.config import Config
-from learner.rollouts.hub import HubSnapshot
-from learner.rollouts.opponent_pool import OpponentPool
-from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_state import RunState
-from protocol.rollout import Batch, Episode
-from protocol.specs import RunSpec
+from millrace.learner.between_updates.stop_rules import reason_to_stop
+from millrace.learner.config.config import Config
+from millrace.learner.rollouts.hub import HubSnapshot
+from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.run_folder.episode_window import EpisodeWindow
+from millrace.learner.run_state import RunState
+from millrace.protocol.rollout import Batch, Episode
+from millrace.protocol.specs import RunSpec
 
 
 class Tally:

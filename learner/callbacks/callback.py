@@ -6,7 +6,7 @@ may already collect the next rollouts meanwhile.
 
 from __future__ import annotations
 
-from learner.run_folder.progress import Progress
+from millrace.learner.run_folder.progress import Progress
 
 
 class Callback:

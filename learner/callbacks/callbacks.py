@@ -11,12 +11,12 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
-from learner.callbacks.callback import Callback
-from learner.callbacks.named import named_callback
-from learner.run_folder.progress import Progress
-from protocol.bounds import one_line
-from protocol.envs.found_names import attribute
-from protocol.errors import UsageError, did_you_mean, first_line, safe_repr
+from millrace.learner.callbacks.callback import Callback
+from millrace.learner.callbacks.named import named_callback
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.errors import UsageError, did_you_mean, first_line, safe_repr
 
 log = logging.getLogger("millrace.learner")
 

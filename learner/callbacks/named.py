@@ -5,7 +5,7 @@ Rule: whatever is wrong with the name is one line that quotes it. What the user'
 
 from __future__ import annotations
 
-from protocol.own_module import own_callable, own_code_failed
+from millrace.protocol.own_module import own_callable, own_code_failed
 
 
 def named_callback(name: str) -> object:

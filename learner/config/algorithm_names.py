@@ -15,29 +15,29 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
-from learner.config.resume_rules import declared
-from protocol.bounds import one_line
-from protocol.envs.found_names import attribute, importable, last_part
-from protocol.errors import UsageError, did_you_mean, first_line, safe_repr
-from protocol.own_module import import_own, is_name
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
+from millrace.learner.config.resume_rules import declared
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.found_names import attribute, importable, last_part
+from millrace.protocol.errors import UsageError, did_you_mean, first_line, safe_repr
+from millrace.protocol.own_module import import_own, is_name
 
 ALGORITHMS = {
-    "ppo": "learner.algorithms.ppo:PPO",
-    "a2c": "learner.algorithms.a2c:A2C",
-    "dqn": "learner.algorithms.dqn:DQN",
-    "impala": "learner.algorithms.impala:IMPALA",
-    "reinforce": "learner.algorithms.reinforce:REINFORCE",
-    "sac": "learner.algorithms.sac:SAC",
-    "td3": "learner.algorithms.td3:TD3",
+    "ppo": "millrace.learner.algorithms.ppo:PPO",
+    "a2c": "millrace.learner.algorithms.a2c:A2C",
+    "dqn": "millrace.learner.algorithms.dqn:DQN",
+    "impala": "millrace.learner.algorithms.impala:IMPALA",
+    "reinforce": "millrace.learner.algorithms.reinforce:REINFORCE",
+    "sac": "millrace.learner.algorithms.sac:SAC",
+    "td3": "millrace.learner.algorithms.td3:TD3",
 }
 """`module:Class` of each algorithm of ours, imported when it is used"""
 
 NEEDED = (
     "__init__", "policy_spec", "update", "weights", "is_finite", "state_dict", "load_state_dict", "remember", "roll_back",
 )  # fmt: skip
-"""The methods of an algorithm, as `learner.algorithms.Algorithm` describes them"""
+"""The methods of an algorithm, as `millrace.learner.algorithms.Algorithm` describes them"""
 
 FOR_PRIOR = ("add_prior", "learn_from_prior")
 """The methods that an algorithm needs besides, in a run with prior data"""

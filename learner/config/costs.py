@@ -9,11 +9,11 @@ import math
 
 from gymnasium.wrappers import TimeLimit
 
-from learner.config.config import Config
-from learner.config.evaluation_size import evaluation_size
-from protocol.envs.description import DescribedEnv, class_name
-from protocol.policy.arithmetic import multiply_adds
-from protocol.specs import PolicySpec
+from millrace.learner.config.config import Config
+from millrace.learner.config.evaluation_size import evaluation_size
+from millrace.protocol.envs.description import DescribedEnv, class_name
+from millrace.protocol.policy.arithmetic import multiply_adds
+from millrace.protocol.specs import PolicySpec
 
 MANY_MULTIPLY_ADDS = 1 << 24  # of one observation; Atari's four frames of 84 x 84 take half of it
 PASSES = 3  # a gradient costs twice as much as the pass forward

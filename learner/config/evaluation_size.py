@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from learner.config.config import Config
+from millrace.learner.config.config import Config
 
 MOST_EPISODES, FEWEST_EPISODES = 100, 10  # of an evaluation whose number of episodes is not set
 LONGEST_EPISODE = 10  # its episodes are cut after so many times the mean length of training, if there is no time limit

@@ -14,18 +14,18 @@ from typing import Any
 
 import msgspec
 
-from learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
-from learner.config.config import TABLES, Config
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.other_names import in_place_of
-from learner.config.presets import PRESETS, environment_presets, named_presets
-from learner.config.validation import convert, validate
-from learner.run_folder.regular_files import MOST_TEXT_BYTES
-from learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
-from protocol.envs.found_names import moved
-from protocol.errors import UsageError, did_you_mean
-from protocol.flags.fields import fields_of
-from protocol.flags.values import with_whole_numbers
+from millrace.learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
+from millrace.learner.config.config import TABLES, Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.other_names import in_place_of
+from millrace.learner.config.presets import PRESETS, environment_presets, named_presets
+from millrace.learner.config.validation import convert, validate
+from millrace.learner.run_folder.regular_files import MOST_TEXT_BYTES
+from millrace.learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
+from millrace.protocol.envs.found_names import moved
+from millrace.protocol.errors import UsageError, did_you_mean
+from millrace.protocol.flags.fields import fields_of
+from millrace.protocol.flags.values import with_whole_numbers
 
 
 def resolve(

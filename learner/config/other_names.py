@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 
-from learner.config.hyperparameters import algorithms_with
+from millrace.learner.config.hyperparameters import algorithms_with
 
 SAME_VALUE = {
     "steps": "total_timesteps total_steps timesteps_total num_timesteps max_timesteps train_for_env_steps",

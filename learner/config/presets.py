@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from protocol.flags.toml_words import written
+from millrace.protocol.flags.toml_words import written
 
 if TYPE_CHECKING:
-    from learner.config.config import Config
+    from millrace.learner.config.config import Config
 
 PRESETS = Path(__file__).with_name("presets.toml")
 NAMED = "named"  # the table of presets.toml that holds whole runs

@@ -11,18 +11,18 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from learner.config.resume_rules import Adaptable, Fixed, Free
-from protocol.alive import CallTimeouts
-from protocol.bounds import Count, Natural
-from protocol.env_spec import Scalar
-from protocol.envs.seats import STATE
-from protocol.envs.wrappers import WrapperLike
-from protocol.flags.fields import Flag, NotNegative, Positive
-from protocol.specs import Vector
-from protocol.wire.weight_dtypes import ActingDtype
+from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.bounds import Count, Natural
+from millrace.protocol.env_spec import Scalar
+from millrace.protocol.envs.seats import STATE
+from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.flags.fields import Flag, NotNegative, Positive
+from millrace.protocol.specs import Vector
+from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 HEARTBEAT_S = 1.0
-SEAT_ID, WITH_STATE = "protocol.envs.seats:seat_id", "protocol.envs.seats:with_state"
+SEAT_ID, WITH_STATE = "millrace.protocol.envs.seats:seat_id", "millrace.protocol.envs.seats:with_state"
 STALL_TIMEOUT_S = 600.0
 
 

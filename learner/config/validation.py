@@ -9,20 +9,20 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from learner.config.algorithm_names import settings_record
-from learner.config.config import TABLES, Config
-from learner.config.evaluation_size import evaluation_size
-from learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
-from learner.config.rollout_config import RolloutConfig
-from learner.run_folder.results import METRICS_BESIDE_FACTS
-from protocol.address import advertised_address, check_address
-from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
-from protocol.env_spec import check_arguments
-from protocol.envs.wrappers import wrapper_name
-from protocol.errors import UsageError, safe_repr
-from protocol.flags.fields import fields_of
-from protocol.flags.values import what_was_expected
-from protocol.own_module import is_name
+from millrace.learner.config.algorithm_names import settings_record
+from millrace.learner.config.config import TABLES, Config
+from millrace.learner.config.evaluation_size import evaluation_size
+from millrace.learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
+from millrace.protocol.address import advertised_address, check_address
+from millrace.protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
+from millrace.protocol.env_spec import check_arguments
+from millrace.protocol.envs.wrappers import wrapper_name
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.flags.fields import fields_of
+from millrace.protocol.flags.values import what_was_expected
+from millrace.protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
 LARGEST_SEED = 2**64 - 1  # that PyTorch takes

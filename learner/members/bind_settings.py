@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol
 
-from protocol.address import advertised_address, is_local
-from protocol.errors import UsageError
-from protocol.keys.key_folder import KeyFolder, Keyring, chosen_key_folder
-from protocol.keys.keys import ClientList, Key, Token
+from millrace.protocol.address import advertised_address, is_local
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import KeyFolder, Keyring, chosen_key_folder
+from millrace.protocol.keys.keys import ClientList, Key, Token
 
 log = logging.getLogger("millrace.learner")
 

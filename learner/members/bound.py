@@ -13,12 +13,12 @@ from datetime import UTC, datetime
 
 import zmq
 
-from learner.members.bind_settings import Listening, join_lines, keyring_for
-from protocol.env_spec import FACTORY, REGISTER_IT
-from protocol.errors import UsageError
-from protocol.keys.key_folder import Keyring
-from protocol.logs.notices import log_notice
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.bind_settings import Listening, join_lines, keyring_for
+from millrace.protocol.env_spec import FACTORY, REGISTER_IT
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

@@ -14,12 +14,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic
 
-from learner.members.events import EnvironmentRaised, Event, Failed, WorkerNotStarted
-from learner.members.member_states import MemberState, SentUnusable
-from learner.members.membership import M, Membership, Outgoing
-from protocol.alive import StartFailed
-from protocol.bounds import one_line
-from protocol.messages import (
+from millrace.learner.members.events import EnvironmentRaised, Event, Failed, WorkerNotStarted
+from millrace.learner.members.member_states import MemberState, SentUnusable
+from millrace.learner.members.membership import M, Membership, Outgoing
+from millrace.protocol.alive import StartFailed
+from millrace.protocol.bounds import one_line
+from millrace.protocol.messages import (
     Alive,
     Drain,
     Failure,

@@ -12,16 +12,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
-from learner.members.events import Event
-from learner.members.failure_count import FailureCount
-from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
-from learner.members.process_callbacks import ProcessCallbacks
-from protocol.envs.description import DescribedEnv
-from protocol.errors import Stalled
-from protocol.logs.long_wait import LongWait
-from protocol.specs import DescribeSpec
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
+from millrace.learner.members.events import Event
+from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import Stalled
+from millrace.protocol.logs.long_wait import LongWait
+from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

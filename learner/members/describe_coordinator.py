@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from learner.members.coordinator import Coordinator
-from learner.members.membership import Member, Membership, Outgoing
-from protocol.alive import NO_SLOT
-from protocol.envs.description import DescribedEnv, read_description
-from protocol.errors import BadMessage, UsageError
-from protocol.messages import (
+from millrace.learner.members.coordinator import Coordinator
+from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.protocol.alive import NO_SLOT
+from millrace.protocol.envs.description import DescribedEnv, read_description
+from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.messages import (
     TOLD_TO_STOP,
     Described,
     Goodbye,
@@ -23,7 +23,7 @@ from protocol.messages import (
     Status,
     ToLearner,
 )
-from protocol.specs import DescribeSpec
+from millrace.protocol.specs import DescribeSpec
 
 Accept = Callable[[DescribedEnv], None]
 """Raises `UsageError` if the run cannot be made with this environment."""

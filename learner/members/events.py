@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from protocol.bounds import MAX_LINE, indented, one_line
+from millrace.protocol.bounds import MAX_LINE, indented, one_line
 
 
 @dataclass(frozen=True)

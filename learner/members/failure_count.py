@@ -17,8 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from learner.members.events import Event, Failed, PolicyRaised
-from protocol.errors import EnvironmentFailed, PolicyFailed
+from millrace.learner.members.events import Event, Failed, PolicyRaised
+from millrace.protocol.errors import EnvironmentFailed, PolicyFailed
 
 MOST_IN_A_ROW = 10
 AFTER_STEPS = 0.25

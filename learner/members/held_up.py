@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from learner.members.membership import Member
-from protocol.messages import WorkerActivity
+from millrace.learner.members.membership import Member
+from millrace.protocol.messages import WorkerActivity
 
 DOING = {
     "describing": "in construction",

@@ -7,7 +7,7 @@ costs the learner little, and does not keep the workers of another key out.
 
 from __future__ import annotations
 
-from protocol.token_bucket import TokenBucket
+from millrace.protocol.token_bucket import TokenBucket
 
 AT_ONCE, PER_S = 10_000, 100.0  # Hellos of one key
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from protocol.keys.keys import ClientList
-from protocol.wire.learner_link import LearnerLink
+from millrace.protocol.keys.keys import ClientList
+from millrace.protocol.wire.learner_link import LearnerLink
 
 
 class KeyRevocation:

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from learner.members.membership import Member, Outgoing
-from protocol.messages import LaneIncarnation, Release
+from millrace.learner.members.membership import Member, Outgoing
+from millrace.protocol.messages import LaneIncarnation, Release
 
 
 @dataclass

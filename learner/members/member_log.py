@@ -9,10 +9,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from learner.members.events import Event, RejoinRequested
-from protocol.bounds import MAX_TEXT, one_line
-from protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.events import Event, RejoinRequested
+from millrace.protocol.bounds import MAX_TEXT, one_line
+from millrace.protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

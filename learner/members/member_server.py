@@ -19,8 +19,8 @@ from typing import Any
 
 import msgspec
 
-from learner.members.coordinator import Coordinator
-from learner.members.events import (
+from millrace.learner.members.coordinator import Coordinator
+from millrace.learner.members.events import (
     EnvironmentRaised,
     Event,
     Failed,
@@ -33,20 +33,20 @@ from learner.members.events import (
     WorkerRefused,
     describe,
 )
-from learner.members.held_up import what_they_do
-from learner.members.join_limiter import JoinLimiter
-from learner.members.key_revocation import KeyRevocation
-from learner.members.member_log import MemberLog
-from learner.members.member_states import SentUnusable
-from learner.members.membership import Outgoing
-from learner.members.process_callbacks import ProcessCallbacks
-from protocol.address import advertised_address, name_for_people
-from protocol.bounds import one_line
-from protocol.errors import BadMessage, NoWorkers
-from protocol.logs.long_wait import LongWait
-from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
-from protocol.wire.codec import Buffer, encode
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.held_up import what_they_do
+from millrace.learner.members.join_limiter import JoinLimiter
+from millrace.learner.members.key_revocation import KeyRevocation
+from millrace.learner.members.member_log import MemberLog
+from millrace.learner.members.member_states import SentUnusable
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.protocol.address import advertised_address, name_for_people
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import BadMessage, NoWorkers
+from millrace.protocol.logs.long_wait import LongWait
+from millrace.protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
+from millrace.protocol.wire.codec import Buffer, encode
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

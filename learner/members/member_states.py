@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from protocol.messages import (
+from millrace.protocol.messages import (
     Alive,
     Described,
     Drain,

@@ -18,7 +18,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from learner.members.events import (
+from millrace.learner.members.events import (
     Event,
     Failed,
     NamelessHello,
@@ -29,11 +29,11 @@ from learner.members.events import (
     WorkerProcessFailed,
     WorkerRefused,
 )
-from learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
-from protocol.address import key_of_peer, name_for_people, worker_name
-from protocol.alive import OUR_CODE
-from protocol.bounds import Stage, Stages, escaped, one_line
-from protocol.messages import (
+from millrace.learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
+from millrace.protocol.address import key_of_peer, name_for_people, worker_name
+from millrace.protocol.alive import OUR_CODE
+from millrace.protocol.bounds import Stage, Stages, escaped, one_line
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
     Drain,
@@ -52,7 +52,7 @@ from protocol.messages import (
     WorkerExit,
     WorkerStatus,
 )
-from protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
 
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by: several may be read at once
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory

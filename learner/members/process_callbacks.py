@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from learner.members.events import Failed
-from learner.members.membership import Member
-from protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.learner.members.events import Failed
+from millrace.learner.members.membership import Member
+from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 
 
 @dataclass(frozen=True)

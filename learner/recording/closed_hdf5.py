@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
-from learner.run_folder.regular_files import open_regular
+from millrace.learner.run_folder.regular_files import open_regular
 
 MOST_EXPANSION = 1_032  # deflate, the strongest compression that is read, makes no more bytes of one
 FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf. Any other may be a plug-in, which the file would choose

@@ -21,14 +21,14 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from learner.recording.closed_hdf5 import ClosedHDF5, UnfitFile
-from learner.recording.minari_spaces import space_of_json
-from learner.run_folder.regular_files import read, reason
-from protocol.arrays import Array
-from protocol.bounds import Natural, one_line
-from protocol.envs.spaces import STORED_KINDS, action_spec, observation_leaves
-from protocol.errors import UsageError
-from protocol.specs import ActionSpec, Leaf
+from millrace.learner.recording.closed_hdf5 import ClosedHDF5, UnfitFile
+from millrace.learner.recording.minari_spaces import space_of_json
+from millrace.learner.run_folder.regular_files import read, reason
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import Natural, one_line
+from millrace.protocol.envs.spaces import STORED_KINDS, action_spec, observation_leaves
+from millrace.protocol.errors import UsageError
+from millrace.protocol.specs import ActionSpec, Leaf
 
 METADATA, ARRAYS = "metadata.json", "main_data.hdf5"
 MOST_METADATA_BYTES = 1 << 24  # it has two bounds of each element of a space

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from learner.run_folder.regular_files import open_regular
-from protocol.arrays import Array
+from millrace.learner.run_folder.regular_files import open_regular
+from millrace.protocol.arrays import Array
 
 
 def append_episodes(path: Path, first: int, episodes: Sequence[Any]) -> None:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.rollout import Rollout
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.rollout import Rollout
 
 
 @dataclass(frozen=True)

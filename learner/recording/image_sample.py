@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from learner.run_folder.run_folder import as_folder_name
-from protocol.arrays import Array
-from protocol.specs import Leaf
+from millrace.learner.run_folder.run_folder import as_folder_name
+from millrace.protocol.arrays import Array
+from millrace.protocol.specs import Leaf
 
 ROWS, GAP, GRAY = 4, 2, 128  # rows of the picture; pixels between images, and their brightness
 MOST_PIXELS = 256  # of a side of an image

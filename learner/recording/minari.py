@@ -15,11 +15,11 @@ from typing import Any, Self
 import gymnasium
 from gymnasium import spaces
 
-from learner.recording.dataset_files import ARRAYS
-from learner.recording.episode_file import append_episodes
-from learner.recording.episodes import RecordedEpisode
-from protocol.arrays import Array
-from protocol.errors import RunError, UsageError, first_line
+from millrace.learner.recording.dataset_files import ARRAYS
+from millrace.learner.recording.episode_file import append_episodes
+from millrace.learner.recording.episodes import RecordedEpisode
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import RunError, UsageError, first_line
 
 CHUNK_BYTES = 64 * 2**20
 OF_NAMESPACE = "namespace_metadata.json"  # the file that makes a folder one of Minari's namespaces

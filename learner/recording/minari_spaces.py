@@ -1,6 +1,6 @@
 """Spaces as Minari writes them, in JSON, as gymnasium's. Pure.
 
-Rule: as in `protocol.space_spec`, sizes are checked before anything of that size is allocated.
+Rule: as in `millrace.protocol.space_spec`, sizes are checked before anything of that size is allocated.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import gymnasium
 import msgspec
 import numpy as np
 
-from protocol.bounds import Count, Natural, Whole
-from protocol.envs.space_records import make_space
-from protocol.space_spec import (
+from millrace.protocol.bounds import Count, Natural, Whole
+from millrace.protocol.envs.space_records import make_space
+from millrace.protocol.space_spec import (
     BoxSpace,
     DictSpace,
     DiscreteSpace,

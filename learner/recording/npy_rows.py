@@ -15,9 +15,9 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
-from learner.recording.episodes import RecordedEpisode
-from learner.run_folder.atomic_write import write_atomically
-from protocol.errors import RunError
+from millrace.learner.recording.episodes import RecordedEpisode
+from millrace.learner.run_folder.atomic_write import write_atomically
+from millrace.protocol.errors import RunError
 
 
 class NpyRows:

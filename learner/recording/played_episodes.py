@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from learner.policy_player import PolicyPlayer
-from learner.recording.episodes import RecordedEpisode
-from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
-from protocol.arrays import Array
-from protocol.envs.spaces import action_converter_of
-from protocol.messages import EpisodeRows
-from protocol.random_streams import Purpose, env_seed
+from millrace.learner.policy_player import PolicyPlayer
+from millrace.learner.recording.episodes import RecordedEpisode
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.messages import EpisodeRows
+from millrace.protocol.random_streams import Purpose, env_seed
 
 FIRST_EPISODES = 2  # played before their size is known
 CHUNK_BYTES = 256 * 2**20  # about the memory that the episodes of one plan may take

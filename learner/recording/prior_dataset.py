@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from learner.recording.dataset_files import DatasetFiles
-from protocol.arrays import Array
-from protocol.bounds import one_line
-from protocol.envs.spaces import stored_actions_of
-from protocol.errors import UsageError
-from protocol.rollout import Batch
-from protocol.rows.array_checks import wrong_values
-from protocol.specs import PolicySpec
+from millrace.learner.recording.dataset_files import DatasetFiles
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.spaces import stored_actions_of
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Batch
+from millrace.protocol.rows.array_checks import wrong_values
+from millrace.protocol.specs import PolicySpec
 
 NO_LANE = -1  # `Batch.lane` of prior data
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from learner.policy_player import PolicyPlayer
-from learner.recording.minari import MinariDataset
-from learner.recording.npy_rows import NpyRows
-from learner.recording.played_episodes import PlayedEpisodes, recording_seeds
-from learner.recording.training_recorder import EnvironmentOfDataset
-from protocol.errors import UsageError
+from millrace.learner.policy_player import PolicyPlayer
+from millrace.learner.recording.minari import MinariDataset
+from millrace.learner.recording.npy_rows import NpyRows
+from millrace.learner.recording.played_episodes import PlayedEpisodes, recording_seeds
+from millrace.learner.recording.training_recorder import EnvironmentOfDataset
+from millrace.protocol.errors import UsageError
 
 
 class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):

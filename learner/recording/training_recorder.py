@@ -7,14 +7,14 @@ from typing import Any
 
 import gymnasium
 
-from learner.recording.episodes import EpisodeAssembler
-from learner.recording.minari import MinariDataset
-from learner.rollouts.lanes import AcceptedRollout
-from protocol.envs.action_masks import without_mask
-from protocol.envs.description import DescribedEnv
-from protocol.envs.spaces import action_converter_of
-from protocol.errors import RunError
-from protocol.specs import RunSpec
+from millrace.learner.recording.episodes import EpisodeAssembler
+from millrace.learner.recording.minari import MinariDataset
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.protocol.envs.action_masks import without_mask
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.errors import RunError
+from millrace.protocol.specs import RunSpec
 
 
 class TrainingRecorder:

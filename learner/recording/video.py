@@ -13,13 +13,13 @@ import tempfile
 import warnings
 from pathlib import Path
 
-from learner.policy_player import PolicyPlayer
-from learner.recording.played_episodes import PlayedEpisodes
-from learner.rollouts.evaluation_dealer import PlayedEpisode, episode_seeds, evaluation_of
-from learner.run_folder.regular_files import subfolder
-from learner.run_folder.results import Evaluation
-from protocol.arrays import Array
-from protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
+from millrace.learner.policy_player import PolicyPlayer
+from millrace.learner.recording.played_episodes import PlayedEpisodes
+from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode, episode_seeds, evaluation_of
+from millrace.learner.run_folder.regular_files import subfolder
+from millrace.learner.run_folder.results import Evaluation
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 
 AT_ONCE = 2  # episodes whose frames are in memory
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from protocol.arrays import Doubles
+from millrace.protocol.arrays import Doubles
 
 COLORS = 7  # number of colors in the style sheet
 DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14 5 4 5")  # with round ends

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from learner.config.presets import environment_name
-from learner.run_folder.metrics_log import METRICS_FILE, read_rows
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.regular_files import reason
-from learner.run_folder.results import EVALUATED_AT_KEY
-from learner.run_folder.run_folder import RunFolder
-from learner.run_folder.run_format import check_format, read_config
-from protocol.arrays import Doubles
-from protocol.errors import UsageError
+from millrace.learner.config.presets import environment_name
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from millrace.learner.run_folder.regular_files import reason
+from millrace.learner.run_folder.results import EVALUATED_AT_KEY
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_folder.run_format import check_format, read_config
+from millrace.protocol.arrays import Doubles
+from millrace.protocol.errors import UsageError
 
 GRID_POINTS = 400
 DRAWN = -1e300, 1e300

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from html import escape
 
-from learner.report.html_parts import section
-from learner.report.reported_runs import ReportData
-from learner.run_folder.json_log import LoggedLine
-from protocol.bounds import escaped
+from millrace.learner.report.html_parts import section
+from millrace.learner.report.reported_runs import ReportData
+from millrace.learner.run_folder.json_log import LoggedLine
+from millrace.protocol.bounds import escaped
 
 MOST_HISTORY, AT_ONCE = 30, 8  # lines; those after the first are in a block that is closed at first
 

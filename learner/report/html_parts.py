@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from learner.report.charts import MINUS
+from millrace.learner.report.charts import MINUS
 
 
 def document(title: str, head: Sequence[str], main: str) -> str:

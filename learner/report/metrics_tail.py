@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from learner.run_folder.metrics_log import METRICS_FILE, decoded_row
-from learner.run_folder.regular_files import MOST_BYTES, open_regular
-from learner.run_folder.results import EVALUATION_KEY
-from protocol.arrays import Ints
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, decoded_row
+from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
+from millrace.learner.run_folder.results import EVALUATION_KEY
+from millrace.protocol.arrays import Ints
 
 MOST_ROWS = 256  # at least, and twice as many at most: a chart has 500 points
 CHUNK_BYTES = 1 << 22

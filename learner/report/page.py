@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from learner.report import ledger_and_stages, sections
-from learner.report.history import history
-from learner.report.html_parts import document
-from learner.report.reported_runs import group_runs, read_run
-from learner.run_folder.atomic_write import write_file
-from protocol.errors import UsageError
+from millrace.learner.report import ledger_and_stages, sections
+from millrace.learner.report.history import history
+from millrace.learner.report.html_parts import document
+from millrace.learner.report.reported_runs import group_runs, read_run
+from millrace.learner.run_folder.atomic_write import write_file
+from millrace.protocol.errors import UsageError
 
 CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
 STYLE = Path(__file__).with_name("style.css")

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from learner.report.charts import DOT_KEY, Series, key
-from learner.report.curve import common_grid
-from learner.report.html_parts import return_text
-from learner.report.reported_runs import ReportData, RunGroup
-from learner.run_folder.episode_window import WINDOW_EPISODES
+from millrace.learner.report.charts import DOT_KEY, Series, key
+from millrace.learner.report.curve import common_grid
+from millrace.learner.report.html_parts import return_text
+from millrace.learner.report.reported_runs import ReportData, RunGroup
+from millrace.learner.run_folder.episode_window import WINDOW_EPISODES
 
 WHAT_IS_DRAWN = f"Return, mean of the last {WINDOW_EPISODES} training episodes"
 

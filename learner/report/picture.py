@@ -16,12 +16,12 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from textwrap import shorten, wrap
 
-from learner.report.charts import MINUS, chart
-from learner.report.page import STYLE
-from learner.report.panels import WHAT_IS_DRAWN, Panel, how_it_is_drawn, panels
-from learner.report.reported_runs import ReportData, group_runs, read_run
-from learner.run_folder.atomic_write import write_file
-from protocol.errors import UsageError
+from millrace.learner.report.charts import MINUS, chart
+from millrace.learner.report.page import STYLE
+from millrace.learner.report.panels import WHAT_IS_DRAWN, Panel, how_it_is_drawn, panels
+from millrace.learner.report.reported_runs import ReportData, group_runs, read_run
+from millrace.learner.run_folder.atomic_write import write_file
+from millrace.protocol.errors import UsageError
 
 WIDTH, HEIGHT = 640, 380  # of a panel's axes
 MARGIN, HEAD, LINE = 28, 50, 20

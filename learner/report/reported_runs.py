@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from learner.report.curve import Curve, points, read_run_files
-from learner.report.run_lines import algorithm_label
-from learner.run_folder.json_log import LoggedLine, newest_lines
-from learner.run_folder.metrics_log import METRICS_FILE
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
-from learner.run_folder.regular_files import regular_files
-from learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
-from learner.run_folder.run_folder import RunFolder
-from protocol.arrays import Doubles
-from protocol.bounds import Natural, Real, Seconds
-from protocol.errors import UsageError
+from millrace.learner.report.curve import Curve, points, read_run_files
+from millrace.learner.report.run_lines import algorithm_label
+from millrace.learner.run_folder.json_log import LoggedLine, newest_lines
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
+from millrace.learner.run_folder.regular_files import regular_files
+from millrace.learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.arrays import Doubles
+from millrace.protocol.bounds import Natural, Real, Seconds
+from millrace.protocol.errors import UsageError
 
 MAY_DIFFER_IN_A_GROUP = frozenset({
     # what a group is for

@@ -14,18 +14,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from learner.config.presets import environment_name
-from learner.report.metrics_tail import newest_row
-from learner.report.sentences import ending, per_second
-from learner.run_folder.last_line import resume_command
-from learner.run_folder.lease import Owner
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
-from learner.run_folder.regular_files import reason
-from learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
-from learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
-from learner.run_folder.run_lock import living_owner
-from protocol.bounds import INVALID, LARGEST, MAX_NAME, one_line
-from protocol.errors import UsageError
+from millrace.learner.config.presets import environment_name
+from millrace.learner.report.metrics_tail import newest_row
+from millrace.learner.report.sentences import ending, per_second
+from millrace.learner.run_folder.last_line import resume_command
+from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
+from millrace.learner.run_folder.regular_files import reason
+from millrace.learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
+from millrace.learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
+from millrace.learner.run_folder.run_lock import living_owner
+from millrace.protocol.bounds import INVALID, LARGEST, MAX_NAME, one_line
+from millrace.protocol.errors import UsageError
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
 MOST_RUNS = 1_000  # of a folder

@@ -10,15 +10,15 @@ from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
 
-from learner.report.charts import chart_for_all_widths, key
-from learner.report.html_parts import return_text, section
-from learner.report.panels import WHAT_IS_DRAWN, how_it_is_drawn, panels
-from learner.report.reported_runs import ReportData, RunGroup, differing_settings
-from learner.report.run_lines import duration
-from learner.report.sentences import per_second
-from learner.run_folder.episode_window import WINDOW_EPISODES
-from learner.run_folder.regular_files import read
-from learner.run_folder.results import FactMean
+from millrace.learner.report.charts import chart_for_all_widths, key
+from millrace.learner.report.html_parts import return_text, section
+from millrace.learner.report.panels import WHAT_IS_DRAWN, how_it_is_drawn, panels
+from millrace.learner.report.reported_runs import ReportData, RunGroup, differing_settings
+from millrace.learner.report.run_lines import duration
+from millrace.learner.report.sentences import per_second
+from millrace.learner.run_folder.episode_window import WINDOW_EPISODES
+from millrace.learner.run_folder.regular_files import read
+from millrace.learner.run_folder.results import FactMean
 
 WIDE, NARROW = (1080, 360), (540, 320)
 MOST_BYTES_OF_ONE, MOST_BYTES_OF_ALL = 4 * 2**20, 24 * 2**20  # films or pictures

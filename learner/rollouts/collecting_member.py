@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from learner.members.membership import Member
-from protocol.messages import Heartbeat, WorkerStatus
+from millrace.learner.members.membership import Member
+from millrace.protocol.messages import Heartbeat, WorkerStatus
 
 
 @dataclass

@@ -23,15 +23,15 @@ from dataclasses import dataclass
 
 import msgspec
 
-from learner.members.membership import Member, Outgoing
-from learner.run_folder.results import Evaluation, fact_means
-from protocol.bounds import LARGEST
-from protocol.messages import EpisodeRows, Evaluate, Evaluated, versions_of
-from protocol.random_streams import Purpose, env_seed
-from protocol.rollout import Episode
-from protocol.rows.played import reason_to_reject
-from protocol.rows.rollout_checks import wrong_episode
-from protocol.specs import RunSpec
+from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.run_folder.results import Evaluation, fact_means
+from millrace.protocol.bounds import LARGEST
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, versions_of
+from millrace.protocol.random_streams import Purpose, env_seed
+from millrace.protocol.rollout import Episode
+from millrace.protocol.rows.played import reason_to_reject
+from millrace.protocol.rows.rollout_checks import wrong_episode
+from millrace.protocol.specs import RunSpec
 
 FIRST_TICKET = 1 << 52
 HELD_AT_ONCE = 2  # tickets of one worker: while the learner takes the answer to one, the worker plays the other

@@ -1,6 +1,6 @@
 """The hub: link, ticket coordinator and clock together. A training loop waits only in `gather` and in `evaluate`.
 
-It is all that `learner.train` knows of the rest, and what `millrace.RolloutService` gives to a user's own loop.
+It is all that `millrace.learner.train` knows of the rest, and what `millrace.RolloutService` gives to a user's own loop.
 Rule: every wait has a deadline and says what it waits for.
 """
 
@@ -15,32 +15,32 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from learner.members.events import Event
-from learner.members.failure_count import FailureCount
-from learner.members.held_up import LONG_S
-from learner.members.member_server import MemberServer, ServerCallbacks
-from learner.members.membership import Outgoing
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
-from learner.rollouts.lanes import AcceptedRollout
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.run_status import status
-from learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from learner.rollouts.waiting import LearnerTime
-from learner.rollouts.weight_age import WeightAge
-from learner.run_folder.progress import Progress
-from protocol.address import name_for_people, worker_name
-from protocol.arrays import Array, Floats
-from protocol.bounds import Stages, one_line
-from protocol.errors import BadRollout, Stalled
-from protocol.logs.long_wait import LongWait
-from protocol.messages import Evaluated, Rollout, Status, ToLearner, Weights
-from protocol.rollout import rollout_bytes
-from protocol.rows.rollout_checks import validate
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
+from millrace.learner.members.events import Event
+from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.held_up import LONG_S
+from millrace.learner.members.member_server import MemberServer, ServerCallbacks
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.run_status import status
+from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.rollouts.waiting import LearnerTime
+from millrace.learner.rollouts.weight_age import WeightAge
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.address import name_for_people, worker_name
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.bounds import Stages, one_line
+from millrace.protocol.errors import BadRollout, Stalled
+from millrace.protocol.logs.long_wait import LongWait
+from millrace.protocol.messages import Evaluated, Rollout, Status, ToLearner, Weights
+from millrace.protocol.rollout import rollout_bytes
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 
 log = logging.getLogger("millrace.learner")
 

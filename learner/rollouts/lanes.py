@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from learner.members.lane_placement import PlacedLane
-from protocol.rollout import Rollout
+from millrace.learner.members.lane_placement import PlacedLane
+from millrace.protocol.rollout import Rollout
 
 
 @dataclass

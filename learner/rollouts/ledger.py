@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from protocol.bounds import LARGEST
+from millrace.protocol.bounds import LARGEST
 
 Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
 """A count from a file, from which a run goes on: what it counts then still fits into messages."""

@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import msgspec
 
-from protocol.bounds import Count, Natural, Real
-from protocol.errors import UsageError, did_you_mean
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Episode
+from millrace.protocol.bounds import Count, Natural, Real
+from millrace.protocol.errors import UsageError, did_you_mean
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Episode
 
 FIRST_RATING = 1200.0
 ELO_KEY = "self_play/elo"

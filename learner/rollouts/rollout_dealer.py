@@ -11,12 +11,12 @@ from bisect import insort
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from learner.members.membership import Member, Outgoing
-from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.opponent_pool import OpponentPool
-from learner.rollouts.rounds import Rounds
-from protocol.messages import Collect, Permit, Received, Rollout, versions_of
+from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.rollouts.rounds import Rounds
+from millrace.protocol.messages import Collect, Permit, Received, Rollout, versions_of
 
 
 class RolloutDealer:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from learner.run_folder.progress import Progress
-from protocol.messages import Status
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.messages import Status
 
 
 def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str, phase: str) -> Status:

@@ -17,10 +17,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 
 import msgspec
 
-from learner.members.membership import Outgoing
-from learner.rollouts.collecting_member import CollectingMember
-from protocol.alive import SHARED_VERSIONS
-from protocol.messages import Collect, Evaluate, Heartbeat, Weights
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.protocol.alive import SHARED_VERSIONS
+from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 
 TO_SUPERVISOR = sys.maxsize  # in place of a number of replies: on the way to the supervisor, as far as is known
 

@@ -15,18 +15,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 
-from learner.members.coordinator import Coordinator
-from learner.members.events import EnvironmentNoted, Failed, PolicyRaised
-from learner.members.lane_placement import LanePlacement, is_spare
-from learner.members.member_states import SentUnusable
-from learner.members.membership import Member, Membership, Outgoing
-from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.opponent_pool import OpponentPool
-from learner.rollouts.rollout_dealer import RolloutDealer
-from learner.rollouts.sent_weights import SentWeights
-from protocol.messages import (
+from millrace.learner.members.coordinator import Coordinator
+from millrace.learner.members.events import EnvironmentNoted, Failed, PolicyRaised
+from millrace.learner.members.lane_placement import LanePlacement, is_spare
+from millrace.learner.members.member_states import SentUnusable
+from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
+from millrace.learner.rollouts.sent_weights import SentWeights
+from millrace.protocol.messages import (
     Array,
     EpisodeRows,
     Evaluated,
@@ -38,7 +38,7 @@ from protocol.messages import (
     ToLearner,
     Weights,
 )
-from protocol.specs import RunSpec
+from millrace.protocol.specs import RunSpec
 
 MOST_NOTES = 10  # of all workers together
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
@@ -47,7 +47,7 @@ STRIKES = 3  # rollouts or messages that could not be used, after which a worker
 class TicketCoordinator(Coordinator[CollectingMember]):
     """Members, their lanes, and what they are asked for.
 
-    A rollout that `receive` is given must have passed `protocol.rows.rollout_checks.validate`; else call `reject_rollout`.
+    A rollout that `receive` is given must have passed `millrace.protocol.rows.rollout_checks.validate`; else call `reject_rollout`.
     """
 
     def __init__(

@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, get_args
 
-from learner.members.held_up import LONG_S, held_up
-from learner.members.membership import Member
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.bounds import one_line
+from millrace.learner.members.held_up import LONG_S, held_up
+from millrace.learner.members.membership import Member
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.bounds import one_line
 
 Phase = Literal["starting", "gathering", "learning", "evaluating"]
 SHARES_AFTER_S = 30.0

@@ -16,8 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from learner.run_folder.regular_files import open_regular, reason
-from protocol.errors import RunError
+from millrace.learner.run_folder.regular_files import open_regular, reason
+from millrace.protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
 

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from learner.rehearsed_pickle import rehearse
-from learner.run_folder.atomic_write import TEMPORARY, write_atomically
-from learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
-from protocol.errors import CheckpointError, UsageError
+from millrace.learner.rehearsed_pickle import rehearse
+from millrace.learner.run_folder.atomic_write import TEMPORARY, write_atomically
+from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
+from millrace.protocol.errors import CheckpointError, UsageError
 
 if TYPE_CHECKING:
     from torch import Tensor

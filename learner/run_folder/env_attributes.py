@@ -11,10 +11,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.bounds import MAX_NAME, one_line
-from protocol.errors import UsageError, safe_repr
-from protocol.wire.plain_values import pack, unpack
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MAX_NAME, one_line
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.wire.plain_values import pack, unpack
 
 MOST_BYTES = 1 << 20  # of all attributes together: they travel with all weights
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from learner.run_folder.results import FactMean, fact_means
-from protocol.rollout import Episode
+from millrace.learner.run_folder.results import FactMean, fact_means
+from millrace.protocol.rollout import Episode
 
 WINDOW_EPISODES = 100
 

@@ -1,7 +1,7 @@
 """The log as JSON, one event per line: on stderr (`--log-json`), and its warnings and notices in the run folder (log.jsonl).
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
-"left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin" (`learner.members.events`,
+"left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin" (`millrace.learner.members.events`,
 whose fields stand beside it), "progress", or "said" for any other line of the log.
 
 Rule: log.jsonl is bounded, and nothing depends on it. Of a file that has grown too long, the newer half is kept. Lines that
@@ -23,11 +23,11 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.progress import NOT_SHOWN, Progress
-from learner.run_folder.regular_files import open_regular
-from protocol.bounds import INVALID, escaped_json
-from protocol.logs.notices import is_notice
+from millrace.learner.run_folder.atomic_write import write_atomically
+from millrace.learner.run_folder.progress import NOT_SHOWN, Progress
+from millrace.learner.run_folder.regular_files import open_regular
+from millrace.protocol.bounds import INVALID, escaped_json
+from millrace.protocol.logs.notices import is_notice
 
 RUN_LOG_FILE = "log.jsonl"
 MOST_BYTES_OF_LOG = 1 << 20

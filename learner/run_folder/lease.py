@@ -13,9 +13,9 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from protocol.address import check_address
-from protocol.bounds import INVALID, Line, Natural
-from protocol.errors import UsageError
+from millrace.protocol.address import check_address
+from millrace.protocol.bounds import INVALID, Line, Natural
+from millrace.protocol.errors import UsageError
 
 WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them replaces the whole
 HIGHEST_COUNT = 10**12

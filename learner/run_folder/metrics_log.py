@@ -21,11 +21,11 @@ from typing import Any
 
 import msgspec
 
-from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
-from learner.run_folder.regular_files import MOST_BYTES, open_regular, read, subfolder
-from protocol.bounds import INVALID, Natural
-from protocol.errors import RunError
+from millrace.learner.run_folder.atomic_write import write_atomically
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
+from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular, read, subfolder
+from millrace.protocol.bounds import INVALID, Natural
+from millrace.protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
 

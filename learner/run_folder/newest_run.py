@@ -7,12 +7,12 @@ import os
 import re
 from pathlib import Path
 
-from learner.run_folder.checkpoint import has_any
-from learner.run_folder.run_folder import RunSettings, as_folder_name
-from learner.run_folder.run_format import CONFIG_FILE, read_config
-from protocol.bounds import one_line
-from protocol.errors import UsageError
-from protocol.logs.notices import log_notice
+from millrace.learner.run_folder.checkpoint import has_any
+from millrace.learner.run_folder.run_folder import RunSettings, as_folder_name
+from millrace.learner.run_folder.run_format import CONFIG_FILE, read_config
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import UsageError
+from millrace.protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
 

@@ -10,10 +10,10 @@ from typing import Any, SupportsFloat
 
 import msgspec
 
-from learner.run_folder.requests import Requests
-from learner.run_folder.results import EvaluatedPolicy, Evaluation, FactMean, fact_metrics
-from protocol.errors import UsageError
-from protocol.rollout import Episode, Rollout
+from millrace.learner.run_folder.requests import Requests
+from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, FactMean, fact_metrics
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Episode, Rollout
 
 ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"

@@ -14,7 +14,7 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-from protocol.errors import first_line
+from millrace.protocol.errors import first_line
 
 MOST_TEXT_BYTES = 1 << 22  # of a file of settings or results
 MOST_BYTES = 1 << 31  # of metrics, and of the arrays of a policy

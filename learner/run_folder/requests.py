@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from learner.run_folder.env_attributes import EnvAttributes
-from protocol.bounds import one_line
-from protocol.errors import UsageError, safe_repr
+from millrace.learner.run_folder.env_attributes import EnvAttributes
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import UsageError, safe_repr
 
 MOST_LOGGED = 1_000  # numbers of one row
 LONGEST_NAME = 200  # characters

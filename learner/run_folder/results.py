@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from learner.run_folder.regular_files import read
-from protocol.bounds import Natural, Real, Seconds, Version
-from protocol.specs import SCORE
+from millrace.learner.run_folder.regular_files import read
+from millrace.protocol.bounds import Natural, Real, Seconds, Version
+from millrace.protocol.specs import SCORE
 
 SUMMARY_FILE = "summary.json"
 ALL_STEPS_DONE = "all steps done"

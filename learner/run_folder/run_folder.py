@@ -39,10 +39,10 @@ from msgspec import Meta
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from learner.run_folder.atomic_write import TEMPORARY, Writes, write_file
-from learner.run_folder.regular_files import MOST_BYTES, read, reason
-from learner.run_folder.results import SUMMARY_FILE, Summary, read_summary
-from learner.run_folder.run_format import (
+from millrace.learner.run_folder.atomic_write import TEMPORARY, Writes, write_file
+from millrace.learner.run_folder.regular_files import MOST_BYTES, read, reason
+from millrace.learner.run_folder.results import SUMMARY_FILE, Summary, read_summary
+from millrace.learner.run_folder.run_format import (
     CONFIG_FILE,
     END,
     HEAD,
@@ -53,16 +53,16 @@ from learner.run_folder.run_format import (
     is_run_folder,
     write_format,
 )
-from learner.run_folder.run_lock import RunLock
-from protocol.arrays import Floats
-from protocol.bounds import INVALID, MAX_FACTS, Line, Name, Natural, one_line
-from protocol.env_spec import Scalar
-from protocol.errors import RunError, UsageError
-from protocol.own_module import refuse_modules_in
-from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
-from protocol.policy.possible import why_impossible
-from protocol.space_spec import MAX_SEATS
-from protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
+from millrace.learner.run_folder.run_lock import RunLock
+from millrace.protocol.arrays import Floats
+from millrace.protocol.bounds import INVALID, MAX_FACTS, Line, Name, Natural, one_line
+from millrace.protocol.env_spec import Scalar
+from millrace.protocol.errors import RunError, UsageError
+from millrace.protocol.own_module import refuse_modules_in
+from millrace.protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
+from millrace.protocol.policy.possible import why_impossible
+from millrace.protocol.space_spec import MAX_SEATS
+from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
 
 POLICY_FORMAT = 2
 Which = Literal["final", "best"]

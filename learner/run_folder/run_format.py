@@ -19,11 +19,11 @@ from typing import Any
 
 import msgspec
 
-from learner.run_folder.atomic_write import write_file
-from learner.run_folder.regular_files import read, reason
-from protocol.bounds import INVALID, one_line
-from protocol.errors import UsageError
-from protocol.own_module import refuse_modules_in
+from millrace.learner.run_folder.atomic_write import write_file
+from millrace.learner.run_folder.regular_files import read, reason
+from millrace.protocol.bounds import INVALID, one_line
+from millrace.protocol.errors import UsageError
+from millrace.protocol.own_module import refuse_modules_in
 
 RUN_FORMAT = 2
 RUN_FILE = "run.json"

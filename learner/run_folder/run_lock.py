@@ -23,10 +23,10 @@ from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
-from learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
-from learner.run_folder.regular_files import open_regular, read, reason
-from protocol.address import is_local
-from protocol.errors import RunError, RunTakenOver, UsageError
+from millrace.learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from millrace.learner.run_folder.regular_files import open_regular, read, reason
+from millrace.protocol.address import is_local
+from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
 log = logging.getLogger("millrace.learner")
 

@@ -12,13 +12,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.sent_lanes import Infos
-from protocol.arrays import Array, Bools
-from protocol.envs.spaces import make_unflatten
-from protocol.messages import Stepped
-from protocol.specs import SEAT_LEAVES, StepSpec
-from protocol.wire.shared_memory import SharedMemory
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.sent_lanes import Infos
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.envs.spaces import make_unflatten
+from millrace.protocol.messages import Stepped
+from millrace.protocol.specs import SEAT_LEAVES, StepSpec
+from millrace.protocol.wire.shared_memory import SharedMemory
 
 
 class BatchArrays:

@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
 
-from protocol.envs.seats import columns_of
+from millrace.protocol.envs.seats import columns_of
 
 
 class BatchLayout:

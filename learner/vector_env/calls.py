@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.lane_orders import call_order
-from learner.vector_env.lost_lanes import RESET_ATTEMPTS
-from learner.vector_env.order_coordinator import MakeOrder
-from learner.vector_env.send_recv import SendRecv, VectorEnvParts
-from protocol.bounds import MAX_LINE, one_line
-from protocol.envs.description import DescribedEnv, read_description
-from protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost, safe_repr
-from protocol.messages import DESCRIPTION, Described, Returned
-from protocol.wire.codec import decode_to_learner
-from protocol.wire.plain_values import unpack
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.lane_orders import call_order
+from millrace.learner.vector_env.lost_lanes import RESET_ATTEMPTS
+from millrace.learner.vector_env.order_coordinator import MakeOrder
+from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
+from millrace.protocol.bounds import MAX_LINE, one_line
+from millrace.protocol.envs.description import DescribedEnv, read_description
+from millrace.protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost, safe_repr
+from millrace.protocol.messages import DESCRIPTION, Described, Returned
+from millrace.protocol.wire.codec import decode_to_learner
+from millrace.protocol.wire.plain_values import unpack
 
 USE_INSTEAD = ("reset", "step", "close")
 """Methods of an environment that only the vector environment may call."""

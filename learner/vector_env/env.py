@@ -21,18 +21,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.vector.utils import batch_space
 
-from learner.vector_env.batch_arrays import BatchArrays
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.calls import CopyCalls
-from learner.vector_env.infos import InfoReader, merged
-from learner.vector_env.lost_lanes import LostLanes
-from learner.vector_env.send_recv import SendRecv, VectorEnvParts
-from learner.vector_env.sent_lanes import Infos, Ready
-from learner.vector_env.spec import VectorEnvDescription
-from learner.vector_env.step_arguments import Options, action_arrays, numbered, reset_arguments
-from learner.vector_env.step_hub import StepHub
-from protocol.arrays import Array
-from protocol.envs.spaces import make_flatten
+from millrace.learner.vector_env.batch_arrays import BatchArrays
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.calls import CopyCalls
+from millrace.learner.vector_env.infos import InfoReader, merged
+from millrace.learner.vector_env.lost_lanes import LostLanes
+from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
+from millrace.learner.vector_env.sent_lanes import Infos, Ready
+from millrace.learner.vector_env.spec import VectorEnvDescription
+from millrace.learner.vector_env.step_arguments import Options, action_arrays, numbered, reset_arguments
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.spaces import make_flatten
 
 log = logging.getLogger("millrace.learner")
 

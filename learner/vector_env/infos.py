@@ -8,11 +8,11 @@ from typing import Any
 
 from gymnasium.vector import VectorEnv
 
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.sent_lanes import Infos, Ready
-from protocol.arrays import Array
-from protocol.errors import BadMessage
-from protocol.wire.plain_values import repr_paths, unpack
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.sent_lanes import Infos, Ready
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.wire.plain_values import repr_paths, unpack
 
 log = logging.getLogger("millrace.learner")
 

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from learner.vector_env.order_coordinator import MakeOrder
-from protocol.arrays import Array, Bytes
-from protocol.messages import Call, LaneIncarnation, Reset, Step
-from protocol.wire.plain_values import pack
+from millrace.learner.vector_env.order_coordinator import MakeOrder
+from millrace.protocol.arrays import Array, Bytes
+from millrace.protocol.messages import Call, LaneIncarnation, Reset, Step
+from millrace.protocol.wire.plain_values import pack
 
 
 def packed(value: object) -> Bytes:

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-from learner.vector_env.batch_layout import BatchLayout
-from protocol.errors import WorkerLost
-from protocol.random_streams import Purpose, env_seed
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.protocol.errors import WorkerLost
+from millrace.protocol.random_streams import Purpose, env_seed
 
 RESET_ATTEMPTS = 3
 """How often a reset is tried while each attempt loses a worker."""

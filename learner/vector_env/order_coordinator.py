@@ -12,13 +12,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from learner.members.coordinator import Coordinator
-from learner.members.events import Failed
-from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
-from learner.members.member_states import TimedOut
-from learner.members.membership import Member, Membership, Outgoing
-from protocol.errors import BadMessage, EnvironmentFailed
-from protocol.messages import (
+from millrace.learner.members.coordinator import Coordinator
+from millrace.learner.members.events import Failed
+from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
+from millrace.learner.members.member_states import TimedOut
+from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.protocol.errors import BadMessage, EnvironmentFailed
+from millrace.protocol.messages import (
     Answer,
     Call,
     Heartbeat,
@@ -29,9 +29,9 @@ from protocol.messages import (
     Stepped,
     ToLearner,
 )
-from protocol.rows.stepped import wrong_rows
-from protocol.specs import StepSpec
-from protocol.wire.plain_values import unpack
+from millrace.protocol.rows.stepped import wrong_rows
+from millrace.protocol.specs import StepSpec
+from millrace.protocol.wire.plain_values import unpack
 
 MakeOrder = Callable[[int, int, LaneIncarnation], Order]
 """Makes an order for a lane from the session, the ticket, and the lane's number and incarnation."""

@@ -14,17 +14,26 @@ from typing import Any, Literal
 
 from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 
-from learner.vector_env.batch_arrays import BatchArrays
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.lane_orders import packed, step_order
-from learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
-from learner.vector_env.order_coordinator import MakeOrder
-from learner.vector_env.sent_lanes import AfterLoss, Asked, AskedReset, Ready, Sent, SentLanes, WatchedTime, after_loss
-from learner.vector_env.step_arguments import Options
-from learner.vector_env.step_hub import StepHub
-from protocol.arrays import Array, Bools
-from protocol.errors import NoWorkers, UsageError, WorkerLost
-from protocol.messages import Stepped
+from millrace.learner.vector_env.batch_arrays import BatchArrays
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.lane_orders import packed, step_order
+from millrace.learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
+from millrace.learner.vector_env.order_coordinator import MakeOrder
+from millrace.learner.vector_env.sent_lanes import (
+    AfterLoss,
+    Asked,
+    AskedReset,
+    Ready,
+    Sent,
+    SentLanes,
+    WatchedTime,
+    after_loss,
+)
+from millrace.learner.vector_env.step_arguments import Options
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.errors import NoWorkers, UsageError, WorkerLost
+from millrace.protocol.messages import Stepped
 
 log = logging.getLogger("millrace.learner")
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, NamedTuple
 
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.lane_orders import reset_order
-from learner.vector_env.lost_lanes import RESET_ATTEMPTS
-from learner.vector_env.order_coordinator import MakeOrder
-from protocol.arrays import Bytes
-from protocol.messages import Returned
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.lane_orders import reset_order
+from millrace.learner.vector_env.lost_lanes import RESET_ATTEMPTS
+from millrace.learner.vector_env.order_coordinator import MakeOrder
+from millrace.protocol.arrays import Bytes
+from millrace.protocol.messages import Returned
 
 Infos = dict[str, Any]
 """What the environment tells beside a row."""

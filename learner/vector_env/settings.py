@@ -12,12 +12,12 @@ from typing import Any, Literal
 from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
-from learner.members.bind_settings import BindSettings
-from protocol.alive import CallTimeouts
-from protocol.env_spec import EnvLike, EnvSpec, Scalar
-from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError, safe_repr
-from protocol.machine.cpu_cores import usable_cores
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
+from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.machine.cpu_cores import usable_cores
 
 ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
 """gymnasium's. A tuple has the observation spaces of the batch and of a single copy."""

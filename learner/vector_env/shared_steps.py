@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from protocol.address import worker_name
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.shared_memory import SharedMemory
-from protocol.wire.wake_up import SpinWait, WakePipe, WakeReason
+from millrace.protocol.address import worker_name
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.shared_memory import SharedMemory
+from millrace.protocol.wire.wake_up import SpinWait, WakePipe, WakeReason
 
 
 class SharedSteps:

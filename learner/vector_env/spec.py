@@ -16,14 +16,14 @@ from gymnasium.spaces.utils import is_space_dtype_shape_equiv
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_differing_spaces, batch_space
 
-from learner.vector_env.settings import ObservationMode, VectorEnvSettings
-from protocol.alive import CallTimeouts
-from protocol.env_spec import EnvSpec, PickledCallable
-from protocol.envs.description import DescribedEnv
-from protocol.envs.spaces import leaves_with_own_dtype
-from protocol.errors import EnvironmentFailed, UsageError, safe_repr
-from protocol.specs import DescribeSpec, Leaf, StepSpec
-from protocol.wire.codec import check_can_be_sent
+from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.env_spec import EnvSpec, PickledCallable
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.envs.spaces import leaves_with_own_dtype
+from millrace.protocol.errors import EnvironmentFailed, UsageError, safe_repr
+from millrace.protocol.specs import DescribeSpec, Leaf, StepSpec
+from millrace.protocol.wire.codec import check_can_be_sent
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.specs import Leaf
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.specs import Leaf
 
 SEEDS = range(-(2**63), 2**64)
 """Seeds that a message can carry. The environment refuses others that it cannot use."""

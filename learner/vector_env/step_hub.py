@@ -13,16 +13,16 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
-from learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
-from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
-from learner.vector_env.shared_steps import SharedSteps
-from learner.vector_env.vector_env_status import status
-from protocol.errors import NoWorkers
-from protocol.messages import Answer, Order, Status
-from protocol.specs import StepSpec
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
+from millrace.learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
+from millrace.learner.vector_env.shared_steps import SharedSteps
+from millrace.learner.vector_env.vector_env_status import status
+from millrace.protocol.errors import NoWorkers
+from millrace.protocol.messages import Answer, Order, Status
+from millrace.protocol.specs import StepSpec
+from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from learner.vector_env.order_coordinator import OrderCoordinator
-from protocol.messages import Status
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.protocol.messages import Status
 
 
 def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], Status] | None = None) -> Status:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from millrace import import_conflict
 from millrace.cli.commands import COMMANDS
-from protocol.errors import UsageError
-from protocol.flags.parse import asks_for_help, show_help
+from millrace.protocol.errors import UsageError
+from millrace.protocol.flags.parse import asks_for_help, show_help
 
 
 def run(argv: list[str]) -> int:

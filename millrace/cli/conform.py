@@ -15,10 +15,10 @@ from millrace.conformance.examiner import Check, CheckResult
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import as_data, explanation, line_of, summary
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError
-from protocol.flags.fields import Flag, Positive
-from protocol.flags.parse import cut_at_dashes, parse_flags
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.flags.fields import Flag, Positive
+from millrace.protocol.flags.parse import cut_at_dashes, parse_flags
 
 
 class ConformFlags(msgspec.Struct, frozen=True, kw_only=True):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from learner.report.run_lines import find_runs
 from millrace.cli.flags import DashboardFlags
 from millrace.dashboard.serve import serve
-from protocol.address import is_local
-from protocol.errors import UsageError
-from protocol.flags.parse import parse_flags
+from millrace.learner.report.run_lines import find_runs
+from millrace.protocol.address import is_local
+from millrace.protocol.errors import UsageError
+from millrace.protocol.flags.parse import parse_flags
 
 
 def dashboard(argv: list[str]) -> int:

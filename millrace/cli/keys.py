@@ -11,10 +11,10 @@ from typing import Annotated
 import msgspec
 
 from millrace.cli.subcommands import chosen_subcommand
-from protocol.flags.fields import Flag
-from protocol.flags.parse import parse_flags
-from protocol.keys.key_folder import KeyFolder, chosen_key_folder
-from protocol.keys.keys import public_key
+from millrace.protocol.flags.fields import Flag
+from millrace.protocol.flags.parse import parse_flags
+from millrace.protocol.keys.key_folder import KeyFolder, chosen_key_folder
+from millrace.protocol.keys.keys import public_key
 
 
 class KeysFlags(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,7 +10,7 @@ from millrace.cli.subcommands import chosen_subcommand
 from millrace.launch.kubernetes import manifest
 from millrace.launch.launcher_flags import SET_BY_LAUNCHER, read_flags
 from millrace.launch.slurm import script
-from protocol.errors import UsageError
+from millrace.protocol.errors import UsageError
 
 LAUNCHERS: dict[str, type[LaunchFlags]] = {"kubernetes": KubernetesFlags, "slurm": SlurmFlags, "ray": RayFlags}
 ABOUT = "Start a learner and workers on a cluster. Put flags of `millrace learner` after `--`."

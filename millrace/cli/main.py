@@ -15,12 +15,12 @@ from contextlib import suppress
 from pathlib import Path
 
 import millrace
-from learner.run_folder.last_line import last_line
-from learner.run_folder.run_format import is_run_folder
-from learner.standard_streams import prepare_streams, unfailing
 from millrace.cli.commands import COMMANDS, GROUPS, run_command
-from protocol.bounds import escaped, indented
-from protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
+from millrace.learner.run_folder.last_line import last_line
+from millrace.learner.run_folder.run_format import is_run_folder
+from millrace.learner.standard_streams import prepare_streams, unfailing
+from millrace.protocol.bounds import escaped, indented
+from millrace.protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 NOT_IN_WORKERS = {

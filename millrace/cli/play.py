@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from millrace.cli.flags import EvaluateFlags, RecordFlags
+from millrace.protocol.flags.parse import parse_flags
 from millrace.terminal import count_line
-from protocol.flags.parse import parse_flags
 
 
 def evaluate(argv: list[str]) -> int:

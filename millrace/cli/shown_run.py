@@ -11,19 +11,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from learner.config.presets import origin
-from learner.run_folder.results import ALL_STEPS_DONE
-from learner.run_folder.run_folder import RunFolder
-from learner.standard_streams import unfailing
+from millrace.learner.config.presets import origin
+from millrace.learner.run_folder.results import ALL_STEPS_DONE
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.standard_streams import unfailing
+from millrace.protocol.flags.program_name import typed_name
+from millrace.protocol.logs.notices import log_notice
 from millrace.terminal import progress_view
-from protocol.flags.program_name import typed_name
-from protocol.logs.notices import log_notice
 
 if TYPE_CHECKING:
-    from learner.callbacks.callbacks import Watch
-    from learner.config.config import Config
-    from learner.run_folder.progress import Progress
-    from learner.run_folder.results import Summary
+    from millrace.learner.callbacks.callbacks import Watch
+    from millrace.learner.config.config import Config
+    from millrace.learner.run_folder.progress import Progress
+    from millrace.learner.run_folder.results import Summary
 
 log = logging.getLogger("millrace.learner")
 

@@ -20,20 +20,20 @@ from typing import Annotated, TextIO
 import msgspec
 from msgspec import Meta
 
-from learner.members.held_up import in_words
-from learner.report.run_lines import RunLine, in_sentences, read_line
-from learner.report.sentences import bottleneck, lag_in_words, per_second, went_wrong
-from learner.run_folder.run_format import is_run_folder
-from learner.run_folder.run_lock import learner_of_run
-from protocol.errors import Refused, RunError, UsageError
-from protocol.flags.fields import Flag
-from protocol.flags.parse import parse_flags
-from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
-from protocol.keys.keys import Token
-from protocol.messages import Inquire, Status, WorkerStatus
-from protocol.wire.codec import encode
-from protocol.wire.worker_link import OF_OBSERVER, WorkerLink
-from workers.conversation.connection_rules import checked_token
+from millrace.learner.members.held_up import in_words
+from millrace.learner.report.run_lines import RunLine, in_sentences, read_line
+from millrace.learner.report.sentences import bottleneck, lag_in_words, per_second, went_wrong
+from millrace.learner.run_folder.run_format import is_run_folder
+from millrace.learner.run_folder.run_lock import learner_of_run
+from millrace.protocol.errors import Refused, RunError, UsageError
+from millrace.protocol.flags.fields import Flag
+from millrace.protocol.flags.parse import parse_flags
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.messages import Inquire, Status, WorkerStatus
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
+from millrace.workers.conversation.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are right-aligned

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from learner.config.command_line import read_config
 from millrace.cli.shown_run import show_run
+from millrace.learner.config.command_line import read_config
 
 
 def train(argv: list[str]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from workers.__main__ import main
+from millrace.workers.__main__ import main
 
 
 def run(argv: list[str]) -> int:

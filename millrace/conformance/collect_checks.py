@@ -28,11 +28,11 @@ from millrace.conformance.learner import QUIET_S, Learner
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
 from millrace.conformance.watch import resets_too_early
-from protocol.arrays import Floats
-from protocol.envs.description import agents_in_words
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
-from protocol.messages import (
+from millrace.protocol.arrays import Floats
+from millrace.protocol.envs.description import agents_in_words
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import UsageError
+from millrace.protocol.messages import (
     Collect,
     Drain,
     Evaluate,
@@ -49,12 +49,12 @@ from protocol.messages import (
     Rollout,
     Weights,
 )
-from protocol.policy.features import leaf_of_features
-from protocol.policy.layout import acting_size, buffer_size, named_views, parameter_layout
-from protocol.specs import PolicySpec, RunSpec, seat_returns
-from protocol.wire.codec import encode
-from protocol.wire.plain_values import pack
-from protocol.wire.weight_dtypes import to_wire_dtype
+from millrace.protocol.policy.features import leaf_of_features
+from millrace.protocol.policy.layout import acting_size, buffer_size, named_views, parameter_layout
+from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.plain_values import pack
+from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
 STEPS = 32  # T of most checks
 TIMED_STEPS = 200  # T of a rollout that tells how fast the client is

@@ -21,7 +21,6 @@ from pathlib import Path
 
 import zmq
 
-from learner.members.bound import bind
 from millrace.conformance.examiner import Check, CheckResult, Examiner
 from millrace.conformance.learner import Settings
 from millrace.conformance.script import (
@@ -35,11 +34,12 @@ from millrace.conformance.script import (
     SendFrames,
     StartClient,
 )
-from protocol.bounds import escaped
-from protocol.errors import UsageError
-from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring
-from protocol.keys.keys import Token
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.bound import bind
+from millrace.protocol.bounds import escaped
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.wire.learner_link import LearnerLink
 
 ADDRESS_VARIABLE = "MILLRACE_ADDRESS"
 ADDRESS_WORD, TOKEN_WORD = "{address}", "{token}"

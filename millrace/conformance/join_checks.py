@@ -13,10 +13,10 @@ from millrace.conformance import rules
 from millrace.conformance.learner import Learner
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import AskToStop, Broken, CutConnection, Listen, Script, Skipped, Wait, brief
-from protocol.bounds import MAX_LINE
-from protocol.envs.description import DescribedEnv, read_description
-from protocol.errors import BadMessage, UsageError
-from protocol.messages import (
+from millrace.protocol.bounds import MAX_LINE
+from millrace.protocol.envs.description import DescribedEnv, read_description
+from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.messages import (
     Described,
     Drain,
     Goodbye,
@@ -31,8 +31,8 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.specs import DescribeSpec
-from protocol.wire.socket_options import routing_id
+from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.wire.socket_options import routing_id
 
 MOST_LIMIT_STEPS = 2000  # of a time limit that a check walks to
 POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # balance the pole of a cart, so that its episodes reach the time limit

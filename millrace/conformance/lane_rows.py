@@ -12,14 +12,14 @@ import numpy as np
 
 from millrace.conformance import rules
 from millrace.conformance.script import Broken
-from protocol.arrays import Array, Bools, Floats
-from protocol.messages import Weights
-from protocol.policy.distributions import distribution
-from protocol.policy.policy import make_policy
-from protocol.rollout import Rollout
-from protocol.rows.array_checks import place_of
-from protocol.specs import RunSpec
-from protocol.wire.weight_dtypes import to_float32
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.messages import Weights
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.rows.array_checks import place_of
+from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire.weight_dtypes import to_float32
 
 RETURN_TOLERANCE = 1e-4  # relative: the rows carry rewards in float32, the sums are of float64
 LOG_PROB_TOLERANCE = 1e-3  # absolute: another order of additions gives other last bits

@@ -29,11 +29,11 @@ from millrace.conformance.script import (
     brief,
 )
 from millrace.conformance.watch import WatchedSession
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.errors import BadMessage
-from protocol.keys.keys import Token
-from protocol.messages import (
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
     Failure,
@@ -46,8 +46,8 @@ from protocol.messages import (
     ToWorker,
     Welcome,
 )
-from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from protocol.wire.codec import Buffer, encode
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.wire.codec import Buffer, encode
 
 M = TypeVar("M")
 QUIET_S = 0.7

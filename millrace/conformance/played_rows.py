@@ -10,11 +10,11 @@ import numpy as np
 from millrace.conformance import rules
 from millrace.conformance.lane_rows import LOG_PROB_TOLERANCE, can_be_recomputed, is_return, params_of
 from millrace.conformance.script import Broken, brief
-from protocol.arrays import Array
-from protocol.messages import EpisodeRows, Evaluate, Evaluated, Weights
-from protocol.policy.distributions import distribution
-from protocol.rows.played import reason_to_reject
-from protocol.specs import RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, Weights
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.rows.played import reason_to_reject
+from millrace.protocol.specs import RunSpec
 
 BY_CHANCE = -14.0  # log of a probability: that so many drawn actions are all the most probable ones
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from millrace.conformance.rules import Rule
-from protocol.errors import BadMessage
-from protocol.messages import Inquire, ToLearner
-from protocol.wire.codec import Buffer
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.messages import Inquire, ToLearner
+from millrace.protocol.wire.codec import Buffer
 
 T = TypeVar("T")
 

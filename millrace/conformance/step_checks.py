@@ -25,11 +25,11 @@ from millrace.conformance.learner import Learner
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
 from millrace.conformance.watch import resets_too_early
-from protocol.arrays import Array
-from protocol.bounds import MAX_LINE
-from protocol.envs.description import DescribedEnv
-from protocol.envs.spaces import leaves_with_own_dtype, make_flatten
-from protocol.messages import (
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MAX_LINE
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.envs.spaces import leaves_with_own_dtype, make_flatten
+from millrace.protocol.messages import (
     Call,
     Drain,
     Failure,
@@ -42,9 +42,9 @@ from protocol.messages import (
     Stepped,
     Weights,
 )
-from protocol.specs import StepSpec
-from protocol.wire.codec import encode
-from protocol.wire.plain_values import pack, unpack
+from millrace.protocol.specs import StepSpec
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.plain_values import pack, unpack
 
 WALK_STEPS = 300  # steps of the walk that looks for ends of episodes
 APART_STEPS = 8  # in which actions that copies do not share make a difference

@@ -16,8 +16,8 @@ from millrace.conformance.lane_rows import LaneRows
 from millrace.conformance.played_rows import PlayedRows
 from millrace.conformance.rules import Rule
 from millrace.conformance.script import Broken, brief
-from protocol.errors import BadRollout
-from protocol.messages import (
+from millrace.protocol.errors import BadRollout
+from millrace.protocol.messages import (
     Answer,
     Call,
     Collect,
@@ -45,9 +45,9 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.rows.rollout_checks import validate
-from protocol.rows.stepped import wrong_rows
-from protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.rows.stepped import wrong_rows
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds

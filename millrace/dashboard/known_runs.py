@@ -12,17 +12,17 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from learner.report.metrics_tail import MetricsTail
-from learner.report.reported_runs import ReportedRun, read_run
-from learner.report.run_lines import RunLine, find_runs, read_line
-from learner.run_folder.json_log import RUN_LOG_FILE
-from learner.run_folder.metrics_log import METRICS_FILE
-from learner.run_folder.regular_files import open_regular, reason, regular_files
-from learner.run_folder.results import SUMMARY_FILE
-from learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
-from learner.run_folder.run_lock import LOCK_FILE
-from protocol.bounds import escaped
-from protocol.errors import UsageError
+from millrace.learner.report.metrics_tail import MetricsTail
+from millrace.learner.report.reported_runs import ReportedRun, read_run
+from millrace.learner.report.run_lines import RunLine, find_runs, read_line
+from millrace.learner.run_folder.json_log import RUN_LOG_FILE
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files
+from millrace.learner.run_folder.results import SUMMARY_FILE
+from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
+from millrace.learner.run_folder.run_lock import LOCK_FILE
+from millrace.protocol.bounds import escaped
+from millrace.protocol.errors import UsageError
 
 CHANGES = ("", CONFIG_FILE, RUN_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
 MOST_KEPT = 64  # runs whose rows are in memory

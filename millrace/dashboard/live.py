@@ -17,12 +17,12 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from millrace.cli.status import observer_name, whom_to_ask
-from protocol.bounds import one_line
-from protocol.errors import UserFacingError
-from protocol.keys.keys import Token
-from protocol.messages import Inquire, Status, WorkerStatus
-from protocol.wire.codec import encode
-from protocol.wire.worker_link import OF_OBSERVER, WorkerLink
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import UserFacingError
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.messages import Inquire, Status, WorkerStatus
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 
 ASK_EVERY_S = 0.5
 LOOKED_AT_S = 10.0  # a page that is open asks each second

@@ -14,22 +14,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from learner.members.held_up import in_words
-from learner.metric_names import METRICS, NONE, described, label
-from learner.report.charts import DOT_KEY, Segment, Series, bar, chart_for_all_widths
-from learner.report.curve import points
-from learner.report.history import clock_time
-from learner.report.html_parts import return_text, section
-from learner.report.reported_runs import ReportedRun, RunResults
-from learner.report.run_lines import RunLine, algorithm_label, duration, headline
-from learner.report.sentences import bottleneck, per_second, went_wrong
-from learner.run_folder.json_log import LoggedLine
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
 from millrace.dashboard.live import LaneSample, Seen
-from protocol.arrays import Doubles
-from protocol.bounds import escaped
-from protocol.messages import Status, WorkerStatus
+from millrace.learner.members.held_up import in_words
+from millrace.learner.metric_names import METRICS, NONE, described, label
+from millrace.learner.report.charts import DOT_KEY, Segment, Series, bar, chart_for_all_widths
+from millrace.learner.report.curve import points
+from millrace.learner.report.history import clock_time
+from millrace.learner.report.html_parts import return_text, section
+from millrace.learner.report.reported_runs import ReportedRun, RunResults
+from millrace.learner.report.run_lines import RunLine, algorithm_label, duration, headline
+from millrace.learner.report.sentences import bottleneck, per_second, went_wrong
+from millrace.learner.run_folder.json_log import LoggedLine
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
+from millrace.protocol.arrays import Doubles
+from millrace.protocol.bounds import escaped
+from millrace.protocol.messages import Status, WorkerStatus
 
 WIDE = 1080, 360
 SHOWN_S, LEAST_SHOWN_S = 180.0, 30.0  # of who waits for whom

@@ -14,12 +14,12 @@ from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from learner.interrupts import Interrupts, Stopped
 from millrace.dashboard.known_runs import KnownRuns
 from millrace.dashboard.live import Lookout
 from millrace.dashboard.server import DashboardServer
 from millrace.dashboard.site import Site
-from protocol.errors import UserFacingError
+from millrace.learner.interrupts import Interrupts, Stopped
+from millrace.protocol.errors import UserFacingError
 
 LOOK_FOR_SIGNALS_S = 0.1
 LINGER_S = 2.5  # so that pages which are open show the end

@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from millrace.dashboard.http import PageAnswer, PageRequest, answer_parts, parsed, refusal, why_refused
-from protocol.address import WILDCARDS
-from protocol.errors import UsageError
+from millrace.protocol.address import WILDCARDS
+from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.dashboard")
 

@@ -15,20 +15,20 @@ from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
-from learner.report import ledger_and_stages, sections
-from learner.report.history import history
-from learner.report.html_parts import document, return_text, section
-from learner.report.page import STYLE
-from learner.report.reported_runs import ReportData, group_runs
-from learner.report.run_lines import RunLine, algorithm_label, duration
-from learner.report.sentences import per_second
-from learner.run_folder.regular_files import open_regular
 from millrace.dashboard import run_page
 from millrace.dashboard.http import PageAnswer, PageRequest, StoredBody, refusal
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import Seen
 from millrace.dashboard.run_page import Choice
-from protocol.errors import UsageError
+from millrace.learner.report import ledger_and_stages, sections
+from millrace.learner.report.history import history
+from millrace.learner.report.html_parts import document, return_text, section
+from millrace.learner.report.page import STYLE
+from millrace.learner.report.reported_runs import ReportData, group_runs
+from millrace.learner.report.run_lines import RunLine, algorithm_label, duration
+from millrace.learner.report.sentences import per_second
+from millrace.learner.run_folder.regular_files import open_regular
+from millrace.protocol.errors import UsageError
 
 SCRIPT = Path(__file__).with_name("page.js")
 MOST_FILM_BYTES = 64 * 2**20

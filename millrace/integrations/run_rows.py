@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from learner.callbacks.callback import Callback
-from learner.run_folder.progress import Progress
-from protocol.errors import UsageError, refusals_of
+from millrace.learner.callbacks.callback import Callback
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.errors import UsageError, refusals_of
 
 
 class RowFilter:

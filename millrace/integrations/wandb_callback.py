@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from learner.run_folder.progress import ENV_STEPS_KEY, Progress
 from millrace.integrations.run_rows import RowCallback, flat_settings, run_name, tool
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, Progress
 
 
 class WandbCallback(RowCallback):

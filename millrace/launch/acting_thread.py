@@ -10,21 +10,21 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic
 
-from learner.members.membership import Member
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
 from millrace.launch.endpoint import Endpoint
-from protocol.alive import StartFailed, WorkerExit
-from protocol.arrays import Array
-from protocol.policy.policy import Policy, make_policy
-from protocol.specs import PolicySpec, RunSpec
-from protocol.wire.weight_dtypes import ActingDtype
-from workers.collect.collector import Collector
-from workers.copies.env_loop import Pulse
-from workers.copies.split_vector_env import SplitLane, SplitVectorEnv
-from workers.evaluate.evaluator import Evaluator
-from workers.supervise.supervisor import Supervisor
-from workers.worker_thread import WorkerThread
+from millrace.learner.members.membership import Member
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
+from millrace.protocol.alive import StartFailed, WorkerExit
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.wire.weight_dtypes import ActingDtype
+from millrace.workers.collect.collector import Collector
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.split_vector_env import SplitLane, SplitVectorEnv
+from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.supervise.supervisor import Supervisor
+from millrace.workers.worker_thread import WorkerThread
 
 NEVER_S = 1e9  # the timeout of an order that may take any time
 
@@ -86,7 +86,7 @@ def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
     """
     if device == "cpu" and not spec.needs_torch:
         return make_policy(spec)
-    from protocol.policy.torch_policy import TorchPolicy
+    from millrace.protocol.policy.torch_policy import TorchPolicy
 
     return TorchPolicy(spec, device, together=True, images=images)
 

@@ -11,17 +11,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from learner.members.bind_settings import BindSettings
-from learner.members.bound import Bound, bind, listen
-from learner.members.process_callbacks import ProcessCallbacks
 from millrace.launch.local_worker_options import FlagsOfWorker, private_address, temporary_keys
-from protocol.keys.keys import Token
-from protocol.wire.shared_memory import InheritedDescriptors
-from workers.conversation.connection_rules import LEARNER_STARTED_IT_S
-from workers.slots import copies_per_machine
-from workers.supervise.supervisor import STOP_WITHIN_S, Running, Supervisor
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.worker_thread import WorkerThread
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.bound import Bound, bind, listen
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.wire.shared_memory import InheritedDescriptors
+from millrace.workers.conversation.connection_rules import LEARNER_STARTED_IT_S
+from millrace.workers.slots import copies_per_machine
+from millrace.workers.supervise.supervisor import STOP_WITHIN_S, Running, Supervisor
+from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from millrace.workers.worker_thread import WorkerThread
 
 
 class StartedWorkers(NamedTuple):
@@ -97,7 +97,7 @@ class Endpoint(Bound):
 def open_endpoint(where: BindSettings, transport: str, resources: ExitStack, code: str = "") -> Endpoint:
     """Bind `where.bind`, or without one an address of this transport for local workers.
 
-    `code`: as of `learner.members.bound.bind`. Raises `UsageError`.
+    `code`: as of `millrace.learner.members.bound.bind`. Raises `UsageError`.
     """
     if where.bind:
         token, bound = None, listen(where, resources, code)

@@ -14,9 +14,9 @@ from datetime import datetime
 
 from millrace.cli.flags import KubernetesFlags
 from millrace.launch.launcher_flags import METRICS_PORT, learner_flags
-from protocol.errors import UsageError
-from protocol.home_folder import expanded
-from protocol.keys.key_folder import FIRST_CLIENT, KeyFolder
+from millrace.protocol.errors import UsageError
+from millrace.protocol.home_folder import expanded
+from millrace.protocol.keys.key_folder import FIRST_CLIENT, KeyFolder
 
 PORT = 5555
 TOKEN = f"{FIRST_CLIENT}.token"

@@ -9,10 +9,10 @@ import re
 from collections.abc import Sequence
 from typing import TypeVar
 
-from learner.config.command_line import read_config
 from millrace.cli.flags import LaunchFlags
-from protocol.errors import UsageError
-from protocol.flags.parse import cut_at_dashes, parse_flags
+from millrace.learner.config.command_line import read_config
+from millrace.protocol.errors import UsageError
+from millrace.protocol.flags.parse import cut_at_dashes, parse_flags
 
 Flags = TypeVar("Flags", bound=LaunchFlags)
 

@@ -13,26 +13,26 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from learner.callbacks.callbacks import Watch
-from learner.config.config import Config
-from learner.config.validation import workers_to_wait_for
-from learner.conversations import describe_settings
-from learner.interrupts import Interrupts
-from learner.members.bind_settings import BindSettings
-from learner.members.describe_coordinator import Accept
-from learner.resume_checks import Resumption
-from learner.run_setup import RunSetup, known_environment, prometheus_observer
-from learner.torch_setup import one_thread, torch_device
-from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import worker_flags
 from millrace.launch.page_beside import opened_folder
 from millrace.launch.vector import listen
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.specs import DescribeSpec
-from workers.supervise.supervisor import STOP_WITHIN_S
+from millrace.learner.callbacks.callbacks import Watch
+from millrace.learner.config.config import Config
+from millrace.learner.config.validation import workers_to_wait_for
+from millrace.learner.conversations import describe_settings
+from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.describe_coordinator import Accept
+from millrace.learner.resume_checks import Resumption
+from millrace.learner.run_setup import RunSetup, known_environment, prometheus_observer
+from millrace.learner.torch_setup import one_thread, torch_device
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.specs import DescribeSpec
+from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 
 def train(
@@ -70,7 +70,7 @@ def train(
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once
         processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
-        from learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
+        from millrace.learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
 
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)

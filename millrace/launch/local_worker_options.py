@@ -14,14 +14,14 @@ from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from learner.config.config import Config
-from learner.config.rollout_config import RolloutConfig
-from learner.members.bind_settings import generate_run_keys
-from learner.run_folder.regular_files import open_regular, reason, subfolder
-from protocol.errors import UsageError, safe_repr
-from protocol.keys.key_folder import Keyring, chosen_key_folder
-from protocol.keys.keys import Token
-from workers.supervise.supervisor import Supervisor, core_flags
+from millrace.learner.config.config import Config
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.members.bind_settings import generate_run_keys
+from millrace.learner.run_folder.regular_files import open_regular, reason, subfolder
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.keys.key_folder import Keyring, chosen_key_folder
+from millrace.protocol.keys.keys import Token
+from millrace.workers.supervise.supervisor import Supervisor, core_flags
 
 LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing

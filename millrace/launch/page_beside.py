@@ -14,13 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from learner.config.config import Config
-from learner.resume_checks import Resumption
-from learner.run_folder.run_folder import RunFolder
-from learner.run_setup import run_folder
+from millrace.learner.config.config import Config
+from millrace.learner.resume_checks import Resumption
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_setup import run_folder
+from millrace.protocol.errors import RunError
+from millrace.protocol.logs.notices import log_notice
 from millrace.terminal import in_notebook
-from protocol.errors import RunError
-from protocol.logs.notices import log_notice
 
 START_WITHIN_S = 60.0
 NOTEBOOK_PIXELS = 640

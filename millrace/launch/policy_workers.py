@@ -12,17 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from learner.config.rollout_config import RolloutConfig
-from learner.conversations import describe_settings
-from learner.interrupts import Interrupts
-from learner.members.bind_settings import BindSettings
-from learner.policy_player import PolicyPlayer, SavedPolicy
-from learner.torch_setup import one_thread
-from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import FlagsOfWorker
 from millrace.launch.vector import listen
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.conversations import describe_settings
+from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.policy_player import PolicyPlayer, SavedPolicy
+from millrace.learner.torch_setup import one_thread
+from millrace.learner.vector_env.settings import VectorEnvSettings
 
 
 @dataclass(frozen=True)

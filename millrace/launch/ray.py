@@ -14,15 +14,15 @@ from pathlib import Path
 
 import ray
 
-from learner.callbacks.callbacks import Watch
-from learner.config.command_line import read_config
-from learner.members.bind_settings import keyring_for
 from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
 from millrace.launch.ray_worker import WorkerHost
 from millrace.launch.training import train
-from protocol.errors import UsageError, first_line, refusals_of
-from protocol.keys.key_folder import Keyring, read_token
+from millrace.learner.callbacks.callbacks import Watch
+from millrace.learner.config.command_line import read_config
+from millrace.learner.members.bind_settings import keyring_for
+from millrace.protocol.errors import UsageError, first_line, refusals_of
+from millrace.protocol.keys.key_folder import Keyring, read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:

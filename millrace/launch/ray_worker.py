@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from protocol.keys.key_folder import TOKEN_VARIABLE
-from workers.__main__ import main as run_worker
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
+from millrace.workers.__main__ import main as run_worker
 
 FINAL_EXIT_CODES = (0, 2)  # the learner asked it to leave, or refused it; after any other code it is started again
 

@@ -8,22 +8,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
-from learner.config.rollout_config import RolloutConfig
-from learner.config.validation import workers_to_wait_for
-from learner.conversations import describe_settings, describe_spec, open_hub, rollout_spec
-from learner.env_spaces import EnvSpaces
-from learner.members.bind_settings import BindSettings
-from learner.members.describe import described_by_workers
-from learner.rollouts.hub import Hub
-from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import stopped_on_error, worker_cores
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.config.validation import workers_to_wait_for
+from millrace.learner.conversations import describe_settings, describe_spec, open_hub, rollout_spec
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.describe import described_by_workers
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.rollouts.ledger import Ledger
 from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.specs import RunSpec
-from workers.supervise.supervisor import core_flags
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.specs import RunSpec
+from millrace.workers.supervise.supervisor import core_flags
 
 
 def start(

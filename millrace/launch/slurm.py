@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 from millrace.cli.flags import SlurmFlags
 from millrace.launch.launcher_flags import learner_flags
-from protocol.errors import UsageError
-from protocol.home_folder import expanded
+from millrace.protocol.errors import UsageError
+from millrace.protocol.home_folder import expanded
 
 
 def script(flags: SlurmFlags, rest: Sequence[str]) -> str:

@@ -9,26 +9,26 @@ import logging
 from contextlib import ExitStack
 from pathlib import Path
 
-from learner.callbacks.callbacks import Watch
-from learner.config.config import Config
-from learner.config.validation import check_copies, idle_workers, workers_to_wait_for
-from learner.interrupts import Interrupts
-from learner.members.bind_settings import BindSettings
-from learner.resume_checks import Resumption, unless_finished
-from learner.run_setup import (
+from millrace.launch.endpoint import open_endpoint
+from millrace.launch.local_worker_options import FlagsOfWorker, no_flags, stopped_on_error, worker_flags
+from millrace.launch.page_beside import opened_folder
+from millrace.learner.callbacks.callbacks import Watch
+from millrace.learner.config.config import Config
+from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
+from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.resume_checks import Resumption, unless_finished
+from millrace.learner.run_setup import (
     RunSetup,
     describe_over,
     known_environment,
     named_environment,
     prometheus_observer,
 )
-from learner.torch_setup import one_thread
-from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import FlagsOfWorker, no_flags, stopped_on_error, worker_flags
-from millrace.launch.page_beside import opened_folder
-from protocol.env_spec import EnvSpec
-from workers.slots import LIMIT_VARIABLE, copies_per_machine
-from workers.supervise.supervisor import STOP_WITHIN_S
+from millrace.learner.torch_setup import one_thread
+from millrace.protocol.env_spec import EnvSpec
+from millrace.workers.slots import LIMIT_VARIABLE, copies_per_machine
+from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 log = logging.getLogger("millrace.learner")
 
@@ -73,7 +73,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
         folder = folder or opened_folder(config, None, stack)  # not before a worker elsewhere has come
-        from learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
+        from millrace.learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
 
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)

@@ -17,28 +17,28 @@ from typing import Literal
 import msgspec
 from gymnasium.vector import AutoresetMode
 
-from learner.members.bind_settings import BindSettings
-from learner.members.describe import DescribeSettings, described_by_workers
-from learner.members.describe_coordinator import Accept, accept_any
-from learner.members.events import Failed
-from learner.members.failure_count import FailureCount
-from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.settings import ObservationMode, VectorEnvSettings
-from learner.vector_env.shared_steps import SharedSteps
-from learner.vector_env.spec import RequestedCopies, observation_spaces, requested_copies
-from learner.vector_env.step_hub import StepHub
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker, no_flags
-from protocol.address import advertised_address, check_address
-from protocol.alive import CallTimeouts
-from protocol.env_spec import EnvLike, EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError
-from protocol.machine.cpu_cores import usable_cores
-from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
-from protocol.wire.wake_up import SPIN_S, WakePipe
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.describe import DescribeSettings, described_by_workers
+from millrace.learner.members.describe_coordinator import Accept, accept_any
+from millrace.learner.members.events import Failed
+from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
+from millrace.learner.vector_env.shared_steps import SharedSteps
+from millrace.learner.vector_env.spec import RequestedCopies, observation_spaces, requested_copies
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.protocol.address import advertised_address, check_address
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.env_spec import EnvLike, EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.cpu_cores import usable_cores
+from millrace.protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
+from millrace.protocol.wire.wake_up import SPIN_S, WakePipe
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join

@@ -12,10 +12,10 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
-from protocol.policy.masks import MASK, choices
-from protocol.specs import Leaf
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.masks import MASK, choices
+from millrace.protocol.specs import Leaf
 
 
 def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.bounds import one_line
+from millrace.protocol.bounds import one_line
 
 RESET, STEP = "observation, info", "observation, reward, terminated, truncated, info"
 """What each method returns."""

@@ -13,15 +13,15 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
-from protocol.arrays import Array
-from protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
-from protocol.envs.advice.space_advice import observation_advice
-from protocol.envs.seats import SeatedEnv
-from protocol.envs.space_generators import generator_states, restore_generators
-from protocol.envs.space_records import describe_space, make_space
-from protocol.errors import BadMessage, UsageError, first_line, joined
-from protocol.space_spec import MAX_SEATS, MAX_WRAPPERS, EnvDescription, SpaceSpec, check_size
-from protocol.wire import plain_values
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
+from millrace.protocol.envs.advice.space_advice import observation_advice
+from millrace.protocol.envs.seats import SeatedEnv
+from millrace.protocol.envs.space_generators import generator_states, restore_generators
+from millrace.protocol.envs.space_records import describe_space, make_space
+from millrace.protocol.errors import BadMessage, UsageError, first_line, joined
+from millrace.protocol.space_spec import MAX_SEATS, MAX_WRAPPERS, EnvDescription, SpaceSpec, check_size
+from millrace.protocol.wire import plain_values
 
 MAX_METADATA_BYTES = 1 << 16
 
@@ -80,7 +80,7 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
 def read_description(description: EnvDescription) -> DescribedEnv:
     """The properties that a description gives. Raises `BadMessage` if it describes no environment, and no other error.
 
-    It must have passed `protocol.space_spec.check_size`, as what was decoded has.
+    It must have passed `millrace.protocol.space_spec.check_size`, as what was decoded has.
     """
     if description.metadata.nbytes > MAX_METADATA_BYTES or description.metadata.dtype != np.uint8:
         raise BadMessage(f"metadata: expected at most {MAX_METADATA_BYTES} bytes, got {description.metadata.nbytes}")

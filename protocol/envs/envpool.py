@@ -19,9 +19,9 @@ from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import VectorEnv
 
-from protocol.env_spec import EnvSpec
-from protocol.envs.vectorized import check_unwrapped_id, vector_alternative
-from protocol.errors import UsageError
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.vectorized import check_unwrapped_id, vector_alternative
+from millrace.protocol.errors import UsageError
 
 MAX_EPISODE_STEPS = 2**31 - 1  # envpool counts steps in an int32
 _WARNINGS_LOCK = threading.Lock()
@@ -35,7 +35,7 @@ class EnvpoolSpec(NamedTuple):
     options: dict[str, Any]
     """keyword arguments of `envpool.make`"""
     limit: int
-    """steps after which `workers.copies.envpool_copies` truncates an episode; envpool itself does not"""
+    """steps after which `millrace.workers.copies.envpool_copies` truncates an episode; envpool itself does not"""
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     """Observation and action space of one copy."""

@@ -13,17 +13,17 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
-from protocol.envs.advice.atari_ids import preprocessed
-from protocol.envs.advice.config_dict import wants_a_dict
-from protocol.envs.advice.files_as_modules import module_of_file
-from protocol.envs.advice.missing_modules import what_to_install
-from protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
-from protocol.envs.advice.several_agents import what_it_lacks
-from protocol.envs.found_names import attribute
-from protocol.envs.seats import has_seats
-from protocol.envs.unknown_ids import most_similar, what_to_write
-from protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
-from protocol.errors import UsageError, first_line, joined, words_an_error
+from millrace.protocol.envs.advice.atari_ids import preprocessed
+from millrace.protocol.envs.advice.config_dict import wants_a_dict
+from millrace.protocol.envs.advice.files_as_modules import module_of_file
+from millrace.protocol.envs.advice.missing_modules import what_to_install
+from millrace.protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
+from millrace.protocol.envs.advice.several_agents import what_it_lacks
+from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.envs.seats import has_seats
+from millrace.protocol.envs.unknown_ids import most_similar, what_to_write
+from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
+from millrace.protocol.errors import UsageError, first_line, joined, words_an_error
 
 
 def names_a_function(env_id: str) -> bool:

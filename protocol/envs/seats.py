@@ -20,10 +20,10 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from protocol.bounds import MAX_NAME, one_line
-from protocol.envs.answers import OF_STEP, WrongAnswer, in_words, reset_answer, wrong_step
-from protocol.envs.found_names import attribute
-from protocol.errors import UsageError, safe_repr
+from millrace.protocol.bounds import MAX_NAME, one_line
+from millrace.protocol.envs.answers import OF_STEP, WrongAnswer, in_words, reset_answer, wrong_step
+from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.errors import UsageError, safe_repr
 
 SEAT, STATE = "seat", "state"
 """Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from protocol.errors import BadMessage
+from millrace.protocol.errors import BadMessage
 
 
 def generator_states(*given: gymnasium.Space[Any]) -> tuple[str, ...]:
@@ -40,7 +40,7 @@ def _with_inner(space: gymnasium.Space[Any]) -> Iterator[gymnasium.Space[Any]]:
 
 
 def _state(space: gymnasium.Space[Any]) -> str:
-    """As `protocol.space_spec.GeneratorState`. Not by `space.np_random`, which would seed a space that is not."""
+    """As `millrace.protocol.space_spec.GeneratorState`. Not by `space.np_random`, which would seed a space that is not."""
     generator: np.random.Generator | None = space._np_random
     if generator is None or not isinstance(generator.bit_generator, np.random.PCG64):
         return ""

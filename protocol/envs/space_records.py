@@ -13,11 +13,11 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from protocol.arrays import Array
-from protocol.bounds import LARGEST, MAX_NAME, one_line
-from protocol.envs.spaces import OBSERVATIONS
-from protocol.errors import BadMessage, UsageError, first_line
-from protocol.space_spec import (
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import LARGEST, MAX_NAME, one_line
+from millrace.protocol.envs.spaces import OBSERVATIONS
+from millrace.protocol.errors import BadMessage, UsageError, first_line
+from millrace.protocol.space_spec import (
     MAX_DEPTH,
     MAX_LEAVES,
     BoxSpace,
@@ -40,7 +40,7 @@ def describe_space(space: gymnasium.Space[Any], name: str = "space") -> SpaceSpe
 
 
 def make_space(spec: SpaceSpec) -> gymnasium.Space[Any]:
-    """The space of a record that passed `protocol.space_spec.check_size`. Raises `BadMessage` if there is no such space."""
+    """The space of a record that passed `millrace.protocol.space_spec.check_size`. Raises `BadMessage` if there is no such space."""
     try:
         return _make(spec)
     except BadMessage:

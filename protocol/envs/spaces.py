@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from protocol.arrays import Array
-from protocol.errors import UsageError
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import UsageError
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box"

@@ -25,9 +25,9 @@ import gymnasium
 from gymnasium.envs.registration import find_highest_version, parse_env_id
 from gymnasium.envs.registration import namespace as _namespace
 
-from protocol.bounds import one_line
-from protocol.envs.advice.missing_modules import what_to_install
-from protocol.errors import first_line, words_an_error
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.advice.missing_modules import what_to_install
+from millrace.protocol.errors import first_line, words_an_error
 
 GROUP = "gymnasium.envs"
 LARGEST_FILE, LARGEST_PACKAGE = 1 << 20, 1 << 24  # bytes of source text that are read

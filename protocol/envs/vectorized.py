@@ -10,9 +10,9 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from protocol.env_spec import EnvSpec
-from protocol.envs.advice.atari_ids import preprocessed
-from protocol.errors import UsageError
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.advice.atari_ids import preprocessed
+from millrace.protocol.errors import UsageError
 
 
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
-from protocol.errors import UsageError
+from millrace.protocol.errors import UsageError
 
 _EXPRESSION = re.compile(r"\{([\w\s()+*/%-]{1,100})\}")
 _OPERATORS: dict[type[ast.operator], Callable[[int, int], int]] = {

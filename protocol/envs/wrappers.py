@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import gymnasium
 
-from protocol.bounds import one_line
-from protocol.envs.advice.several_agents import what_it_lacks
-from protocol.envs.found_names import found_by_others, in_main, last_part, name_of
-from protocol.envs.seats import has_seats
-from protocol.errors import UsageError, first_line, safe_repr
-from protocol.own_module import own_callable
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.advice.several_agents import what_it_lacks
+from millrace.protocol.envs.found_names import found_by_others, in_main, last_part, name_of
+from millrace.protocol.envs.seats import has_seats
+from millrace.protocol.errors import UsageError, first_line, safe_repr
+from millrace.protocol.own_module import own_callable
 
 Wrapper = Callable[..., Any]
 WrapperLike = str | Wrapper

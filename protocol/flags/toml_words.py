@@ -12,8 +12,8 @@ import json
 import shlex
 import tomllib
 
-from protocol.bounds import one_line
-from protocol.errors import UsageError
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import UsageError
 
 IN_TOML = {
     "true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false", "nan": "nan",

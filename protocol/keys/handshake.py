@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import zmq
 
-from protocol.keys.keys import Token, fingerprint
+from millrace.protocol.keys.keys import Token, fingerprint
 
 FAILED = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 LEARNER_EVENTS = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED

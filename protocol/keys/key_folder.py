@@ -20,9 +20,9 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-from protocol.errors import UsageError
-from protocol.home_folder import expanded
-from protocol.keys.keys import KEY_BYTES, ClientList, Key, Token, check_name
+from millrace.protocol.errors import UsageError
+from millrace.protocol.home_folder import expanded
+from millrace.protocol.keys.keys import KEY_BYTES, ClientList, Key, Token, check_name
 
 log = logging.getLogger("millrace.cli.keys")
 

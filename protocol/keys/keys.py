@@ -19,8 +19,8 @@ import msgspec
 import zmq
 import zmq.utils.z85
 
-from protocol.bounds import INVALID
-from protocol.errors import UsageError
+from millrace.protocol.bounds import INVALID
+from millrace.protocol.errors import UsageError
 
 KEY_BYTES = 32
 CHECK_BYTES = 4

@@ -24,11 +24,11 @@ from contextlib import suppress
 
 import zmq
 
-from protocol.errors import UsageError
-from protocol.keys.handshake import LEARNER_EVENTS, PendingHandshakes
-from protocol.keys.key_folder import Keyring
-from protocol.keys.keys import KEY_BYTES, Key, Token
-from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.handshake import LEARNER_EVENTS, PendingHandshakes
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.keys.keys import KEY_BYTES, Key, Token
+from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 
 log = logging.getLogger("millrace.authenticator")
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protocol.token_bucket import TokenBucket
+from millrace.protocol.token_bucket import TokenBucket
 
 
 class LogRateLimiter:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from protocol.machine.control_groups import cpu_quota
+from millrace.protocol.machine.control_groups import cpu_quota
 
 
 def usable_cores(system: Path = Path("/")) -> int:

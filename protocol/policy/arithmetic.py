@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from protocol.policy.layout import convolutions, parameter_layout
-from protocol.specs import PolicySpec
+from millrace.protocol.policy.layout import convolutions, parameter_layout
+from millrace.protocol.specs import PolicySpec
 
 
 def multiply_adds(spec: PolicySpec) -> int:
@@ -21,7 +21,7 @@ def multiply_adds(spec: PolicySpec) -> int:
             total += math.prod(field.shape) * places.get(field.name, 1)
     if spec.encoder is None or spec.own is not None:
         return total
-    from protocol.policy.encoder import multiply_adds_of_encoder
+    from millrace.protocol.policy.encoder import multiply_adds_of_encoder
 
     return total + multiply_adds_of_encoder(spec)
 

@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.arrays import Array, Bools, Floats
-from protocol.errors import PolicyFailed, UsageError, first_line
-from protocol.own_module import own_callable
-from protocol.policy.layout import named_views, parameter_layout
-from protocol.policy.masks import not_allowed
-from protocol.rows.array_checks import wrong_values
-from protocol.specs import ExtraArray, OwnPolicySpec, PolicySpec
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.errors import PolicyFailed, UsageError, first_line
+from millrace.protocol.own_module import own_callable
+from millrace.protocol.policy.layout import named_views, parameter_layout
+from millrace.protocol.policy.masks import not_allowed
+from millrace.protocol.rows.array_checks import wrong_values
+from millrace.protocol.specs import ExtraArray, OwnPolicySpec, PolicySpec
 
 LOG_PROB = ExtraArray("log_prob", (), "float32")
 

@@ -12,7 +12,7 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
 
 The warm-up number is 1 or 0. While it is 1, the actions of the last two are uniform in [-1, 1].
 
-`protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares them.
+`millrace.protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import Protocol
 
 import numpy as np
 
-from protocol.arrays import Array, Floats
-from protocol.specs import PolicySpec
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.specs import PolicySpec
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _TINY = np.float32(1e-30)

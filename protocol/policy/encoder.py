@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
-from protocol.errors import UsageError, first_line
-from protocol.own_module import own_callable
-from protocol.policy.features import feature_size
-from protocol.random_streams import Purpose, torch_seed
-from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
+from millrace.protocol.errors import UsageError, first_line
+from millrace.protocol.own_module import own_callable
+from millrace.protocol.policy.features import feature_size
+from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
 ROWS = 2  # observations of a trial pass: with one, a module that mixes up rows would not be noticed
 

@@ -11,8 +11,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from protocol.arrays import Array, Doubles, Floats
-from protocol.specs import Leaf, PolicySpec
+from millrace.protocol.arrays import Array, Doubles, Floats
+from millrace.protocol.specs import Leaf, PolicySpec
 
 CLIP = np.float32(10.0)  # normalized observations are clipped to ±10
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from protocol.specs import Leaf, PolicySpec
+from millrace.protocol.specs import Leaf, PolicySpec
 
 LEAST_SIDE = 36  # pixels, from which on an image goes through three convolutions
 COLORS = (1, 3, 4)

@@ -2,7 +2,7 @@
 
 All parameters of a policy are in one flat float32 buffer. The parameters that are needed to act come first. So publishing
 copies the first part of the buffer, and loading makes views of the received frame. Only `parameter_layout` defines the
-positions. The parameters of the networks in `protocol.policy.networks` are views with the same layout.
+positions. The parameters of the networks in `millrace.protocol.policy.networks` are views with the same layout.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.policy.distributions import distribution
-from protocol.policy.features import critic_size, feature_size
-from protocol.policy.recurrent import core_shapes
-from protocol.specs import Leaf, PolicySpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.features import critic_size, feature_size
+from millrace.protocol.policy.recurrent import core_shapes
+from millrace.protocol.specs import Leaf, PolicySpec
 
 IMAGE_FEATURES = 128  # width of the layer between the convolutions of one image and the rest
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Floats
-from protocol.policy.distributions import Distribution, EpsilonGreedy, distribution
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.policy.distributions import Distribution, EpsilonGreedy, distribution
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 
 MASK = "action_mask"  # the key in `info`, or in a Dict observation
 FORBIDDEN = -1e30

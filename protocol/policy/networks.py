@@ -1,8 +1,8 @@
 """The networks in torch. The learner trains them, and workers with images act with them.
 
-All parameters are in one flat float32 tensor, in the layout of `protocol.policy.layout`, and all gradients in a second one.
+All parameters are in one flat float32 tensor, in the layout of `millrace.protocol.policy.layout`, and all gradients in a second one.
 The named arrays are views of these two. So the gradient norm is the norm of one tensor, Adam is one kernel, and publishing
-copies the first part of one tensor. Features come from `protocol.policy.features` (numpy) and are already normalized.
+copies the first part of one tensor. Features come from `millrace.protocol.policy.features` (numpy) and are already normalized.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from protocol.policy.encoder import make_encoder
-from protocol.policy.features import feature_size
-from protocol.policy.layout import (
+from millrace.protocol.policy.encoder import make_encoder
+from millrace.protocol.policy.features import feature_size
+from millrace.protocol.policy.layout import (
     CRITICS,
     LOG_STD_BOUNDS,
     Field,
@@ -28,11 +28,11 @@ from protocol.policy.layout import (
     parameter_layout,
     total_size,
 )
-from protocol.policy.malloc import keep_freed_memory
-from protocol.policy.masks import FORBIDDEN
-from protocol.policy.torch_distributions import log_prob_and_entropy, squashed_sample
-from protocol.random_streams import Purpose, torch_seed
-from protocol.specs import PolicySpec
+from millrace.protocol.policy.malloc import keep_freed_memory
+from millrace.protocol.policy.masks import FORBIDDEN
+from millrace.protocol.policy.torch_distributions import log_prob_and_entropy, squashed_sample
+from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.specs import PolicySpec
 
 DTYPE = torch.float32
 """of all parameters, whatever PyTorch's default is"""

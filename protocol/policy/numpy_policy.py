@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.arrays import Array, Floats
-from protocol.policy.features import features, normalize
-from protocol.policy.layout import (
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.layout import (
     LOG_STD_BOUNDS,
     appended_params,
     buffer_layout,
@@ -22,8 +22,8 @@ from protocol.policy.layout import (
     parameter_layout,
     total_size,
 )
-from protocol.policy.recurrent import advance, zero_state
-from protocol.specs import PolicySpec
+from millrace.protocol.policy.recurrent import advance, zero_state
+from millrace.protocol.specs import PolicySpec
 
 
 class NumpyPolicy:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from protocol.arrays import Array, Floats
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.specs import PolicySpec
-from protocol.wire.weight_dtypes import ActingDtype
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.specs import PolicySpec
+from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 
 class Policy(Protocol):
     """Chooses distribution parameters for observations. Leaves are [L, N, *leaf]; params are [L, N, P] float32.
 
-    `state` [L, N, S] float32 is the state of the recurrent core. A call updates it in place (`protocol.policy.recurrent`).
+    `state` [L, N, S] float32 is the state of the recurrent core. A call updates it in place (`millrace.protocol.policy.recurrent`).
     """
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -33,6 +33,6 @@ def make_policy(spec: PolicySpec, images: ActingDtype = "float32") -> Policy:
     """
     if not spec.needs_torch:
         return NumpyPolicy(spec)
-    from protocol.policy.torch_policy import TorchPolicy
+    from millrace.protocol.policy.torch_policy import TorchPolicy
 
     return TorchPolicy(spec, images=images)

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocol.arrays import Floats
-from protocol.specs import PolicySpec
+from millrace.protocol.arrays import Floats
+from millrace.protocol.specs import PolicySpec
 
 GATES = {"lstm": 4, "gru": 3}
 

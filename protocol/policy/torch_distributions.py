@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from protocol.policy.distributions import LOG_SQRT_2PI
-from protocol.specs import ActionSpec, PolicySpec
+from millrace.protocol.policy.distributions import LOG_SQRT_2PI
+from millrace.protocol.specs import ActionSpec, PolicySpec
 
 LOG_2 = math.log(2)
 SQUASHED_BOUND = 0.999

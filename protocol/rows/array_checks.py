@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.specs import ActionSpec, Leaf
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.specs import ActionSpec, Leaf
 
 Axes = Sequence[str | tuple[str, ...]]
 STEP_AND_COPY: Axes = ("step", "copy")

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.bounds import MOST_FRAMES
-from protocol.messages import EpisodeRows
-from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
-from protocol.specs import RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MOST_FRAMES
+from millrace.protocol.messages import EpisodeRows
+from millrace.protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
+from millrace.protocol.specs import RunSpec
 
 
 def reason_to_reject(

@@ -11,12 +11,12 @@ import math
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.errors import BadRollout
-from protocol.policy.masks import no_choice, not_allowed
-from protocol.rollout import Episode, Rollout
-from protocol.rows.array_checks import Axes, Expected, place_of, wrong_arrays, wrong_observation
-from protocol.specs import ActionSpec, RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import BadRollout
+from millrace.protocol.policy.masks import no_choice, not_allowed
+from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rows.array_checks import Axes, Expected, place_of, wrong_arrays, wrong_observation
+from millrace.protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 """No larger number is finite as a float32: returns are sums of rewards before they are rounded."""
@@ -71,7 +71,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
 
 
 def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:
-    """Raise `BadRollout` if the rows of seats break the law of `protocol.rollout`. Arrays [T, N·A], `resets` [T+1, N]."""
+    """Raise `BadRollout` if the rows of seats break the law of `millrace.protocol.rollout`. Arrays [T, N·A], `resets` [T+1, N]."""
     reset = np.repeat(resets, run.sent_seats, axis=1)  # [T+1, N·A]
     steps = np.arange(len(valid))[:, None]
     row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last

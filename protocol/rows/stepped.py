@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from protocol.messages import Stepped
-from protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
-from protocol.specs import StepSpec
+from millrace.protocol.messages import Stepped
+from millrace.protocol.rows.array_checks import Expected, wrong_arrays, wrong_observation
+from millrace.protocol.specs import StepSpec
 
 
 def wrong_rows(answer: Stepped, spec: StepSpec, axes: Sequence[str] | None) -> str:

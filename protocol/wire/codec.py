@@ -23,14 +23,25 @@ import msgpack
 import msgspec
 import numpy as np
 
-from protocol.bounds import one_line
-from protocol.env_spec import MAX_CALLABLE_BYTES, PickledCallable
-from protocol.errors import BadMessage, UsageError
-from protocol.messages import Described, Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker, Welcome
-from protocol.space_spec import check_size
-from protocol.specs import RunSpec, StepSpec
-from protocol.wire.compression import Packing, raw_bytes, unpack_array
-from protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.bounds import one_line
+from millrace.protocol.env_spec import MAX_CALLABLE_BYTES, PickledCallable
+from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.messages import (
+    Described,
+    Hello,
+    Inquire,
+    Refuse,
+    Rollout,
+    Status,
+    ToLearner,
+    ToObserver,
+    ToWorker,
+    Welcome,
+)
+from millrace.protocol.space_spec import check_size
+from millrace.protocol.specs import RunSpec, StepSpec
+from millrace.protocol.wire.compression import Packing, raw_bytes, unpack_array
+from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
 
 Buffer = bytes | memoryview
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Bytes
-from protocol.errors import BadMessage
+from millrace.protocol.arrays import Array, Bools, Bytes
+from millrace.protocol.errors import BadMessage
 
 Frame = bytes | memoryview
 

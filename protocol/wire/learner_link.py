@@ -18,15 +18,15 @@ from collections.abc import Iterator, Sequence
 
 import zmq
 
-from protocol.address import check_address, name_for_people
-from protocol.errors import BadMessage, RunError, UsageError
-from protocol.keys.key_folder import Keyring
-from protocol.keys.zap import AuthenticatorThread
-from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
-from protocol.messages import Inquire, Refuse, ToLearner
-from protocol.wire.codec import Buffer, decode_to_learner, encode
-from protocol.wire.socket_options import LINGER_MS, set_options
-from protocol.wire.sockets import Traffic, receive_frames, send_frames
+from millrace.protocol.address import check_address, name_for_people
+from millrace.protocol.errors import BadMessage, RunError, UsageError
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.keys.zap import AuthenticatorThread
+from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
+from millrace.protocol.messages import Inquire, Refuse, ToLearner
+from millrace.protocol.wire.codec import Buffer, decode_to_learner, encode
+from millrace.protocol.wire.socket_options import LINGER_MS, set_options
+from millrace.protocol.wire.sockets import Traffic, receive_frames, send_frames
 
 log = logging.getLogger("millrace.link")
 

@@ -17,7 +17,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from protocol.errors import BadMessage, safe_repr
+from millrace.protocol.errors import BadMessage, safe_repr
 
 DTYPE_KINDS = "biufcSUmM"
 MAX_DEPTH = 32

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.specs import StepSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.specs import StepSpec
 
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 CACHE_LINE_BYTES = 64  # each counter of a lane has a cache line of its own

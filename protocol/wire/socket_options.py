@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import zmq
 
-from protocol.address import needs_ipv6
-from protocol.keys.handshake import HANDSHAKE_MS
-from protocol.keys.keys import Token
+from millrace.protocol.address import needs_ipv6
+from millrace.protocol.keys.handshake import HANDSHAKE_MS
+from millrace.protocol.keys.keys import Token
 
 LINGER_MS = 2000
 UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after a cut it may need as long again as the cut lasted

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import zmq
 
-from protocol.wire.codec import MAX_FRAMES, Buffer
+from millrace.protocol.wire.codec import MAX_FRAMES, Buffer
 
 COPY_BELOW_BYTES = 65536  # copying a smaller frame is cheaper than tracking it
 NOT_WAITING, AND_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)

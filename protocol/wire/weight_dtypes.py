@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from protocol.arrays import Array, Floats
-from protocol.errors import RunError
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import RunError
 
 ActingDtype = Literal["float32", "bfloat16"]
 

@@ -12,17 +12,17 @@ from typing import TypeVar
 
 import zmq
 
-from protocol.address import check_address, check_worker_name, is_local, resolves
-from protocol.errors import BadMessage, UsageError
-from protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
-from protocol.keys.keys import Token
-from protocol.keys.zap import connect_with
-from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
-from protocol.messages import ToObserver, ToWorker
-from protocol.wire.codec import MAX_HEAD_BYTES, Buffer, decode_to_observer, decode_to_worker
-from protocol.wire.compression import Packing, has_zstd
-from protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, Limits, routing_id, set_options
-from protocol.wire.sockets import receive_frames, send_frames
+from millrace.protocol.address import check_address, check_worker_name, is_local, resolves
+from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.zap import connect_with
+from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
+from millrace.protocol.messages import ToObserver, ToWorker
+from millrace.protocol.wire.codec import MAX_HEAD_BYTES, Buffer, decode_to_observer, decode_to_worker
+from millrace.protocol.wire.compression import Packing, has_zstd
+from millrace.protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, Limits, routing_id, set_options
+from millrace.protocol.wire.sockets import receive_frames, send_frames
 
 Decoded = TypeVar("Decoded")
 

@@ -20,10 +20,10 @@ from benchmarks.scores import (
     seeds_text,
     write_scores,
 )
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.layers import resolve
-from learner.config.presets import environment_name
 from millrace.cli.main import main
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.presets import environment_name
 
 SCORES = read_scores()
 

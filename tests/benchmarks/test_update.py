@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.contest import Contest
 from benchmarks.update_ppo import contest
-from learner.algorithms.kernels.mlp import SmallMLP
+from millrace.learner.algorithms.kernels.mlp import SmallMLP
 
 
 def contests() -> list[Contest]:

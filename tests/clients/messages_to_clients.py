@@ -7,8 +7,8 @@ from typing import get_args
 
 import numpy as np
 
-from protocol.env_spec import EnvSpec
-from protocol.messages import (
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.messages import (
     Call,
     Collect,
     Drain,
@@ -26,11 +26,11 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.policy.layout import acting_size
-from protocol.specs import ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec, StepSpec
-from protocol.wire.codec import encode
-from protocol.wire.plain_values import pack
-from protocol.wire.weight_dtypes import to_wire_dtype
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.specs import ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec, StepSpec
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.plain_values import pack
+from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
 SESSION = 77
 CARTPOLE = EnvSpec("CartPole-v1")

@@ -18,9 +18,9 @@ import msgpack
 import msgspec
 import numpy as np
 
-from protocol.arrays import Floats
-from protocol.errors import BadMessage
-from protocol.messages import (
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.messages import (
     Collect,
     Described,
     Drain,
@@ -44,15 +44,15 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.policy.distributions import Categorical
-from protocol.specs import RunSpec, StepSpec
-from protocol.wire.codec import Buffer, decode_to_learner, encode
-from protocol.wire.plain_values import pack
-from protocol.wire.worker_link import WorkerLink
-from workers.collect import collected_lane
-from workers.conversation.held import Held, HeldEvaluations
-from workers.conversation.session import Session
-from workers.worker import Worker, WorkerOptions, identity
+from millrace.protocol.policy.distributions import Categorical
+from millrace.protocol.specs import RunSpec, StepSpec
+from millrace.protocol.wire.codec import Buffer, decode_to_learner, encode
+from millrace.protocol.wire.plain_values import pack
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers.collect import collected_lane
+from millrace.workers.conversation.held import Held, HeldEvaluations
+from millrace.workers.conversation.session import Session
+from millrace.workers.worker import Worker, WorkerOptions, identity
 
 replace = msgspec.structs.replace
 FLAT = np.zeros(0, np.uint8)

@@ -11,8 +11,8 @@ from typing import TypeVar
 import pytest
 import zmq
 
-from protocol.messages import Hello, ToLearner
-from protocol.wire.codec import decode_to_learner
+from millrace.protocol.messages import Hello, ToLearner
+from millrace.protocol.wire.codec import decode_to_learner
 from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port
 
 M = TypeVar("M", bound=ToLearner)

@@ -15,7 +15,7 @@ from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import explanation
 from millrace.conformance.script import Ended
-from protocol.env_spec import EnvSpec
+from millrace.protocol.env_spec import EnvSpec
 from tests.system.stage.processes import ROOT
 
 WORKER = (sys.executable, "-m", "millrace", "worker", "{address}")

@@ -15,9 +15,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from learner.run_folder.metrics_log import read_rows
-from protocol.messages import PROTOCOL_VERSION, Drain, Refuse
-from protocol.wire.codec import encode
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.protocol.messages import PROTOCOL_VERSION, Drain, Refuse
+from millrace.protocol.wire.codec import encode
 from tests.clients.messages_to_clients import corpus
 from tests.clients.programs import FalseLearner
 from tests.system.stage.processes import START_S, Running, Stage, free_port, wait_for

@@ -15,7 +15,7 @@ from millrace.conformance.conform import ClientCommand, conform
 from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import explanation
-from protocol.env_spec import EnvSpec
+from millrace.protocol.env_spec import EnvSpec
 from tests.clients.conftest import CPP
 from tests.clients.cpp_mutants import MUTANTS, Mutant
 

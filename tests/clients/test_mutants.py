@@ -14,7 +14,7 @@ from millrace.conformance.learner import Settings
 from millrace.conformance.profiles import PROFILES
 from millrace.conformance.report import explanation
 from millrace.conformance.rules import Rule
-from protocol.env_spec import EnvSpec
+from millrace.protocol.env_spec import EnvSpec
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(120)]
 

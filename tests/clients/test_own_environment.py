@@ -14,13 +14,15 @@ import pytest
 from msgspec.structs import replace
 
 import millrace as millrace_package
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.envs.seats import SeatedEnv, seated
-from protocol.messages import Goodbye, Welcome
-from protocol.policy.called_policy import Acted, CalledPolicy
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec, StepSpec
-from protocol.wire.codec import encode
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.seats import SeatedEnv, seated
+from millrace.protocol.messages import Goodbye, Welcome
+from millrace.protocol.policy.called_policy import Acted, CalledPolicy
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec, StepSpec
+from millrace.protocol.wire.codec import encode
+from millrace.workers.collect.collector import Collector
+from millrace.workers.copies.seated_copies import SeatedCopies
 from tests.clients.messages_to_clients import OBSERVATION, POLICY, STEP
 from tests.clients.programs import (
     IN_LEARNER,
@@ -36,8 +38,6 @@ from tests.clients.programs import (
 from tests.support.in_process.collectors import collect
 from tests.support.users_code.client_games import Nim, Tag
 from tests.system.stage.processes import START_S, Stage
-from workers.collect.collector import Collector
-from workers.copies.seated_copies import SeatedCopies
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]
 

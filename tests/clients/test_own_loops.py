@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import millrace
-from protocol.errors import NoWorkers
+from millrace.protocol.errors import NoWorkers
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, learner, loopback
 from tests.system.stage.processes import START_S, Stage
 

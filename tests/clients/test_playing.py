@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from learner.config.layers import resolve
 from millrace.launch.training import train
+from millrace.learner.config.layers import resolve
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, last_line, learner, loopback, millrace
 from tests.system.stage.processes import START_S, Learner, Stage
 

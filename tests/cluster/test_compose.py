@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.metrics_log import read_rows
 from tests.cluster.compose import BASE, LOOK_EVERY_S, USER, Cluster, Program, prepare, program
 from tests.cluster.engine import TOOLS, Engine, why_not
 from tests.system.stage.processes import ROOT, wait_for

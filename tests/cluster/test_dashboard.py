@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from learner.run_folder.json_log import kept_log
 from millrace.dashboard.known_runs import key_of
+from millrace.learner.run_folder.json_log import kept_log
 from tests.cluster.chromium import Page
 from tests.millrace.dashboard.test_site import HOSTILE, a_hostile_run
 from tests.system.stage.preloaded import workers_of

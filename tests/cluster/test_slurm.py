@@ -11,8 +11,8 @@ from typing import Any
 import psutil
 import pytest
 
-from learner.run_folder.metrics_log import read_rows
 from millrace.cli.main import main
+from millrace.learner.run_folder.metrics_log import read_rows
 from tests.cluster.slurm import Slurm, why_not
 from tests.system.stage.processes import SMALL, START_S, TOY, Stage, wait_for
 from tests.system.stage.runs import accounted

@@ -11,17 +11,17 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from benchmarks.program import BENCHMARKS
-from learner.config.command_line import RunFlags
-from learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.cli import conform, flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
 from millrace.cli.launch import LAUNCHERS
-from protocol.errors import UsageError
-from protocol.flags.fields import fields_of
-from protocol.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
+from millrace.learner.config.command_line import RunFlags
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.protocol.errors import UsageError
+from millrace.protocol.flags.fields import fields_of
+from millrace.protocol.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
+from millrace.workers.flags import WorkerFlags
 from tests.docs.pages import Block
 from website.commands_page import help_of, lines_of
-from workers.flags import WorkerFlags
 
 SHELL = {"", "bash", "sh", "console", "shell"}
 OPERATORS = re.compile(r"^[();<>|&]+$")

@@ -13,14 +13,14 @@ from unittest import mock
 import pytest
 
 import millrace
-from learner.config.command_line import RunFlags
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.rollout_config import RolloutConfig
-from learner.metric_names import METRICS
-from learner.run_folder import run_folder
 from millrace.cli.commands import COMMANDS
-from protocol import errors
-from protocol.errors import UserFacingError
+from millrace.learner.config.command_line import RunFlags
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.metric_names import METRICS
+from millrace.learner.run_folder import run_folder
+from millrace.protocol import errors
+from millrace.protocol.errors import UserFacingError
 from tests.learner.algorithms.cloning.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
 from website import commands_page, python_page, settings_page
 from website.doctest_fences import with_fences

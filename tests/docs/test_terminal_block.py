@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from learner.run_folder.progress import Progress
+from millrace.learner.run_folder.progress import Progress
 from millrace.sparkline import Sparkline
 from millrace.terminal import render_block
 from tests.docs.pages import blocks, written

@@ -9,20 +9,20 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from learner.algorithms import Algorithm
-from learner.between_updates.evaluations import Evaluations
-from learner.between_updates.run_parts import RunParts
-from learner.between_updates.tally import Tally
-from learner.config.config import Config
-from learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode, evaluation_of
-from learner.rollouts.hub import Hub
-from learner.run_folder.atomic_write import Writes
-from learner.run_folder.results import EvaluatedPolicy
-from learner.run_folder.run_folder import RunFolder
-from learner.run_state import RunState
 from millrace.cli.flags import EvaluateFlags
-from protocol.bounds import LARGEST
-from protocol.rollout import Episode
+from millrace.learner.algorithms import Algorithm
+from millrace.learner.between_updates.evaluations import Evaluations
+from millrace.learner.between_updates.run_parts import RunParts
+from millrace.learner.between_updates.tally import Tally
+from millrace.learner.config.config import Config
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode, evaluation_of
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.run_folder.atomic_write import Writes
+from millrace.learner.run_folder.results import EvaluatedPolicy
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_state import RunState
+from millrace.protocol.bounds import LARGEST
+from millrace.protocol.rollout import Episode
 from tests.support.conversation.fake_ends import run_spec
 
 

@@ -9,22 +9,22 @@ from typing import cast
 import numpy as np
 import pytest
 
-from learner.config.layers import resolve
-from learner.config.rollout_config import RolloutConfig
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.run_folder.run_folder import RunFolder
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed
-from protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Heartbeat, Hello, WorkerExit
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.policy.recurrent import zero_state
-from protocol.rollout import Episode
-from protocol.specs import PolicySpec
-from protocol.wire.codec import Buffer, decode_to_worker
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Heartbeat, Hello, WorkerExit
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import PolicySpec
+from millrace.protocol.wire.codec import Buffer, decode_to_worker
+from millrace.protocol.wire.learner_link import LearnerLink
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.saved_policies import load_policy, policy_run

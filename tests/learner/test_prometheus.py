@@ -20,25 +20,25 @@ import zmq
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-import learner.prometheus
-from learner.config.config import Config
-from learner.config.layers import resolve
-from learner.metric_names import METRICS
-from learner.prometheus import EVERY_S, STAGES, MetricsCollector, metrics_server
-from learner.rollouts.hub import PULSE_S, Hub, HubSettings
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import FactMean
-from learner.run_setup import prometheus_observer
+import millrace.learner.prometheus
 from millrace.launch import training
-from protocol.bounds import MAX_FACTS, Stage
-from protocol.errors import UsageError
-from protocol.messages import Drain
-from protocol.policy.policy import make_policy
-from protocol.wire.codec import encode
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import resolve
+from millrace.learner.metric_names import METRICS
+from millrace.learner.prometheus import EVERY_S, STAGES, MetricsCollector, metrics_server
+from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import FactMean
+from millrace.learner.run_setup import prometheus_observer
+from millrace.protocol.bounds import MAX_FACTS, Stage
+from millrace.protocol.errors import UsageError
+from millrace.protocol.messages import Drain
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.workers.collect.collector import Collector
 from tests.learner.rollouts.test_ticket_coordinator import A, B, C, Learner
 from tests.support.conversation.fake_ends import process_ends, run_spec
-from workers.collect.collector import Collector
 
 Labels = tuple[tuple[str, str], ...]
 Metrics = dict[tuple[str, Labels], float]
@@ -332,6 +332,6 @@ def test_prometheus_own_linter_finds_nothing(scraped: Scraped) -> None:
 
 
 def test_it_needs_no_torch() -> None:
-    asks = "import sys, learner.prometheus; assert 'torch' not in sys.modules"
+    asks = "import sys, millrace.learner.prometheus; assert 'torch' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", asks], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

@@ -10,23 +10,23 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 
-from learner.algorithms.ppo import PPO
-from learner.between_updates.between_updates import BetweenUpdates
-from learner.config.config import Config
-from learner.config.hyperparameters import PPOConfig
-from learner.config.layers import resolve
-from learner.resume_checks import unless_finished
-from learner.rollouts.lanes import AcceptedRollout
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.opponent_pool import PoolState, Snapshot
-from learner.run_folder import checkpoint
-from learner.run_folder.results import EvaluatedPolicy, Evaluation, Summary
-from learner.run_folder.run_folder import RunFolder
-from learner.run_state import RunState, restore
-from learner.train import train
-from protocol.env_spec import EnvSpec
-from protocol.errors import CheckpointError
-from protocol.rollout import Batch, stack_rollouts
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.between_updates.between_updates import BetweenUpdates
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.config.layers import resolve
+from millrace.learner.resume_checks import unless_finished
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.opponent_pool import PoolState, Snapshot
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, Summary
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_state import RunState, restore
+from millrace.learner.train import train
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import CheckpointError
+from millrace.protocol.rollout import Batch, stack_rollouts
 from tests.support.conversation.fake_ends import fake_rollout
 from tests.support.in_process.described import run_spec
 

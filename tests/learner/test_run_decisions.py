@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from learner.between_updates.stop_rules import reason_to_stop
-from learner.between_updates.tally import Tally
-from learner.config.config import Config
-from learner.config.evaluation_size import evaluation_size, final_evaluation_size
-from learner.run_state import RunState
+from millrace.learner.between_updates.stop_rules import reason_to_stop
+from millrace.learner.between_updates.tally import Tally
+from millrace.learner.config.config import Config
+from millrace.learner.config.evaluation_size import evaluation_size, final_evaluation_size
+from millrace.learner.run_state import RunState
 from tests.support.conversation.fake_ends import run_spec
 
 

@@ -5,17 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from learner.config.config import Config
-from learner.env_spaces import EnvSpaces
-from learner.metric_names import METRICS
-from learner.run_folder.results import METRICS_BESIDE_FACTS
-from learner.run_spec import run_spec
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import read_description
-from protocol.errors import UsageError
-from protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiDiscreteSpace, SpaceSpec, check_size
-from protocol.specs import SCORE
-from protocol.wire.plain_values import pack
+from millrace.learner.config.config import Config
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.metric_names import METRICS
+from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
+from millrace.learner.run_spec import run_spec
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import read_description
+from millrace.protocol.errors import UsageError
+from millrace.protocol.space_spec import (
+    BoxSpace,
+    DictSpace,
+    DiscreteSpace,
+    EnvDescription,
+    MultiDiscreteSpace,
+    SpaceSpec,
+    check_size,
+)
+from millrace.protocol.specs import SCORE
+from millrace.protocol.wire.plain_values import pack
 
 SMALL = DiscreteSpace(2, 0, "int64")
 HUGE = DiscreteSpace(2**53, 0, "int64")

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.replay.continuous import Continuous
-from learner.config.config import Config
-from learner.config.layers import resolve
-from learner.resume_checks import unless_finished
-from learner.run_folder import checkpoint
-from learner.run_folder.run_folder import RunFolder, Which
-from learner.run_state import RunState, start_from
-from protocol.env_spec import EnvSpec
-from protocol.errors import UserFacingError
-from protocol.policy.layout import buffer_layout, named_views
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.algorithms.replay.continuous import Continuous
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import resolve
+from millrace.learner.resume_checks import unless_finished
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.run_folder import RunFolder, Which
+from millrace.learner.run_state import RunState, start_from
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UserFacingError
+from millrace.protocol.policy.layout import buffer_layout, named_views
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.saved_policies import policy_run
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
 

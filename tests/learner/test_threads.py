@@ -15,16 +15,16 @@ import torch
 from msgspec.structs import replace
 
 import millrace
-from learner import torch_setup
-from learner.between_updates.crowded_cores import CrowdedCores
-from learner.config.costs import minibatch_rows
-from learner.config.layers import resolve
-from learner.run_folder.run_format import POLICY_ARRAYS
-from learner.torch_setup import one_thread, threads
 from millrace.launch.local_worker_options import worker_cores
-from protocol.machine.waiting_threads import VARIABLE as WAIT
-from protocol.policy.encoder import describe_encoder
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner import torch_setup
+from millrace.learner.between_updates.crowded_cores import CrowdedCores
+from millrace.learner.config.costs import minibatch_rows
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.run_format import POLICY_ARRAYS
+from millrace.learner.torch_setup import one_thread, threads
+from millrace.protocol.machine.waiting_threads import VARIABLE as WAIT
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CORES = {2, 3}
 
@@ -168,9 +168,7 @@ def test_threads_sleep_while_they_wait_if_millrace_is_imported_before_torch(
     imports: str, variable: str, spin: bool, tmp_path: Path
 ) -> None:
     (tmp_path / "torch.py").touch()
-    program = (
-        f"import {imports}; import os; from protocol.machine.waiting_threads import SPIN; print(SPIN, os.environ[{WAIT!r}])"
-    )
+    program = f"import {imports}; import os; from millrace.protocol.machine.waiting_threads import SPIN; print(SPIN, os.environ[{WAIT!r}])"
     environment = {name: value for name, value in os.environ.items() if name != WAIT} | (
         {WAIT: variable} if variable else {}
     )

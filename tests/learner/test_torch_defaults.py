@@ -10,9 +10,9 @@ import pytest
 import torch
 
 import millrace
-from learner.torch_setup import one_thread
-from protocol.policy.encoder import describe_encoder
-from protocol.specs import ActionSpec, Leaf
+from millrace.learner.torch_setup import one_thread
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.specs import ActionSpec, Leaf
 
 SMALL: dict[str, Any] = {
     "envs": 2, "lanes": 1, "rollout_steps": 16, "steps": 64, "workers": 1, "transport": "inproc", "net": (8,),
@@ -81,12 +81,12 @@ def test_a_run_has_the_same_bits(name: str, tmp_path: Path, plain: dict[str, byt
 def camera(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose policy acts with torch."""
     folder = tmp_path_factory.mktemp("camera")
-    return millrace.train("workers.envs.toy:Frames-v0", run_dir=str(folder), **{**SMALL, "steps": 32}).path
+    return millrace.train("millrace.workers.envs.toy:Frames-v0", run_dir=str(folder), **{**SMALL, "steps": 32}).path
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_a_loaded_policy_acts_the_same(name: str, camera: Path) -> None:
-    env = gymnasium.make("workers.envs.toy:Frames-v0")
+    env = gymnasium.make("millrace.workers.envs.toy:Frames-v0")
     seen, _ = env.reset(seed=1)
     env.close()
     expected = [millrace.load(camera, deterministic=False, seed=seed)(seen) for seed in range(5)]

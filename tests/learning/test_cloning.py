@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import millrace
-from learner.run_folder.metrics_log import read_rows
 from millrace.cli.main import main
+from millrace.learner.run_folder.metrics_log import read_rows
 
 CASES = [("CartPole-v1", 22.0, 10_000, 15), ("Pendulum-v1", -1_220.0, 4_000, 400)]
 """Each environment with the return of random actions, the env steps of 20 episodes, and the epochs"""

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from learner.config.layers import resolve
-from learner.run_folder.run_folder import RunFolder
 from millrace.launch.training import train
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.run_folder import RunFolder
 
 pytestmark = [pytest.mark.learning, pytest.mark.timeout(3600)]
 

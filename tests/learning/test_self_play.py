@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.policy_player import saved_policy
-from learner.run_folder import checkpoint
-from protocol.policy.policy import make_policy
-from protocol.policy.recurrent import zero_state
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.run_folder import checkpoint
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.policy.recurrent import zero_state
 
 pytestmark = [pytest.mark.learning, pytest.mark.timeout(1200)]
 

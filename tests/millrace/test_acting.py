@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.config.layers import resolve
-from learner.policy_player import saved_policy
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.run_folder.run_folder import RunFolder
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import make_action_converter, make_unflatten
-from protocol.messages import EpisodeRows
-from protocol.specs import RunSpec
+from millrace.learner.config.layers import resolve
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import make_action_converter, make_unflatten
+from millrace.protocol.messages import EpisodeRows
+from millrace.protocol.specs import RunSpec
 from tests.support.in_process.collectors import TOY, random_weights, run_of
 
 STEPS = 30
@@ -225,8 +225,8 @@ def test_acting_imports_neither_torch_nor_an_environment_nor_an_algorithm(tmp_pa
     folder = folder_of(run_of("CartPole-v1"), tmp_path)
     program = (
         f"import sys, numpy, millrace; policy = millrace.load({str(folder)!r}); policy(numpy.zeros(4)); "
-        "assert not sys.modules.keys() & {'torch', 'cloudpickle', 'learner.algorithms.algorithm', "
-        "'gymnasium.envs.classic_control', 'workers.worker'}"
+        "assert not sys.modules.keys() & {'torch', 'cloudpickle', 'millrace.learner.algorithms.algorithm', "
+        "'gymnasium.envs.classic_control', 'millrace.workers.worker'}"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 

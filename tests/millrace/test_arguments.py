@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.members.bound import bind
 from millrace.arguments import plain
 from millrace.launch import learner_inference, policy_workers, rollouts, training, vector
 from millrace.launch.local_worker_options import private_address
+from millrace.learner.members.bound import bind
 from tests.support.users_code import own_policies
 
 CALLS = 500

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.metrics_log import read_rows
 
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 4, "rollout_steps": 64, "n_epochs": 4, "net": (16,),

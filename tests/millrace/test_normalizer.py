@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 
 SMALL: dict[str, Any] = {"envs": 4, "lanes": 2, "workers": 1, "rollout_steps": 24, "transport": "inproc"}
 POLICY = millrace.MLP(8, normalize_observations=True)
@@ -87,7 +87,9 @@ def test_they_serve_a_policy_that_does_not_normalize() -> None:
 
 
 def test_of_several_arrays_the_features_are_side_by_side() -> None:
-    with millrace.RolloutService("workers.envs.toy:Spaces-v0", env_kwargs={"observation": "dict"}, **SMALL) as service:
+    with millrace.RolloutService(
+        "millrace.workers.envs.toy:Spaces-v0", env_kwargs={"observation": "dict"}, **SMALL
+    ) as service:
         service.publish(service.policy.initial())
         batch = service.gather()
         service.normalizer.update(batch)

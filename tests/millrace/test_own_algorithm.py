@@ -16,12 +16,12 @@ from safetensors.numpy import load_file
 
 import millrace
 from examples.own_loss import ClippedPlus, Conservative
-from learner.algorithms import algorithm_class
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.run_folder import RunFolder
 from millrace.cli.main import main
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.errors import UsageError
 from millrace.testing import check_algorithm
-from protocol.errors import UsageError
 
 NAME = "examples.own_loss:ClippedPlus"
 SMALL: dict[str, Any] = {

@@ -20,15 +20,15 @@ import pytest
 import millrace
 from millrace.cli.status import as_table
 from millrace.policies import PolicyParameters
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import CheckpointError, RunError, UsageError
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.networks import ActorCriticNetwork
-from protocol.policy.policy import make_policy
-from protocol.rollout import stack_rollouts
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import CheckpointError, RunError, UsageError
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import stack_rollouts
+from millrace.workers.collect.collector import Collector
 from tests.support.in_process.collectors import collect, random_weights
 from tests.support.users_code.seat_envs import AGENTS
-from workers.collect.collector import Collector
 
 SMALL: dict[str, Any] = {"workers": 1, "envs": 4, "lanes": 2, "transport": "inproc"}
 
@@ -153,7 +153,7 @@ def test_published_arrays_may_change_afterwards() -> None:
 
 
 def test_a_status_request_gets_the_figures_of_the_batches() -> None:
-    with service("workers.envs.toy:Countdown-v0", max_lag=1) as made:
+    with service("millrace.workers.envs.toy:Countdown-v0", max_lag=1) as made:
         made.publish(made.policy.initial())
         made.gather()
         made.gather()

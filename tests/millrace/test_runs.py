@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.run_format import check_format
 from millrace.cli.main import main
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.run_format import check_format
 from tests.support.in_process.collectors import TOY
 from tests.system.stage.run_folders import policy_of
 

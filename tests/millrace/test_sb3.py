@@ -12,8 +12,8 @@ import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 
 import millrace
-from protocol.envs.seats import seated
-from protocol.errors import UsageError
+from millrace.protocol.envs.seats import seated
+from millrace.protocol.errors import UsageError
 from tests.support.gymnasium_versions import TAXI
 from tests.support.numbers.bit_equality import bit_equal
 from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame, RandomTeam
@@ -132,7 +132,7 @@ def test_infos_are_those_of_each_copy() -> None:
 
 
 def test_attributes_and_methods_by_index() -> None:
-    env = make_vec_env("workers.envs.toy:Informs-v0", 3, monitor=False, transport="inproc")
+    env = make_vec_env("millrace.workers.envs.toy:Informs-v0", 3, monitor=False, transport="inproc")
     assert isinstance(env, Sb3VecEnv)
     env.set_attr("level", 7, indices=[2, 0])
     assert env.get_attr("level") == [7, 1, 7]

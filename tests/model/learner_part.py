@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from typing import Self, TypeVar
 
-from learner.members.lane_placement import LanePlacement
-from learner.members.membership import Membership, Outgoing
-from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.rollout_dealer import RolloutDealer
-from learner.rollouts.rounds import Rounds
-from learner.rollouts.sent_weights import SentWeights
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.messages import ToLearner, WorkerExit
+from millrace.learner.members.lane_placement import LanePlacement
+from millrace.learner.members.membership import Membership, Outgoing
+from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
+from millrace.learner.rollouts.rounds import Rounds
+from millrace.learner.rollouts.sent_weights import SentWeights
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.messages import ToLearner, WorkerExit
 from tests.model import membership_part
 from tests.model.conversation import Content
 from tests.model.message_content import (

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from learner.members.membership import Member, Membership
-from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_dealer import FIRST_TICKET
+from millrace.learner.members.membership import Member, Membership
+from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
 from tests.model.conversation import Content
 from tests.model.message_content import hello, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, Name, name

@@ -8,8 +8,8 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from learner.rollouts.evaluation_dealer import FIRST_TICKET
-from protocol.messages import (
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     EpisodeRows,
@@ -30,8 +30,8 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.rollout import Episode
-from protocol.specs import RunSpec, StepSpec
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import RunSpec, StepSpec
 from tests.model.conversation import Content
 from tests.model.names import Kind, Name, name
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows

@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
 ROOT = Path(__file__).parent.parent.parent
-COORDINATOR = "learner.rollouts.ticket_coordinator"
-ROLLOUTS = "learner.rollouts.rollout_dealer"
-WEIGHTS = "learner.rollouts.sent_weights"
-MEMBERS = "learner.members.coordinator"
-LANES = "learner.rollouts.lanes"
-POOL = "learner.rollouts.opponent_pool"
-ROUNDS = "learner.rollouts.rounds"
-MEMBERSHIP = "learner.members.membership"
-PLACEMENT = "learner.members.lane_placement"
-SESSION = "workers.conversation.session"
-HELD = "workers.conversation.held"
+COORDINATOR = "millrace.learner.rollouts.ticket_coordinator"
+ROLLOUTS = "millrace.learner.rollouts.rollout_dealer"
+WEIGHTS = "millrace.learner.rollouts.sent_weights"
+MEMBERS = "millrace.learner.members.coordinator"
+LANES = "millrace.learner.rollouts.lanes"
+POOL = "millrace.learner.rollouts.opponent_pool"
+ROUNDS = "millrace.learner.rollouts.rounds"
+MEMBERSHIP = "millrace.learner.members.membership"
+PLACEMENT = "millrace.learner.members.lane_placement"
+SESSION = "millrace.workers.conversation.session"
+HELD = "millrace.workers.conversation.held"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 from typing import Any
 
-from learner.rollouts.evaluation_dealer import FIRST_TICKET
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
 
 BITS = 20
 MASK = (1 << BITS) - 1

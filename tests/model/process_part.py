@@ -10,13 +10,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from protocol.messages import ToLearner, ToWorker
+from millrace.protocol.messages import ToLearner, ToWorker
+from millrace.workers.conversation.session import Session, WorkerEffect, WorkerIdentity
+from millrace.workers.conversation.worker_states import WorkerState
 from tests.model.conversation import Content, Event, Facts
 from tests.model.message_content import session
 from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S
-from workers.conversation.session import Session, WorkerEffect, WorkerIdentity
-from workers.conversation.worker_states import WorkerState
 
 PAUSE_S = 0.5  # between two Hellos: one in every tick
 

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
-from protocol.specs import RunSpec
+from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings
+from millrace.protocol.specs import RunSpec
 from tests.support.conversation.fake_ends import run_spec
 
 TICK_S = 1.0

@@ -11,16 +11,18 @@ from typing import Any
 
 import pytest
 
-from learner.members.lane_placement import LanePlacement
-from learner.members.membership import Membership
-from learner.rollouts.collecting_member import CollectingMember
-from learner.rollouts.evaluation_dealer import EvaluationDealer
-from learner.rollouts.lanes import Ticket, TicketedLane
-from learner.rollouts.rollout_dealer import RolloutDealer
-from learner.rollouts.rounds import Rounds
-from learner.rollouts.sent_weights import SentWeights
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
+from millrace.learner.members.lane_placement import LanePlacement
+from millrace.learner.members.membership import Membership
+from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer
+from millrace.learner.rollouts.lanes import Ticket, TicketedLane
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
+from millrace.learner.rollouts.rounds import Rounds
+from millrace.learner.rollouts.sent_weights import SentWeights
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
+from millrace.workers.conversation.held import HeldEvaluations, HeldOrders, HeldRollouts, OrderLane, RolloutLane
+from millrace.workers.conversation.session import Session, WorkerIdentity, _SessionState
 from tests.model import learner_part, worker_part
 from tests.model.conversation import Content
 from tests.model.evaluation import learner_half as of_evaluation
@@ -35,8 +37,6 @@ from tests.model.vector_env import worker_half as stepping_worker
 from tests.model.vector_env.stepping import Stepping
 from tests.model.worker_part import Worker
 from tests.model.world import GONE, World
-from workers.conversation.held import HeldEvaluations, HeldOrders, HeldRollouts, OrderLane, RolloutLane
-from workers.conversation.session import Session, WorkerIdentity, _SessionState
 
 SMALL = Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-from learner.members.membership import Outgoing
-from protocol.messages import Collect, Evaluate, Heartbeat, Weights
+from millrace.learner.members.membership import Outgoing
+from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 from tests.model import learner_part, process_part, worker_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner, first_learner

@@ -9,15 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeVar
 
-from protocol.messages import Collect, Evaluate, HeartbeatReply, ToLearner, ToWorker
-from tests.model import process_part
-from tests.model.conversation import Content
-from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
-from tests.model.process_part import Process
-from tests.model.settings import Settings
-from tests.support.conversation.fake_ends import fake_evaluated, fake_rollouts, held_count
-from workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
-from workers.conversation.session import (
+from millrace.protocol.messages import Collect, Evaluate, HeartbeatReply, ToLearner, ToWorker
+from millrace.workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
+from millrace.workers.conversation.session import (
     EvaluationTask,
     Leave,
     RolloutTask,
@@ -26,6 +20,12 @@ from workers.conversation.session import (
     WorkerEffect,
     _SessionState,
 )
+from tests.model import process_part
+from tests.model.conversation import Content
+from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
+from tests.model.process_part import Process
+from tests.model.settings import Settings
+from tests.support.conversation.fake_ends import fake_evaluated, fake_rollouts, held_count
 
 SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},

@@ -7,7 +7,7 @@ import resource
 
 import pytest
 
-from protocol.errors import UsageError, check_at_least, first_line, usage_error
+from millrace.protocol.errors import UsageError, check_at_least, first_line, usage_error
 
 
 class WithoutText(Exception):

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from learner.callbacks.named import named_callback
-from learner.config.layers import resolve
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import PolicyFailed, UserFacingError
-from protocol.own_module import own_callable
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.encoder import describe_encoder
-from protocol.specs import OwnPolicySpec, PolicySpec
+from millrace.learner.callbacks.named import named_callback
+from millrace.learner.config.layers import resolve
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import PolicyFailed, UserFacingError
+from millrace.protocol.own_module import own_callable
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.specs import OwnPolicySpec, PolicySpec
 
 OBSERVATION, ACTION = observation_leaves(Box(-1, 1, (4,))), action_spec(Discrete(2))
 

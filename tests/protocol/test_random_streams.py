@@ -14,23 +14,23 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from learner.algorithms.ppo import PPO
-from learner.algorithms.sac import SAC
-from learner.config.hyperparameters import PPOConfig, SACConfig
-from learner.recording.played_episodes import recording_seeds
-from learner.rollouts.evaluation_dealer import episode_seeds
-from learner.vector_env.lost_lanes import replacement_seeds
-from protocol.messages import Evaluate
-from protocol.policy.called_policy import Acted, CalledPolicy
-from protocol.policy.encoder import describe_encoder
-from protocol.policy.policy import make_policy
-from protocol.random_streams import Purpose, env_seed, generator, torch_seed
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.sac import SAC
+from millrace.learner.config.hyperparameters import PPOConfig, SACConfig
+from millrace.learner.recording.played_episodes import recording_seeds
+from millrace.learner.rollouts.evaluation_dealer import episode_seeds
+from millrace.learner.vector_env.lost_lanes import replacement_seeds
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.policy.called_policy import Acted, CalledPolicy
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.random_streams import Purpose, env_seed, generator, torch_seed
+from millrace.protocol.specs import PolicySpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import no_pulse, run_around, with_env
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
-from workers.evaluate.evaluator import Evaluator
 
 DRAWS, STEPS = 64, 4_000
 

@@ -12,13 +12,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.errors import UsageError
-from protocol.rollout import Rollout
-from protocol.specs import RunSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import RunSpec
+from millrace.workers.collect.collector import OpenEnvCopies
+from millrace.workers.copies.env_copies import VectorCopies
+from millrace.workers.envs.toy import Scripted
 from tests.support.in_process.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
-from workers.collect.collector import OpenEnvCopies
-from workers.copies.env_copies import VectorCopies
-from workers.envs.toy import Scripted
 
 SCRIPTED = run_of(f"{TOY}Scripted-v0")
 

@@ -15,17 +15,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.arrays import Array
-from protocol.bounds import MAX_NAME
-from protocol.env_spec import EnvSpec
-from protocol.errors import BadRollout
-from protocol.messages import Weights
-from protocol.rollout import Episode, Rollout
-from protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
-from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MAX_NAME
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import BadRollout
+from millrace.protocol.messages import Weights
+from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
+from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
+from millrace.workers.conversation.held import Assignment
 from tests.support.in_process.collectors import SESSION, VERSION, no_pulse, random_collector, random_weights
 from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
-from workers.conversation.held import Assignment
 
 LAW = {
     form: re.compile(rf"({closed}R)?((?!R){closed}R)*{running}")

@@ -20,15 +20,25 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members import join_limiter, membership
-from learner.members import member_states as standing
-from learner.rollouts import ticket_coordinator
-from protocol import alive, bounds, env_spec, messages, rollout, space_spec, specs
-from protocol.keys import handshake
-from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
-from protocol.wire import codec, socket_options
-from protocol.wire import compression as packing
-from workers.conversation import held, session, worker_states
+from millrace.learner.members import join_limiter, membership
+from millrace.learner.members import member_states as standing
+from millrace.learner.rollouts import ticket_coordinator
+from millrace.protocol import alive, bounds, env_spec, messages, rollout, space_spec, specs
+from millrace.protocol.keys import handshake
+from millrace.protocol.messages import (
+    PROTOCOL_VERSION,
+    Collect,
+    Hello,
+    Permit,
+    Received,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+)
+from millrace.protocol.wire import codec, socket_options
+from millrace.protocol.wire import compression as packing
+from millrace.workers.conversation import held, session, worker_states
 
 DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"

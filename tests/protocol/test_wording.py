@@ -12,20 +12,20 @@ import gymnasium
 import numpy as np
 import pytest
 
-from learner.run_folder.last_line import last_line
-from protocol.env_spec import EnvSpec, check_arguments
-from protocol.envs import unknown_ids
-from protocol.envs.advice.old_gym import INSTALL, instead_of_id, instead_of_object, is_of_old_gym
-from protocol.envs.advice.space_advice import observation_advice
-from protocol.envs.found_names import attribute, importable, name_of
-from protocol.envs.make_env import why_not_made
-from protocol.envs.unknown_ids import installed_packages, load_plugins, what_to_write
-from protocol.envs.wrappers import wrap
-from protocol.errors import UsageError, first_line, joined, safe_repr, words_an_error, worker_exception
-from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.facts import facts_of_info
-from workers.copies.mask_reader import _shown
-from workers.copies.row_writers import missing_leaf, one_number
+from millrace.learner.run_folder.last_line import last_line
+from millrace.protocol.env_spec import EnvSpec, check_arguments
+from millrace.protocol.envs import unknown_ids
+from millrace.protocol.envs.advice.old_gym import INSTALL, instead_of_id, instead_of_object, is_of_old_gym
+from millrace.protocol.envs.advice.space_advice import observation_advice
+from millrace.protocol.envs.found_names import attribute, importable, name_of
+from millrace.protocol.envs.make_env import why_not_made
+from millrace.protocol.envs.unknown_ids import installed_packages, load_plugins, what_to_write
+from millrace.protocol.envs.wrappers import wrap
+from millrace.protocol.errors import UsageError, first_line, joined, safe_repr, words_an_error, worker_exception
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.facts import facts_of_info
+from millrace.workers.copies.mask_reader import _shown
+from millrace.workers.copies.row_writers import missing_leaf, one_number
 
 
 class Raises:

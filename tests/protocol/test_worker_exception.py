@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from protocol.errors import EnvironmentFailed, WorkerTraceback, worker_exception
+from millrace.protocol.errors import EnvironmentFailed, WorkerTraceback, worker_exception
 
 
 def raised(*errors: BaseException) -> str:

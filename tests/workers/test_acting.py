@@ -8,18 +8,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.arrays import Array, Floats
-from protocol.errors import PolicyFailed
-from protocol.messages import Weights
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.policy.policy import Policy, make_policy
-from protocol.policy.recurrent import zero_state
-from protocol.specs import EncoderSpec, OwnPolicySpec, RunSpec
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import PolicyFailed
+from millrace.protocol.messages import Weights
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.specs import EncoderSpec, OwnPolicySpec, RunSpec
+from millrace.workers.acting import acting_of
+from millrace.workers.activity import Activity, ActivityReader, activity, share_activity
+from millrace.workers.opponents import KnownOpponents
 from tests.support.in_process.collectors import random_weights, run_of
-from workers.acting import acting_of
-from workers.activity import Activity, ActivityReader, activity, share_activity
-from workers.opponents import KnownOpponents
 
 RUN = run_of("CartPole-v1")
 SEEN: list[str] = []
@@ -118,7 +118,7 @@ def test_an_opponent_is_made_under_the_name_of_a_policy(page: Counting, monkeypa
         note()
         return make_policy(*given)
 
-    monkeypatch.setattr("workers.opponents.make_policy", make_noting)
+    monkeypatch.setattr("millrace.workers.opponents.make_policy", make_noting)
     find = KnownOpponents(run).among({7: Weights(7, parameters, buffers)})
     kept = [find(-1), find(7), find(7)]
     assert SEEN == ["preparing"] * 2

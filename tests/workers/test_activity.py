@@ -10,9 +10,9 @@ import gymnasium
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from protocol.alive import CallTimeouts
-from protocol.wire.plain_values import pack
-from workers.activity import (
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.wire.plain_values import pack
+from millrace.workers.activity import (
     DOING,
     ENV_CALLS,
     SINCE_S,
@@ -23,10 +23,10 @@ from workers.activity import (
     activity,
     share_activity,
 )
-from workers.copies.env_copies import LoopedCopies, VectorCopies
-from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import EnvLoop
-from workers.envs.toy import Countdown
+from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.env_loop import EnvLoop
+from millrace.workers.envs.toy import Countdown
 
 
 class Watched(Countdown):

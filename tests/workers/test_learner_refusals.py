@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from protocol.env_spec import EnvSpec
-from protocol.envs.action_masks import has_mask, without_mask
-from protocol.envs.description import describe_env
-from protocol.envs.seats import SeatedEnv
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed, UsageError
-from protocol.messages import Evaluate
-from protocol.rollout import Episode
-from protocol.space_spec import MAX_DEPTH, MAX_ELEMENTS, MAX_LEAVES, MAX_SEATS
-from protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.action_masks import has_mask, without_mask
+from millrace.protocol.envs.description import describe_env
+from millrace.protocol.envs.seats import SeatedEnv
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed, UsageError
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.rollout import Episode
+from millrace.protocol.space_spec import MAX_DEPTH, MAX_ELEMENTS, MAX_LEAVES, MAX_SEATS
+from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
-from workers.evaluate.evaluator import Evaluator
 
 ROOT = Path(__file__).parents[2]
 WHERE = (
@@ -446,7 +446,7 @@ def test_the_largest_rewards_make_a_return_that_the_learner_takes() -> None:
 
 
 def test_whatever_its_reason_is_a_worker_sends_no_episode_that_the_learner_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.collect.seat_rows.whole_episode", lambda *_: Episode(1e300, 1, 0.0, (0.0, 0.0)))
+    monkeypatch.setattr("millrace.workers.collect.seat_rows.whole_episode", lambda *_: Episode(1e300, 1, 0.0, (0.0, 0.0)))
     assert collected(Two).startswith("lane 0, copy 0, episode: expected a finite return of 1 to ")
-    monkeypatch.setattr("workers.evaluate.evaluator.whole_episode", lambda *_: Episode(1.0, 51, 0.0, (0.0, 0.0)))
+    monkeypatch.setattr("millrace.workers.evaluate.evaluator.whole_episode", lambda *_: Episode(1.0, 51, 0.0, (0.0, 0.0)))
     assert evaluated(Two).startswith("while the policy was evaluated: copy 0, episode: expected a finite return of 1 to 50")

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from protocol.alive import SHARED_VERSIONS
-from workers.shared_weights import SESSIONS, SharedWeights, SharedWeightsReader
+from millrace.protocol.alive import SHARED_VERSIONS
+from millrace.workers.shared_weights import SESSIONS, SharedWeights, SharedWeightsReader
 
 FIRST = 5_000  # session of the learner
 

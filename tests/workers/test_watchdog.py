@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from workers import watchdog
-from workers.watchdog import Watchdog, deepest_frame, where_it_hung
+from millrace.workers import watchdog
+from millrace.workers.watchdog import Watchdog, deepest_frame, where_it_hung
 
 PROGRAM = """
 import re, sys, threading, time
-from workers.watchdog import Watchdog
+from millrace.workers.watchdog import Watchdog
 
 def step():
     {hang}

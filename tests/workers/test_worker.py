@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.alive import NO_SLOT, OUR_CODE, CallTimeouts
-from protocol.arrays import Array
-from protocol.messages import (
+from millrace.protocol.alive import NO_SLOT, OUR_CODE, CallTimeouts
+from millrace.protocol.arrays import Array
+from millrace.protocol.messages import (
     Collect,
     Drain,
     Failure,
@@ -30,23 +30,23 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.rollout import rollout_bytes
-from protocol.specs import RunSpec
-from protocol.wire import codec
-from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
-from protocol.wire.compression import Packing
-from protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
-from protocol.wire.worker_link import WorkerLink
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.rollout import rollout_bytes
+from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire import codec
+from millrace.protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
+from millrace.protocol.wire.compression import Packing
+from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers import slots as slot_file
+from millrace.workers.activity import ActivityReader, activity
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.session import Leave, Session
+from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
+from millrace.workers.slots import Slots
+from millrace.workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of
-from workers import slots as slot_file
-from workers.activity import ActivityReader, activity
-from workers.collect.collector import Collector
-from workers.conversation.session import Leave, Session
-from workers.evaluate.evaluator import Evaluator
-from workers.shared_weights import SharedWeights, SharedWeightsReader
-from workers.slots import Slots
-from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
 

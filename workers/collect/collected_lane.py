@@ -13,21 +13,21 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
-from protocol.arrays import Array, Bools
-from protocol.policy.masks import stored_leaves
-from protocol.policy.recurrent import zero_state
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Episode
-from protocol.specs import RunSpec
-from protocol.wire.plain_values import pack, unpack
-from workers.collect.seat_rows import SeatRows
-from workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
-from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.env_loop import Pulse
-from workers.copies.facts import Facts
-from workers.copies.row_writers import ObservationWriter
-from workers.copies.seated_copies import SeatedCopies
-from workers.opponents import Opponent
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.policy.masks import stored_leaves
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire.plain_values import pack, unpack
+from millrace.workers.collect.seat_rows import SeatRows
+from millrace.workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.facts import Facts
+from millrace.workers.copies.row_writers import ObservationWriter
+from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.opponents import Opponent
 
 
 class CollectedLane:

@@ -15,33 +15,33 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.arrays import Array, Floats
-from protocol.bounds import Stages
-from protocol.envs.envpool import envpool_spec
-from protocol.envs.spaces import action_converter_of
-from protocol.envs.vectorized import make_native
-from protocol.envs.which_copy import EnvCopy
-from protocol.errors import EnvironmentFailed, PolicyFailed
-from protocol.messages import Weights
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.masks import stored_leaves
-from protocol.policy.policy import Policy
-from protocol.rollout import Rollout
-from protocol.specs import RunSpec
-from workers.acting import RolloutActions, acting_of
-from workers.activity import ENV_CALLS, MAKING, activity
-from workers.collect.collected_lane import CollectedLane
-from workers.conversation.held import Assignment
-from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
-from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.env_loop import Pulse
-from workers.copies.envpool_copies import EnvpoolCopies
-from workers.copies.open_lanes import OpenLanes
-from workers.copies.row_writers import write_numbers
-from workers.copies.seated_copies import SeatedCopies
-from workers.copies.value_checks import check_acted, check_observed, check_rewards
-from workers.copy_slots import make_copy
-from workers.opponents import KnownOpponents, Opponents
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.bounds import Stages
+from millrace.protocol.envs.envpool import envpool_spec
+from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.envs.vectorized import make_native
+from millrace.protocol.envs.which_copy import EnvCopy
+from millrace.protocol.errors import EnvironmentFailed, PolicyFailed
+from millrace.protocol.messages import Weights
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.masks import stored_leaves
+from millrace.protocol.policy.policy import Policy
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import RunSpec
+from millrace.workers.acting import RolloutActions, acting_of
+from millrace.workers.activity import ENV_CALLS, MAKING, activity
+from millrace.workers.collect.collected_lane import CollectedLane
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.envpool_copies import EnvpoolCopies
+from millrace.workers.copies.open_lanes import OpenLanes
+from millrace.workers.copies.row_writers import write_numbers
+from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
+from millrace.workers.copy_slots import make_copy
+from millrace.workers.opponents import KnownOpponents, Opponents
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""

@@ -1,6 +1,6 @@
 """The rows of a lane whose env copies have seats: which are valid, and what a seat did that waits for its outcome.
 
-Rule: a seat's row is the one in which its outcome comes (`protocol.envs.seats`). Until then each row repeats what was
+Rule: a seat's row is the one in which its outcome comes (`millrace.protocol.envs.seats`). Until then each row repeats what was
 written when the seat acted: action, log-probability, and the state of the policy before it. So the row is whole wherever
 rollouts are cut, and a rollout may hold an action that older weights chose, with its log-probability under those.
 """
@@ -11,18 +11,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Doubles, Floats
-from protocol.bounds import LARGEST
-from protocol.policy.recurrent import zero_state
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Episode
-from protocol.rows.rollout_checks import LARGEST_REWARD, wrong_episode
-from protocol.specs import RunSpec
-from workers.copies.env_copies import SeatColumns, StepResult
-from workers.copies.env_errors import environment_failed
-from workers.copies.facts import Facts
-from workers.copies.value_checks import check_rewards
-from workers.opponents import Match, Opponent, OtherTeams, whole_episode
+from millrace.protocol.arrays import Array, Bools, Doubles, Floats
+from millrace.protocol.bounds import LARGEST
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Episode
+from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, wrong_episode
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import SeatColumns, StepResult
+from millrace.workers.copies.env_errors import environment_failed
+from millrace.workers.copies.facts import Facts
+from millrace.workers.copies.value_checks import check_rewards
+from millrace.workers.opponents import Match, Opponent, OtherTeams, whole_episode
 
 
 class SeatRows:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-from protocol.address import check_address, is_local
-from protocol.errors import UsageError
-from protocol.keys.key_folder import TOKEN_VARIABLE
-from protocol.keys.keys import Token
+from millrace.protocol.address import check_address, is_local
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
+from millrace.protocol.keys.keys import Token
 
 REJOIN_TIMEOUT_S = 600.0
 """How long, at least, a worker that had joined waits for its learner to come back."""

@@ -15,7 +15,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from protocol.messages import (
+from millrace.protocol.messages import (
     Answer,
     Evaluate,
     Evaluated,

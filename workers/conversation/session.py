@@ -12,8 +12,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from protocol.bounds import Stage, last_text, one_line
-from protocol.messages import (
+from millrace.protocol.bounds import Stage, last_text, one_line
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     TOLD_TO_STOP,
     Answer,
@@ -42,12 +42,19 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.space_spec import EnvDescription
-from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from workers.conversation.connection_rules import REJOIN_TIMEOUT_S
-from workers.conversation.held import Assignment, HeldEvaluations, HeldOrders, HeldRollouts
-from workers.conversation.worker_states import TABLE, LearnerSilent, StopRequested, WorkerFailed, WorkerState, WorkFinished
-from workers.exit_codes import EXIT_UNSUITABLE
+from millrace.protocol.space_spec import EnvDescription
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.workers.conversation.connection_rules import REJOIN_TIMEOUT_S
+from millrace.workers.conversation.held import Assignment, HeldEvaluations, HeldOrders, HeldRollouts
+from millrace.workers.conversation.worker_states import (
+    TABLE,
+    LearnerSilent,
+    StopRequested,
+    WorkerFailed,
+    WorkerState,
+    WorkFinished,
+)
+from millrace.workers.exit_codes import EXIT_UNSUITABLE
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
 NO_LEARNER = "no learner answered"

@@ -17,26 +17,26 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import OrderEnforcing
 
-from protocol.arrays import Array, Bools, Doubles
-from protocol.envs.action_masks import without_mask
-from protocol.envs.answers import reset_answer, wrong_step
-from protocol.envs.description import agents_in_words, agents_of
-from protocol.envs.seats import SeatedEnv
-from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
-from protocol.envs.vectorized import check_resets_next_step
-from protocol.envs.which_copy import FIRST_COPY, EnvCopy
-from protocol.errors import UsageError
-from protocol.random_streams import Purpose, env_seed
-from protocol.specs import RunSpec
-from protocol.wire.plain_values import unpack
-from workers.activity import EVALUATING, MAKING, RESETTING, STEPPING, activity
-from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
-from workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
-from workers.copies.mask_reader import MaskReader, unused_mask
-from workers.copies.row_writers import missing_leaf, read_leaves
-from workers.copy_slots import close_copy
-from workers.envs.reset_ahead import ResetAhead
+from millrace.protocol.arrays import Array, Bools, Doubles
+from millrace.protocol.envs.action_masks import without_mask
+from millrace.protocol.envs.answers import reset_answer, wrong_step
+from millrace.protocol.envs.description import agents_in_words, agents_of
+from millrace.protocol.envs.seats import SeatedEnv
+from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
+from millrace.protocol.envs.vectorized import check_resets_next_step
+from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose, env_seed
+from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire.plain_values import unpack
+from millrace.workers.activity import EVALUATING, MAKING, RESETTING, STEPPING, activity
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
+from millrace.workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
+from millrace.workers.copies.mask_reader import MaskReader, unused_mask
+from millrace.workers.copies.row_writers import missing_leaf, read_leaves
+from millrace.workers.copy_slots import close_copy
+from millrace.workers.envs.reset_ahead import ResetAhead
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]
@@ -90,7 +90,7 @@ class EnvCopies(Protocol):
         ...
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
-        """Set an attribute of every copy to a value, packed by `protocol.wire.plain_values`."""
+        """Set an attribute of every copy to a value, packed by `millrace.protocol.wire.plain_values`."""
         ...
 
     def close(self) -> None:

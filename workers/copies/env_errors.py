@@ -8,8 +8,8 @@ from __future__ import annotations
 import re
 from traceback import extract_tb, format_exception
 
-from protocol.envs.answers import OF_RESET, OF_STEP, WrongAnswer
-from protocol.errors import EnvironmentFailed, first_line
+from millrace.protocol.envs.answers import OF_RESET, OF_STEP, WrongAnswer
+from millrace.protocol.errors import EnvironmentFailed, first_line
 
 
 class CopyFailed(Exception):

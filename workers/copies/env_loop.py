@@ -17,11 +17,11 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
-from protocol.bounds import one_line
-from protocol.envs.answers import STEP, reset_answer, wrong_step
-from protocol.envs.which_copy import FIRST_COPY, EnvCopy
-from protocol.errors import UsageError, safe_repr
-from workers.activity import (
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.answers import STEP, reset_answer, wrong_step
+from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
+from millrace.protocol.errors import UsageError, safe_repr
+from millrace.workers.activity import (
     DOING,
     ENV_CALLS,
     MAKING,
@@ -31,8 +31,8 @@ from workers.activity import (
     WAITING,
     activity,
 )
-from workers.copies.env_errors import CopyFailed
-from workers.copy_slots import close_copy, make_copy
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copy_slots import close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 CopyInfos = list[tuple[int, dict[str, Any]]]

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from protocol.arrays import Array
-from protocol.envs.envpool import EnvpoolSpec
-from protocol.envs.spaces import make_flatten
-from workers.activity import RESETTING, STEPPING, activity
-from workers.copies.env_copies import Leaves, StepResult
-from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import Pulse
-from workers.copies.facts import facts_of_copies, of_ended
-from workers.copy_slots import close_copy, give_back
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.envpool import EnvpoolSpec
+from millrace.protocol.envs.spaces import make_flatten
+from millrace.workers.activity import RESETTING, STEPPING, activity
+from millrace.workers.copies.env_copies import Leaves, StepResult
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.facts import facts_of_copies, of_ended
+from millrace.workers.copy_slots import close_copy, give_back
 
 
 class EnvpoolCopies:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.bounds import one_line
-from protocol.errors import safe_repr
-from workers.copies.env_errors import CopyFailed
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import safe_repr
+from millrace.workers.copies.env_errors import CopyFailed
 
 Facts = Mapping[int, tuple[float, ...]]
 """By env copy: the facts of the episode that ended in this step."""

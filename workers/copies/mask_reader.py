@@ -13,13 +13,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.bounds import one_line
-from protocol.envs.action_masks import has_mask
-from protocol.envs.spaces import action_spec
-from protocol.errors import safe_repr
-from protocol.policy.masks import MASK, choices, no_choice
-from workers.copies.env_errors import CopyFailed
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.action_masks import has_mask
+from millrace.protocol.envs.spaces import action_spec
+from millrace.protocol.errors import safe_repr
+from millrace.protocol.policy.masks import MASK, choices, no_choice
+from millrace.workers.copies.env_errors import CopyFailed
 
 DTYPES = ("bool", "int8", "uint8", "int64", "int32")
 _NONE: Mapping[str, Any] = {}

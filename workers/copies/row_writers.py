@@ -16,11 +16,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.bounds import one_line
-from protocol.errors import first_line, safe_repr
-from protocol.specs import Leaf
-from workers.copies.env_errors import CopyFailed
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import first_line, safe_repr
+from millrace.protocol.specs import Leaf
+from millrace.workers.copies.env_errors import CopyFailed
 
 Numbers = tuple[Any, Any, Any]
 """Reward, terminated and truncated of N copies: each an array or a sequence."""

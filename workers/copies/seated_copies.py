@@ -11,15 +11,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.envs.seats import SeatedEnv, SeatStep, side_by_side
-from protocol.envs.which_copy import FIRST_COPY, EnvCopy
-from workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
-from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import Pulse
-from workers.copies.facts import facts_of_info
-from workers.copies.mask_reader import unused_mask
-from workers.copies.row_writers import read_leaves
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.envs.seats import SeatedEnv, SeatStep, side_by_side
+from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
+from millrace.workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.facts import facts_of_info
+from millrace.workers.copies.mask_reader import unused_mask
+from millrace.workers.copies.row_writers import read_leaves
 
 
 class SeatedCopies(LoopedCopies):

@@ -14,17 +14,17 @@ from typing import Any, TypeVar
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from protocol.arrays import Array
-from protocol.envs.action_masks import without_mask
-from protocol.envs.spaces import make_flatten
-from protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
-from protocol.specs import RunSpec
-from protocol.wire.plain_values import unpack
-from workers.copies.env_copies import EnvCopies, Leaves, StepResult
-from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.env_loop import Pulse
-from workers.copies.facts import Facts, facts_of_copies, of_ended
-from workers.copies.mask_reader import MaskReader
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.action_masks import without_mask
+from millrace.protocol.envs.spaces import make_flatten
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
+from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire.plain_values import unpack
+from millrace.workers.copies.env_copies import EnvCopies, Leaves, StepResult
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.facts import Facts, facts_of_copies, of_ended
+from millrace.workers.copies.mask_reader import MaskReader
 
 METHODS = ("close", "render", "reset", "step")  # of every environment
 Result = TypeVar("Result")

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.rows.array_checks import Axes, wrong_values
-from protocol.specs import Leaf
-from workers.copies.env_errors import environment_failed
+from millrace.protocol.arrays import Array
+from millrace.protocol.rows.array_checks import Axes, wrong_values
+from millrace.protocol.specs import Leaf
+from millrace.workers.copies.env_errors import environment_failed
 
 
 def check_observed(lane: int | None, leaves: Sequence[Leaf], obs: Sequence[Array], axes: Axes, first_step: int = 0) -> None:

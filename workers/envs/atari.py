@@ -20,7 +20,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
 
-from protocol.errors import UsageError
+from millrace.protocol.errors import UsageError
 
 FRAMES, SKIP, SIDE = 4, 4, 84
 MAX_FRAMES = 108_000  # in a game: half an hour of play

@@ -14,10 +14,10 @@ from typing import Any
 
 import gymnasium
 
-from protocol.envs.which_copy import FIRST_COPY, being_made
-from protocol.errors import UsageError
-from protocol.random_streams import Purpose, env_seed
-from workers.copy_slots import give_back, make_copy
+from millrace.protocol.envs.which_copy import FIRST_COPY, being_made
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose, env_seed
+from millrace.workers.copy_slots import give_back, make_copy
 
 Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, its first observation and its first info
 

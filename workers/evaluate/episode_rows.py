@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.bounds import MOST_FRAMES
-from protocol.messages import EpisodeRows, Evaluate
-from protocol.specs import PolicySpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MOST_FRAMES
+from millrace.protocol.messages import EpisodeRows, Evaluate
+from millrace.protocol.specs import PolicySpec
 
 CHUNK_BYTES = 8 * 2**20
 

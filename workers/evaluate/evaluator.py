@@ -17,29 +17,29 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.envs.seats import columns_of
-from protocol.envs.spaces import action_converter_of
-from protocol.envs.which_copy import EnvCopy
-from protocol.errors import UsageError
-from protocol.messages import Evaluate, Evaluated, Weights
-from protocol.policy.called_policy import CalledPolicy
-from protocol.policy.masks import stored_leaves
-from protocol.policy.policy import Policy
-from protocol.policy.recurrent import zero_state
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Episode
-from protocol.rows.rollout_checks import wrong_episode
-from protocol.specs import RunSpec
-from workers.acting import acting_of
-from workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
-from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.env_loop import Pulse
-from workers.copies.row_writers import ObservationWriter, write_numbers
-from workers.copies.seated_copies import SeatedCopies
-from workers.copies.value_checks import check_acted, check_observed, check_rewards
-from workers.evaluate.episode_rows import RowSender, SendRows, as_frame
-from workers.opponents import KnownOpponents, Match, OtherTeams, whole_episode
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.seats import columns_of
+from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.envs.which_copy import EnvCopy
+from millrace.protocol.errors import UsageError
+from millrace.protocol.messages import Evaluate, Evaluated, Weights
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.policy.masks import stored_leaves
+from millrace.protocol.policy.policy import Policy
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Episode
+from millrace.protocol.rows.rollout_checks import wrong_episode
+from millrace.protocol.specs import RunSpec
+from millrace.workers.acting import acting_of
+from millrace.workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.row_writers import ObservationWriter, write_numbers
+from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
+from millrace.workers.evaluate.episode_rows import RowSender, SendRows, as_frame
+from millrace.workers.opponents import KnownOpponents, Match, OtherTeams, whole_episode
 
 
 class EvaluationCopies(EnvCopies, Protocol):

@@ -22,12 +22,12 @@ from contextlib import suppress
 import msgspec
 import zmq
 
-from protocol.alive import Alive, WorkerActivity, WorkerExit
-from protocol.bounds import INVALID, MAX_NAME, MAX_WORKERS
-from protocol.keys.keys import Token
-from protocol.keys.zap import connect_with
-from protocol.wire.socket_options import RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
-from workers.shared_weights import SharedWeights
+from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
+from millrace.protocol.bounds import INVALID, MAX_NAME, MAX_WORKERS
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.zap import connect_with
+from millrace.protocol.wire.socket_options import RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
+from millrace.workers.shared_weights import SharedWeights
 
 log = logging.getLogger("millrace.worker")
 

@@ -21,11 +21,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from protocol.alive import StartFailed, WorkerActivity, WorkerExit
-from protocol.bounds import one_line
-from protocol.errors import UsageError
-from workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
-from workers.supervise.ending import Ending
+from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.bounds import one_line
+from millrace.protocol.errors import UsageError
+from millrace.workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
+from millrace.workers.supervise.ending import Ending
 
 log = logging.getLogger("millrace.worker")
 

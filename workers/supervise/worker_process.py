@@ -20,16 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from protocol.alive import CALLS, OF_POLICY, OUR_CODE, WorkerActivity
-from protocol.bounds import escaped, one_line
-from protocol.keys.key_folder import TOKEN_VARIABLE
-from protocol.keys.keys import Token
-from workers.activity import STACK_SIGNAL, ActivityReader
-from workers.slots import free_all, open_slots, touch
-from workers.supervise.ending import Ending
-from workers.supervise.process_group import kill, live_members, process_stat
-from workers.supervise.short_log import keep_short
-from workers.watchdog import deepest_frame, where_it_hung
+from millrace.protocol.alive import CALLS, OF_POLICY, OUR_CODE, WorkerActivity
+from millrace.protocol.bounds import escaped, one_line
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
+from millrace.protocol.keys.keys import Token
+from millrace.workers.activity import STACK_SIGNAL, ActivityReader
+from millrace.workers.slots import free_all, open_slots, touch
+from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.process_group import kill, live_members, process_stat
+from millrace.workers.supervise.short_log import keep_short
+from millrace.workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
 

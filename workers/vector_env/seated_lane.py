@@ -1,6 +1,6 @@
 """The env copies of one lane of a vector environment with seats: N · A rows, those of a copy side by side.
 
-Rule: rows are, bit for bit, those of a loop over the same copies (`protocol.envs.seats`). With SameStep, the step in which a
+Rule: rows are, bit for bit, those of a loop over the same copies (`millrace.protocol.envs.seats`). With SameStep, the step in which a
 copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the old ones.
 """
 
@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from protocol.arrays import Array
-from protocol.envs.seats import SeatStep, columns_of, side_by_side
-from workers.copies.env_loop import CopyInfos
-from workers.copies.row_writers import read_leaves, write_numbers
-from workers.vector_env.stepped_lane import SteppedLane
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.seats import SeatStep, columns_of, side_by_side
+from millrace.workers.copies.env_loop import CopyInfos
+from millrace.workers.copies.row_writers import read_leaves, write_numbers
+from millrace.workers.vector_env.stepped_lane import SteppedLane
 
 
 class SeatedLane(SteppedLane):

@@ -14,17 +14,17 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from protocol.arrays import Array
-from protocol.envs.description import agents_of, describe_env
-from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
-from protocol.envs.which_copy import EnvCopy
-from protocol.errors import UsageError
-from protocol.space_spec import EnvDescription
-from protocol.specs import StepSpec
-from workers.activity import MAKING, activity
-from workers.copies.env_errors import CopyFailed
-from workers.copies.env_loop import CopyInfos, EnvLoop, Pulse
-from workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.description import agents_of, describe_env
+from millrace.protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
+from millrace.protocol.envs.which_copy import EnvCopy
+from millrace.protocol.errors import UsageError
+from millrace.protocol.space_spec import EnvDescription
+from millrace.protocol.specs import StepSpec
+from millrace.workers.activity import MAKING, activity
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.env_loop import CopyInfos, EnvLoop, Pulse
+from millrace.workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
 
 
 class ResultRows(NamedTuple):

@@ -14,21 +14,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocol.bounds import Stages, last_text, one_line
-from protocol.errors import UsageError, first_line
-from protocol.machine.cpu_cores import usable_cores
-from protocol.messages import DESCRIPTION, Answer, Array, Call, Described, Order, Reset, Returned, Step, Stepped
-from protocol.specs import StepSpec
-from protocol.wire.codec import encode
-from protocol.wire.plain_values import pack, unpack
-from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
-from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
-from workers.activity import STEPPING, activity
-from workers.copies.env_errors import CopyFailed, environment_failed
-from workers.copies.env_loop import CopyInfos, Pulse
-from workers.copies.open_lanes import OpenLanes
-from workers.vector_env.seated_lane import SeatedLane
-from workers.vector_env.stepped_lane import ResultRows, SteppedLane, new_rows
+from millrace.protocol.bounds import Stages, last_text, one_line
+from millrace.protocol.errors import UsageError, first_line
+from millrace.protocol.machine.cpu_cores import usable_cores
+from millrace.protocol.messages import DESCRIPTION, Answer, Array, Call, Described, Order, Reset, Returned, Step, Stepped
+from millrace.protocol.specs import StepSpec
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.plain_values import pack, unpack
+from millrace.protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
+from millrace.protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
+from millrace.workers.activity import STEPPING, activity
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import CopyInfos, Pulse
+from millrace.workers.copies.open_lanes import OpenLanes
+from millrace.workers.vector_env.seated_lane import SeatedLane
+from millrace.workers.vector_env.stepped_lane import ResultRows, SteppedLane, new_rows
 
 
 class Stepper:

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.gradient_descent import GradientDescent
-from learner.algorithms.kernels.optimizer_step import take_step
-from protocol.policy.distributions import distribution
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Batch
+from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
+from millrace.learner.algorithms.gradient_descent import GradientDescent
+from millrace.learner.algorithms.kernels.optimizer_step import take_step
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Batch
 
 BATCH_SIZE = 64  # rows of a minibatch, if the settings have no batch_size
 LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; here it would take more epochs

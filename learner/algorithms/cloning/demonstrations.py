@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from learner.algorithms.returns import EpisodeEnds, gae
-from protocol.arrays import Array, Floats
-from protocol.rollout import Batch
+from millrace.learner.algorithms.returns import EpisodeEnds, gae
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.rollout import Batch
 
 
 class Demonstrations(NamedTuple):

@@ -1,6 +1,6 @@
 """What a small network makes of an actor's output: log-probabilities and entropies of actions, or actions, in numpy.
 
-Rule: results and gradients equal those of `protocol.policy.torch_distributions` and autograd, except for rounding. They save
+Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding. They save
 0.1 ms of a minibatch of 64 rows: autograd needs a dozen nodes. Arrays are [P, B], a column for each of B rows. `forward`
 keeps what `backward` needs.
 """
@@ -13,11 +13,11 @@ from typing import Protocol
 
 import numpy as np
 
-from protocol.arrays import Array, Bools
-from protocol.policy.distributions import LOG_SQRT_2PI
-from protocol.policy.layout import LOG_STD_BOUNDS
-from protocol.policy.masks import FORBIDDEN
-from protocol.specs import ActionSpec
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.policy.distributions import LOG_SQRT_2PI
+from millrace.protocol.policy.layout import LOG_STD_BOUNDS
+from millrace.protocol.policy.masks import FORBIDDEN
+from millrace.protocol.specs import ActionSpec
 
 LOG_2 = math.log(2)
 

@@ -24,8 +24,8 @@ import torch
 from numpy.lib.stride_tricks import as_strided
 from torch import Tensor
 
-from protocol.arrays import Array
-from protocol.policy.layout import Field, named_views
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.layout import Field, named_views
 
 MLPPass = Callable[[], object]
 

@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from learner.algorithms.kernels.distribution_kernels import EvaluatedActions, SquashedSample, distribution_kernel
-from learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
-from protocol.arrays import Array
-from protocol.policy.features import feature_size
-from protocol.policy.layout import CRITICS, hidden_names
-from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput, trainable
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.kernels.distribution_kernels import EvaluatedActions, SquashedSample, distribution_kernel
+from millrace.learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.features import feature_size
+from millrace.protocol.policy.layout import CRITICS, hidden_names
+from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput, trainable
+from millrace.protocol.specs import PolicySpec
 
 MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protocol.machine.control_groups import free_bytes, table
+from millrace.protocol.machine.control_groups import free_bytes, table
 
 GIB = 2**30
 

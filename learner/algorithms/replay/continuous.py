@@ -16,22 +16,22 @@ import torch
 from msgspec.structs import replace
 from torch import Tensor
 
-from learner.algorithms.algorithm import Start
-from learner.algorithms.cloning.clones import Clones
-from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.gradient_descent import UpdateMetrics
-from learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
-from learner.algorithms.kernels.trained_networks import actor_and_critics
-from learner.algorithms.replay.off_policy import OffPolicy, Transitions
-from learner.algorithms.replay.replay_buffer import Sample
-from learner.config.hyperparameters import ContinuousConfig
-from protocol.arrays import Floats
-from protocol.errors import UsageError
-from protocol.policy.networks import ActorAndCritics
-from protocol.policy.torch_distributions import policy_log_prob
-from protocol.random_streams import Purpose, torch_seed
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms.algorithm import Start
+from millrace.learner.algorithms.cloning.clones import Clones
+from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics
+from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
+from millrace.learner.algorithms.kernels.trained_networks import actor_and_critics
+from millrace.learner.algorithms.replay.off_policy import OffPolicy, Transitions
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.config.hyperparameters import ContinuousConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.networks import ActorAndCritics
+from millrace.protocol.policy.torch_distributions import policy_log_prob
+from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Continuous(Clones, OffPolicy):

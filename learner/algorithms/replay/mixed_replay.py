@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from learner.algorithms.replay.available_memory import GIB, available_bytes
-from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
-from protocol.arrays import Floats, Ints
-from protocol.errors import UsageError
-from protocol.random_streams import Purpose
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf
+from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
+from millrace.learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
+from millrace.protocol.arrays import Floats, Ints
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf
 
 PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
 

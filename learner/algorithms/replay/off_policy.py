@@ -13,13 +13,13 @@ from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor
 
-from learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics
-from learner.algorithms.replay.mixed_replay import MixedReplay
-from learner.algorithms.replay.replay_buffer import Sample
-from learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
-from protocol.arrays import Array
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics
+from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
+from millrace.protocol.arrays import Array
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 
 
 class Transitions(NamedTuple):

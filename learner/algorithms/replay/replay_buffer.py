@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from learner.algorithms.replay.available_memory import GIB, available_bytes
-from learner.algorithms.replay.sum_tree import SumTree
-from learner.algorithms.returns import EpisodeEnds
-from protocol.arrays import Array, Bools, Doubles, Floats, Ints
-from protocol.errors import UsageError
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf
+from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
+from millrace.learner.algorithms.replay.sum_tree import SumTree
+from millrace.learner.algorithms.returns import EpisodeEnds
+from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf
 
 PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
 NO_SLOT = -1

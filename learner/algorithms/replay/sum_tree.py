@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocol.arrays import Doubles, Ints
+from millrace.protocol.arrays import Doubles, Ints
 
 
 class SumTree:

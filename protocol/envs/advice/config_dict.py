@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from traceback import extract_tb
 from typing import Any
 
-from protocol.envs.found_names import last_part
-from protocol.errors import first_line, words_an_error
+from millrace.protocol.envs.found_names import last_part
+from millrace.protocol.errors import first_line, words_an_error
 
 _READS_A_DICT = re.compile(
     r"'(NoneType|EnvCopy)' object (has no attribute '(get|items|keys|pop|setdefault|update|copy)'"

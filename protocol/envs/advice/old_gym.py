@@ -12,8 +12,8 @@ from typing import Any
 
 import gymnasium
 
-from protocol.envs.found_names import attribute
-from protocol.errors import words_an_error
+from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.errors import words_an_error
 
 INSTALL = "pip install gym==0.26.2 shimmy"
 

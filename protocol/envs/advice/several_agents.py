@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.errors import words_an_error
+from millrace.protocol.errors import words_an_error
 
 MARKS = ("possible_agents", "agents", "agent_iter", "agent_selection", "observation_spaces")
 """Attributes that environments of one agent have not."""

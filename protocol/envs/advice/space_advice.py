@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from protocol.envs.space_records import describe_space
-from protocol.errors import words_an_error
+from millrace.protocol.envs.space_records import describe_space
+from millrace.protocol.errors import words_an_error
 
 IMAGES_ONLY = {"minigrid": "minigrid.wrappers:ImgObsWrapper", "babyai": "minigrid.wrappers:ImgObsWrapper"}
 """By the package of an environment whose observations have a text beside an image: its wrapper that leaves the image"""

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
 from millrace.algorithms import (
     PPO,
     ActorCritic,
@@ -29,9 +27,11 @@ from millrace.algorithms import (
     features,
     log_prob_and_entropy,
 )
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import MillraceError, RunError
 from millrace.testing import AlgorithmMistakes, check_algorithm
-from protocol.arrays import Floats
-from protocol.errors import MillraceError, RunError
 
 Pulse = Callable[[], None]
 Metrics = dict[str, float]
@@ -258,7 +258,7 @@ def test_a_planted_mistake_is_found(planted: type, says: str) -> None:
 
 
 def test_an_algorithm_that_does_not_learn_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.algorithm_check.mistakes.LEARNING_STEPS", 4_000)
+    monkeypatch.setattr("millrace.learner.algorithm_check.mistakes.LEARNING_STEPS", 4_000)
     with pytest.raises(
         AlgorithmMistakes, match=r"does not learn the identity environment: after 4,\d+ env steps the mean"
     ) as caught:

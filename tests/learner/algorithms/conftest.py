@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from learner.torch_setup import one_thread
+from millrace.learner.torch_setup import one_thread
 
 
 @pytest.fixture(autouse=True, scope="module")

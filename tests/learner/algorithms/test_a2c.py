@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.a2c import A2C
-from learner.algorithms.ppo import PPO
-from learner.algorithms.reinforce import REINFORCE
-from learner.algorithms.returns import EpisodeEnds, gae
-from learner.config.hyperparameters import A2CConfig, PPOConfig, REINFORCEConfig
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.a2c import A2C
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.reinforce import REINFORCE
+from millrace.learner.algorithms.returns import EpisodeEnds, gae
+from millrace.learner.config.hyperparameters import A2CConfig, PPOConfig, REINFORCEConfig
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows, gae_tolerance
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
 from tests.support.numbers.steps import Errors, only_step, watched

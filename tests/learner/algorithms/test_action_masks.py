@@ -12,23 +12,23 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from learner.algorithms.actor_critic import ActorCritic
-from learner.algorithms.dqn import DQN
-from learner.algorithms.impala import IMPALA
-from learner.algorithms.kernels import trained_networks
-from learner.algorithms.minibatches import Minibatch, log_probs
-from learner.algorithms.ppo import PPO
-from learner.algorithms.replay import replay_buffer
-from learner.config.hyperparameters import DQNConfig, IMPALAConfig, PPOConfig
-from protocol.arrays import Array, Bools
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
-from protocol.policy.distributions import distribution
-from protocol.policy.masks import FORBIDDEN, forbid, masked_distribution, no_choice, not_allowed
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.policy.torch_distributions import log_prob_and_entropy
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.dqn import DQN
+from millrace.learner.algorithms.impala import IMPALA
+from millrace.learner.algorithms.kernels import trained_networks
+from millrace.learner.algorithms.minibatches import Minibatch, log_probs
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.replay import replay_buffer
+from millrace.learner.config.hyperparameters import DQNConfig, IMPALAConfig, PPOConfig
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.masks import FORBIDDEN, forbid, masked_distribution, no_choice, not_allowed
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.support.numbers.batches import batch, no_pulse
 
 OBSERVATION = spaces.Box(-np.inf, np.inf, (4,))

@@ -10,15 +10,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.actor_critic import ActorCritic
-from learner.algorithms.minibatches import LossInput, Minibatch
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
-from protocol.errors import RunError
-from protocol.policy.layout import acting_size
-from protocol.specs import PolicySpec
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.minibatches import LossInput, Minibatch
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from millrace.protocol.errors import RunError
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.specs import PolicySpec
 from tests.support.numbers.batches import (
     COPIES,
     DISCRETE,

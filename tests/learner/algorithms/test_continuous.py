@@ -15,25 +15,25 @@ import numpy as np
 import pytest
 import torch
 
-import learner.algorithms
 import millrace.algorithms
-from learner.algorithms import algorithm_class
-from learner.algorithms.kernels import trained_networks
-from learner.algorithms.replay.continuous import Continuous
-from learner.algorithms.replay.off_policy import Transitions
-from learner.algorithms.replay.replay_buffer import Sample
-from learner.config.hyperparameters import HYPERPARAMETERS
-from protocol.arrays import Floats
-from protocol.envs.spaces import action_converter_of, action_spec
-from protocol.errors import UsageError
-from protocol.policy import networks
-from protocol.policy.distributions import Deterministic, Squashed, distribution
-from protocol.policy.layout import LOG_STD_BOUNDS, named_views
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.policy.torch_distributions import squashed_sample
-from protocol.policy.torch_policy import TorchPolicy
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf
+import millrace.learner.algorithms
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.kernels import trained_networks
+from millrace.learner.algorithms.replay.continuous import Continuous
+from millrace.learner.algorithms.replay.off_policy import Transitions
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.protocol.arrays import Floats
+from millrace.protocol.envs.spaces import action_converter_of, action_spec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy import networks
+from millrace.protocol.policy.distributions import Deterministic, Squashed, distribution
+from millrace.protocol.policy.layout import LOG_STD_BOUNDS, named_views
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.policy.torch_distributions import squashed_sample
+from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf
 
 OBSERVATION = (Leaf("", "box", (3,), "float32"),)
 ACTION = ActionSpec("box", (2,), "float32", low=(-2.0, 0.0), high=(2.0, 1.0))
@@ -355,14 +355,14 @@ def test_with_normalized_rewards_their_scale_does_not_matter(algo: str) -> None:
 def test_they_import_nothing_that_a_user_could_not(name: str) -> None:
     """Every name of ours that these files import, kernels aside, is the object that `millrace.algorithms` exports."""
     path = Path(learner.algorithms.__file__).parent / f"{name}.py"
-    aliases = {"protocol.arrays"}  # names of numpy's array types
+    aliases = {"millrace.protocol.arrays"}  # names of numpy's array types
     found = [
         (node.module, alias.name)
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
         if node.module.split(".")[0] in {"learner", "protocol", "workers", "millrace"}
-        and not node.module.startswith("learner.algorithms.kernels.")
+        and not node.module.startswith("millrace.learner.algorithms.kernels.")
         and node.module not in aliases
     ]
     assert len(found) > 5

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.dqn import DQN, LOSSES, exploration_rate
-from learner.algorithms.normalization import RewardScaler
-from learner.algorithms.replay import replay_buffer as replay_module
-from learner.algorithms.replay.replay_buffer import Sample
-from learner.config.hyperparameters import DQNConfig
-from protocol.arrays import Floats, Ints
-from protocol.errors import UsageError
-from protocol.policy.distributions import distribution
-from protocol.policy.layout import named_views
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf
+from millrace.learner.algorithms.dqn import DQN, LOSSES, exploration_rate
+from millrace.learner.algorithms.normalization import RewardScaler
+from millrace.learner.algorithms.replay import replay_buffer as replay_module
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.config.hyperparameters import DQNConfig
+from millrace.protocol.arrays import Floats, Ints
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.layout import named_views
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf
 from tests.support.numbers.batches import BOX, COPIES, LANES, no_pulse
 from tests.support.numbers.batches import batch as noise_batch
 from tests.support.numbers.rounding import flat_gradient, in_float64, sampled

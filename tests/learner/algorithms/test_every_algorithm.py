@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.algorithm_check.mistakes import RULES, Subject, weights_have_the_policy_s_shape
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
-from learner.config.hyperparameters import HYPERPARAMETERS
-from protocol.errors import RunError
-from protocol.specs import PolicySpec
+from millrace.learner.algorithm_check.mistakes import RULES, Subject, weights_have_the_policy_s_shape
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.protocol.errors import RunError
+from millrace.protocol.specs import PolicySpec
 from tests.learner.algorithms.test_action_masks import masked_batch, spec_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, T, batch, no_pulse, normal, recurrent, shared
 

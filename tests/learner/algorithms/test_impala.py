@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.a2c import A2C
-from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.impala import IMPALA
-from learner.algorithms.minibatches import Minibatch
-from learner.config.hyperparameters import A2CConfig, IMPALAConfig
-from protocol.arrays import Array
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.a2c import A2C
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
+from millrace.learner.algorithms.impala import IMPALA
+from millrace.learner.algorithms.minibatches import Minibatch
+from millrace.learner.config.hyperparameters import A2CConfig, IMPALAConfig
+from millrace.protocol.arrays import Array
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows
 from tests.learner.algorithms.test_vtrace import OffPolicy, on_policy, slow_vtrace, vtrace_tolerances
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared

@@ -13,12 +13,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.normalization import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
-from protocol.arrays import Array
-from protocol.policy.features import normalize
-from protocol.policy.layout import buffer_size
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms.normalization import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.features import normalize
+from millrace.protocol.policy.layout import buffer_size
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 GAMMA = 0.9
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithms import algorithm_class, dqn, losses
-from learner.algorithms.replay.off_policy import CriticLoss
-from learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms import algorithm_class, dqn, losses
+from millrace.learner.algorithms.replay.off_policy import CriticLoss
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
 
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from learner.algorithms.normalization import RewardScaler, RunningMoments
-from learner.algorithms.replay.replay_buffer import ReplayBuffer
-from learner.rollouts.lanes import TicketedLane
-from protocol.policy.policy import make_policy
-from protocol.rollout import Batch, Rollout, stack_rollouts
-from protocol.specs import RunSpec
+from millrace.learner.algorithms.normalization import RewardScaler, RunningMoments
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer
+from millrace.learner.rollouts.lanes import TicketedLane
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import Batch, Rollout, stack_rollouts
+from millrace.protocol.specs import RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
 from tests.support.in_process.collectors import random_weights, run_of
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
 
 GAMMA, N_STEP = 0.9, 3
 ORDER = (0, 2, 1, 3, 4)  # 3 follows 1 and continues nothing; 4 continues 3

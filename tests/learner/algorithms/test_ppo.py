@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.actor_critic import Estimates, Pulse
-from learner.algorithms.minibatches import Minibatch, Observations
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import PPOConfig
-from protocol.arrays import Floats
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.actor_critic import Estimates, Pulse
+from millrace.learner.algorithms.minibatches import Minibatch, Observations
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.support.numbers.batches import (
     DISCRETE,
     GAUSSIAN,

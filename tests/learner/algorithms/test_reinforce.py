@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.minibatches import LossInput, Minibatch
-from learner.algorithms.reinforce import REINFORCE
-from learner.config.hyperparameters import REINFORCEConfig
-from learner.config.layers import resolve
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.minibatches import LossInput, Minibatch
+from millrace.learner.algorithms.reinforce import REINFORCE
+from millrace.learner.config.hyperparameters import REINFORCEConfig
+from millrace.learner.config.layers import resolve
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows, gae_tolerance, sum_tolerance
 from tests.support.in_process.described import run_spec
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse

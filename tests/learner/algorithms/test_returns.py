@@ -9,8 +9,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.returns import EpisodeEnds, discounted_return, gae
-from protocol.arrays import Array
+from millrace.learner.algorithms.returns import EpisodeEnds, discounted_return, gae
+from millrace.protocol.arrays import Array
 from tests.support.numbers.rounding import UNIT, assert_within
 
 GAMMA, LAMBDA = 0.9, 0.8

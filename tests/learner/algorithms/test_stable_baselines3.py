@@ -18,17 +18,17 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from learner.algorithms.dqn import DQN
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import DQNConfig, PPOConfig
-from learner.run_folder.run_folder import RunFolder
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
-from protocol.policy.distributions import distribution
-from protocol.policy.networks import ActorCriticNetwork
-from protocol.policy.policy import make_policy
-from protocol.policy.torch_distributions import log_prob_and_entropy
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.dqn import DQN
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import DQNConfig, PPOConfig
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
+from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.saved_policies import policy_run
 from tests.support.numbers.batches import batch, no_pulse
 

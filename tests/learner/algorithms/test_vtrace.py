@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.returns import complete, vtrace
-from protocol.arrays import Array
+from millrace.learner.algorithms.returns import complete, vtrace
+from millrace.protocol.arrays import Array
 from tests.learner.algorithms.test_returns import GAMMA, Rows, lawful, rows, sum_tolerance
 from tests.support.numbers.rounding import ELEMENTWISE, assert_within
 

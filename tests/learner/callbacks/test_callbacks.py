@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from learner.callbacks.callback import Callback
-from learner.callbacks.callbacks import MOMENTS, Callbacks
-from learner.run_folder.progress import Progress
-from learner.run_folder.requests import MOST_LOGGED, Requests
-from protocol.errors import UsageError
+from millrace.learner.callbacks.callback import Callback
+from millrace.learner.callbacks.callbacks import MOMENTS, Callbacks
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.requests import MOST_LOGGED, Requests
+from millrace.protocol.errors import UsageError
 
 NOW = Progress(env_steps=7)
 

@@ -13,26 +13,26 @@ from typing import Annotated, Any
 import msgspec
 import pytest
 
-from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
-from learner.config.algorithm_names import FOR_PRIOR, NEEDED, NOT_SETTINGS, name_of, settings_record
-from learner.config.command_line import RunFlags, read_config
-from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
-from learner.config.layers import config_from_toml, config_of_run, resolve
-from learner.config.resume_rules import Free, OnResume, declared
-from learner.report.run_lines import algorithm_label
-from learner.resume_checks import check_settings
-from learner.run_folder.newest_run import newest_run
-from learner.run_folder.run_folder import RunFolder
-from protocol.errors import UsageError
+from millrace.learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
+from millrace.learner.config.algorithm_names import FOR_PRIOR, NEEDED, NOT_SETTINGS, name_of, settings_record
+from millrace.learner.config.command_line import RunFlags, read_config
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
+from millrace.learner.config.layers import config_from_toml, config_of_run, resolve
+from millrace.learner.config.resume_rules import Free, OnResume, declared
+from millrace.learner.report.run_lines import algorithm_label
+from millrace.learner.resume_checks import check_settings
+from millrace.learner.run_folder.newest_run import newest_run
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.errors import UsageError
 
 SOURCE = '''
 """Algorithms of a user's own, which learn nothing."""
 from typing import Literal
 
-from learner.algorithms import Algorithm
-from learner.config.hyperparameters import AlgorithmConfig
-from learner.config.resume_rules import Free
+from millrace.learner.algorithms import Algorithm
+from millrace.learner.config.hyperparameters import AlgorithmConfig
+from millrace.learner.config.resume_rules import Free
 
 
 class Base(Algorithm):

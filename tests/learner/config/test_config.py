@@ -8,14 +8,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from learner.algorithms import ALGORITHMS, algorithm_class
-from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
-from learner.config.layers import config_from_toml, lower_layers, resolve
-from learner.config.presets import PRESETS, named_presets
-from learner.config.validation import check_copies, idle_workers, unused_setting, workers_to_wait_for
-from learner.run_folder.run_format import write_format
-from protocol.errors import UsageError
+from millrace.learner.algorithms import ALGORITHMS, algorithm_class
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from millrace.learner.config.layers import config_from_toml, lower_layers, resolve
+from millrace.learner.config.presets import PRESETS, named_presets
+from millrace.learner.config.validation import check_copies, idle_workers, unused_setting, workers_to_wait_for
+from millrace.learner.run_folder.run_format import write_format
+from millrace.protocol.errors import UsageError
 
 
 def written(folder: Path, text: str) -> Path:

@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from gymnasium.wrappers import TimeLimit
 
-from learner.config.costs import endless_evaluations, large_observations
-from learner.config.layers import resolve
-from protocol.envs.description import describe_env, read_description
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.specs import PolicySpec
-from workers.envs.toy import Countdown
+from millrace.learner.config.costs import endless_evaluations, large_observations
+from millrace.learner.config.layers import resolve
+from millrace.protocol.envs.description import describe_env, read_description
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.specs import PolicySpec
+from millrace.workers.envs.toy import Countdown
 
 
 def policy_for(shape: tuple[int, ...], dtype: str, net: tuple[int, ...] = (64, 64)) -> PolicySpec:

@@ -6,12 +6,12 @@ import ast
 
 import pytest
 
-from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.layers import resolve
-from learner.config.other_names import OTHERWISE, SAME_VALUE, SAYS, SETTING, in_place_of, written
-from protocol.flags.fields import fields_of
-from protocol.flags.values import read_value, read_words
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.other_names import OTHERWISE, SAME_VALUE, SAYS, SETTING, in_place_of, written
+from millrace.protocol.flags.fields import fields_of
+from millrace.protocol.flags.values import read_value, read_words
 
 FIELDS = {name: field for kind in (Config, *HYPERPARAMETERS.values()) for name, field in fields_of(kind).items()}
 

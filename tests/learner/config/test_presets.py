@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from learner.config.layers import resolve
-from learner.config.presets import origin
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.presets import origin
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.layers import resolve
-from learner.config.resume_rules import Free, OnResume, declared
-from learner.env_spaces import EnvSpaces
-from learner.resume_checks import Resumption, check_settings, check_spaces, unless_finished
-from learner.run_folder.run_folder import RunFolder
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.resume_rules import Free, OnResume, declared
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.resume_checks import Resumption, check_settings, check_spaces, unless_finished
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import UsageError
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "resume.md"
 OTHER_OPTIMIZER = {"ppo": "rmsprop", "a2c": "adam", "impala": "adam", "reinforce": "rmsprop", "dqn": "adamw"}

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from learner.members.describe import DescribeSettings, described_by_workers
-from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
-from learner.members.events import EnvironmentRaised, Failed, WorkerProcessFailed
-from learner.members.membership import Outgoing
-from learner.members.process_callbacks import ProcessCallbacks
-from protocol.alive import NO_SLOT, WorkerActivity
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
-from protocol.messages import (
+from millrace.learner.members.describe import DescribeSettings, described_by_workers
+from millrace.learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
+from millrace.learner.members.events import EnvironmentRaised, Failed, WorkerProcessFailed
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.protocol.alive import NO_SLOT, WorkerActivity
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     TOLD_TO_STOP,
     Alive,
@@ -35,11 +35,11 @@ from protocol.messages import (
     Welcome,
     WorkerExit,
 )
-from protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
-from protocol.specs import DescribeSpec
-from protocol.wire.codec import decode_to_worker
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.plain_values import pack
+from millrace.protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
+from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.wire.codec import decode_to_worker
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.plain_values import pack
 from tests.support.conversation.fake_link import FakeLink
 
 SPEC = DescribeSpec(EnvSpec("Fake-v0"))

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from learner.config.config import Config
-from learner.members.bind_settings import generate_run_keys, join_lines, keyring_for
-from protocol.address import advertised_address, check_address, is_local, needs_ipv6, own_address, resolves
-from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable
-from protocol.errors import UsageError
-from protocol.keys.key_folder import KeyFolder
-from protocol.keys.keys import ClientList, Key, Token
-from protocol.specs import StepSpec
-from workers.conversation.connection_rules import checked_token
-from workers.security import allowed_code
+from millrace.learner.config.config import Config
+from millrace.learner.members.bind_settings import generate_run_keys, join_lines, keyring_for
+from millrace.protocol.address import advertised_address, check_address, is_local, needs_ipv6, own_address, resolves
+from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import KeyFolder
+from millrace.protocol.keys.keys import ClientList, Key, Token
+from millrace.protocol.specs import StepSpec
+from millrace.workers.conversation.connection_rules import checked_token
+from millrace.workers.security import allowed_code
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 TOKEN = Token(Key.new().public, Key.new())
@@ -85,7 +85,7 @@ def test_insecure_is_spelt_out_and_says_what_it_risks(home: Path, bind: str, cap
 
 
 def test_the_line_to_paste_is_the_whole_command(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.members.bind_settings.socket.gethostname", lambda: "gpu-box")
+    monkeypatch.setattr("millrace.learner.members.bind_settings.socket.gethostname", lambda: "gpu-box")
     keyring = keyring_for(Config(bind="tcp://0.0.0.0:5555"), NOW)
     first, second = join_lines("tcp://0.0.0.0:5555", "", keyring)
     assert first == "waiting for workers; start one with: millrace worker tcp://gpu-box:5555 --token default.token"

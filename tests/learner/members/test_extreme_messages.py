@@ -19,12 +19,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from learner.vector_env.step_hub import StepHub
 from millrace.cli.status import as_table
-from protocol.errors import BadMessage
-from protocol.messages import (
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
     Answer,
@@ -46,9 +46,9 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.rollout import rollout_bytes
-from protocol.wire.codec import Buffer, decode_to_learner, decode_to_observer, decode_to_worker, encode
-from protocol.wire.learner_link import LearnerLink
+from millrace.protocol.rollout import rollout_bytes
+from millrace.protocol.wire.codec import Buffer, decode_to_learner, decode_to_observer, decode_to_worker, encode
+from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC, step, stepped
 from tests.support.conversation.extreme_messages import MARK, SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec

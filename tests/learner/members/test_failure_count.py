@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from learner.members.events import EnvironmentRaised, Failed, PolicyRaised
-from learner.members.failure_count import HOUR_S, MOST_IN_A_ROW, FailureCount
-from protocol.errors import EnvironmentFailed, PolicyFailed, RunError
+from millrace.learner.members.events import EnvironmentRaised, Failed, PolicyRaised
+from millrace.learner.members.failure_count import HOUR_S, MOST_IN_A_ROW, FailureCount
+from millrace.protocol.errors import EnvironmentFailed, PolicyFailed, RunError
 
 COPIES = 16  # of one lane each
 TWO_HOURS_S = 2 * HOUR_S

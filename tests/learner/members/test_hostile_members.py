@@ -10,17 +10,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members.events import EnvironmentRaised, WorkerLeft, WorkerRefused, describe
-from learner.members.join_limiter import AT_ONCE, PER_S, JoinLimiter
-from learner.members.member_log import OF_A_KEY, OF_A_WORKER, MemberLog
-from learner.members.member_server import TURN_S
-from learner.members.membership import MAX_MEMBERS, REMEMBERED
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
-from learner.rollouts.weight_age import WORKERS, WeightAge
-from protocol.errors import BadMessage, BadRollout, EnvironmentFailed
-from protocol.messages import (
+from millrace.learner.members.events import EnvironmentRaised, WorkerLeft, WorkerRefused, describe
+from millrace.learner.members.join_limiter import AT_ONCE, PER_S, JoinLimiter
+from millrace.learner.members.member_log import OF_A_KEY, OF_A_WORKER, MemberLog
+from millrace.learner.members.member_server import TURN_S
+from millrace.learner.members.membership import MAX_MEMBERS, REMEMBERED
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
+from millrace.learner.rollouts.weight_age import WORKERS, WeightAge
+from millrace.protocol.errors import BadMessage, BadRollout, EnvironmentFailed
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Evaluated,
     Failure,
@@ -33,16 +33,16 @@ from protocol.messages import (
     ToLearner,
     Welcome,
 )
-from protocol.rollout import Episode, Rollout
-from protocol.rows.rollout_checks import validate
-from protocol.token_bucket import TokenBucket
-from protocol.wire.codec import decode_to_learner, decode_to_observer, decode_to_worker, encode
-from protocol.wire.learner_link import LearnerLink
+from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.token_bucket import TokenBucket
+from millrace.protocol.wire.codec import decode_to_learner, decode_to_observer, decode_to_worker, encode
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.extreme_messages import SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, SEATS, fake_rollout, run_spec, seated_rollout
 from tests.support.conversation.fake_link import FakeLink
-from workers.copies.env_errors import CopyFailed, environment_failed
 
 
 class Noisy:

@@ -10,7 +10,7 @@ from typing import cast
 
 import pytest
 
-from learner.members.member_server import (
+from millrace.learner.members.member_server import (
     ASK_PROCESSES_S,
     AWAY_S,
     FAIR_SHARE,
@@ -20,14 +20,14 @@ from learner.members.member_server import (
     ServerCallbacks,
     ServerSettings,
 )
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.vector_env.order_coordinator import OrderCoordinator
-from learner.vector_env.step_hub import StepHub
-from learner.vector_env.vector_env_status import status
-from protocol.alive import StartFailed, WorkerActivity, WorkerExit
-from protocol.errors import NoWorkers
-from protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, ToLearner
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.learner.vector_env.vector_env_status import status
+from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.errors import NoWorkers
+from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, ToLearner
+from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.local_workers import NO_LOCAL_WORKERS

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from learner.members.key_revocation import KeyRevocation
-from protocol.messages import Heartbeat
+from millrace.learner.members.key_revocation import KeyRevocation
+from millrace.protocol.messages import Heartbeat
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.fake_ends import process_ends
 

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from learner.recording.prior_dataset import PriorDataset
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
-from protocol.specs import PolicySpec
+from millrace.learner.recording.prior_dataset import PriorDataset
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import UsageError
+from millrace.protocol.specs import PolicySpec
 
 minari = pytest.importorskip("minari")
 h5py = pytest.importorskip("h5py")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from learner.recording.image_sample import GAP, GRAY, image_samples, png
-from protocol.specs import Leaf
+from millrace.learner.recording.image_sample import GAP, GRAY, image_samples, png
+from millrace.protocol.specs import Leaf
 
 T, COPIES, SIDE = 9, 2, 7
 

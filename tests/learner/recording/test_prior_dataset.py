@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from learner.recording.prior_dataset import PriorDataset
-from protocol.envs.spaces import action_converter_of, action_spec, observation_leaves, stored_actions_of
-from protocol.errors import UsageError
-from protocol.specs import PolicySpec
+from millrace.learner.recording.prior_dataset import PriorDataset
+from millrace.protocol.envs.spaces import action_converter_of, action_spec, observation_leaves, stored_actions_of
+from millrace.protocol.errors import UsageError
+from millrace.protocol.specs import PolicySpec
 
 minari = pytest.importorskip("minari")
 BOX = spaces.Box(-1, 1, (2,), np.float32)

@@ -15,33 +15,33 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.config.layers import resolve
-from learner.config.rollout_config import RolloutConfig
-from learner.policy_player import saved_policy
-from learner.recording import minari as dataset_module
-from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
-from learner.recording.played_episodes import recording_seeds
-from learner.recording.prior_dataset import PriorDataset
-from learner.recording.record import RecordedDataset
-from learner.recording.record import record as record_with
-from learner.recording.training_recorder import TrainingRecorder
-from learner.rollouts.lanes import AcceptedRollout
-from learner.run_folder.run_folder import RunFolder
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
-from protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
-from protocol.policy.distributions import distribution
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.policy.recurrent import zero_state
-from protocol.random_streams import Purpose, generator
-from protocol.rollout import Rollout
-from protocol.specs import PolicySpec
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.recording import minari as dataset_module
+from millrace.learner.recording.episodes import EpisodeAssembler, RecordedEpisode
+from millrace.learner.recording.played_episodes import recording_seeds
+from millrace.learner.recording.prior_dataset import PriorDataset
+from millrace.learner.recording.record import RecordedDataset
+from millrace.learner.recording.record import record as record_with
+from millrace.learner.recording.training_recorder import TrainingRecorder
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import PolicySpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
 from tests.support.in_process.collectors import TOY, no_pulse, random_policy, run_of
 from tests.support.in_process.described import described
 from tests.support.in_process.saved_policies import load_policy, policy_run
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
 
 Array = np.ndarray[Any, Any]
 
@@ -468,7 +468,7 @@ def test_without_the_rows_there_is_no_dataset(tmp_path: Path, root: Path, monkey
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("learner.recording.npy_rows.write_atomically", full)
+    monkeypatch.setattr("millrace.learner.recording.npy_rows.write_atomically", full)
     run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
     fails(run, "ns/box-v0", RunError, "rows.npy was not written: No space left on device", npy=tmp_path / "rows.npy")
     assert everything(root) == set()

@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from learner.policy_player import PolicyPlayer
-from learner.recording import video
-from learner.rollouts.evaluation_dealer import PlayedEpisode
-from protocol.rollout import Episode
+from millrace.learner.policy_player import PolicyPlayer
+from millrace.learner.recording import video
+from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode
+from millrace.protocol.rollout import Episode
 
 
 @pytest.mark.parametrize(("teams", "expected"), [(0, [2, 2, 1]), (2, [2, 2, 1]), (3, [3, 2])])

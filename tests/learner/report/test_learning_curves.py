@@ -13,16 +13,16 @@ import pytest
 import resvg_py
 from PIL import Image
 
-from learner.config.layers import resolve
-from learner.report import sections
-from learner.report.curve import Curve, common_grid, read_run_files
-from learner.report.page import page
-from learner.report.picture import LETTERS, Picture, draw
-from learner.report.reported_runs import group_runs, read_run
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress
-from learner.run_folder.run_folder import RunFolder
-from protocol.errors import RunError, UsageError
+from millrace.learner.config.layers import resolve
+from millrace.learner.report import sections
+from millrace.learner.report.curve import Curve, common_grid, read_run_files
+from millrace.learner.report.page import page
+from millrace.learner.report.picture import LETTERS, Picture, draw
+from millrace.learner.report.reported_runs import group_runs, read_run
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.errors import RunError, UsageError
 
 BLUE, WHITE = (0, 114, 178), (255, 255, 255)
 

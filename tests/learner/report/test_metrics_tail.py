@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from learner.report.metrics_tail import MOST_LINE_BYTES, MetricsTail, newest_row
-from learner.run_folder.metrics_log import METRICS_FILE, MetricsLog, read_rows
-from learner.run_folder.progress import ENV_STEPS_KEY, Progress
+from millrace.learner.report.metrics_tail import MOST_LINE_BYTES, MetricsTail, newest_row
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, MetricsLog, read_rows
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, Progress
 
 
 def write(run: Path, numbers: range, mode: str = "a", evaluated: tuple[int, ...] = ()) -> None:

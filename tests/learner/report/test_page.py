@@ -18,18 +18,18 @@ import numpy as np
 import pytest
 import tomli_w
 
-from learner.config.config import Config
-from learner.config.layers import resolve
-from learner.report import sections
-from learner.report.charts import COLORS, MINUS, Series, chart, key, ticks, with_si_prefix
-from learner.report.page import page, write_page
-from learner.report.reported_runs import MAY_DIFFER_IN_A_GROUP, ReportData, group_runs, read_run
-from learner.report.run_lines import duration
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import Evaluation, Summary
-from learner.run_folder.run_folder import RunFolder
-from protocol.errors import RunError, UsageError
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import resolve
+from millrace.learner.report import sections
+from millrace.learner.report.charts import COLORS, MINUS, Series, chart, key, ticks, with_si_prefix
+from millrace.learner.report.page import page, write_page
+from millrace.learner.report.reported_runs import MAY_DIFFER_IN_A_GROUP, ReportData, group_runs, read_run
+from millrace.learner.report.run_lines import duration
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import Evaluation, Summary
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.errors import RunError, UsageError
 
 ROOT = Path(__file__).parents[3]
 LEDGER = {"issued": 30, "used": 20, "outstanding": 4, "lost": 6, "transitions_received": 900,
@@ -399,7 +399,13 @@ def test_rows_that_cannot_be_read_are_left_out_and_counted(tmp_path: Path, caplo
 
 
 @pytest.mark.parametrize(
-    "module", ["learner.report.page", "learner.recording.record", "learner.recording.video", "learner.recording.episodes"]
+    "module",
+    [
+        "millrace.learner.report.page",
+        "millrace.learner.recording.record",
+        "millrace.learner.recording.video",
+        "millrace.learner.recording.episodes",
+    ],
 )
 def test_the_report_and_the_recorder_start_quickly(module: str) -> None:
     heavy = {"torch", "PIL", "resvg_py", "tensorboard", "minari", "h5py", "moviepy", "pygame"}

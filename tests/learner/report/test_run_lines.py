@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from learner.report.run_lines import find_runs, headline, in_sentences, read_line
-from learner.run_folder.lease import Listens, decoded
-from learner.run_folder.metrics_log import METRICS_FILE
-from learner.run_folder.run_format import CONFIG_FILE
-from learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
-from protocol.errors import UsageError
+from millrace.learner.report.run_lines import find_runs, headline, in_sentences, read_line
+from millrace.learner.run_folder.lease import Listens, decoded
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.run_format import CONFIG_FILE
+from millrace.learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
+from millrace.protocol.errors import UsageError
 from tests.learner.report.test_page import a_run
 
 GONE = 2**22 + 1  # no process has so high a number

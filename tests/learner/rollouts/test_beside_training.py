@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from learner.members.events import WorkerProcessFailed
-from learner.members.failure_count import FailureCount
-from learner.members.membership import Outgoing
-from learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
-from protocol.alive import CallTimeouts
-from protocol.bounds import Stages
-from protocol.errors import EnvironmentFailed
-from protocol.messages import PROTOCOL_VERSION, Collect, Evaluate, Heartbeat, Hello, Weights, WorkerExit
+from millrace.learner.members.events import WorkerProcessFailed
+from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.bounds import Stages
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Evaluate, Heartbeat, Hello, Weights, WorkerExit
 from tests.learner.rollouts.test_evaluation_dealer import answer, orders, plan
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of, permits
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, process_ends

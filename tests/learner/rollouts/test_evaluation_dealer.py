@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationPlan, OnRows, evaluation_of
-from protocol.bounds import LARGEST
-from protocol.messages import EpisodeRows, Evaluate, Evaluated
-from protocol.rollout import Episode
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationPlan, OnRows, evaluation_of
+from millrace.protocol.bounds import LARGEST
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
+from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of, permits
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows, process_ends
 

@@ -9,15 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from protocol.arrays import Array
-from protocol.bounds import MOST_FRAMES
-from protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye
-from protocol.rollout import Episode
-from protocol.rows.played import reason_to_reject
-from protocol.rows.rollout_checks import LARGEST_REWARD
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MOST_FRAMES
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye
+from millrace.protocol.rollout import Episode
+from millrace.protocol.rows.played import reason_to_reject
+from millrace.protocol.rows.rollout_checks import LARGEST_REWARD
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of
 from tests.support.conversation.fake_ends import fake_rows
 

@@ -7,8 +7,8 @@ from itertools import islice
 import psutil
 import pytest
 
-from protocol.errors import BadMessage
-from protocol.wire.codec import decode_to_learner
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.wire.codec import decode_to_learner
 from tests.support.conversation.hostile_messages import Frames, hostile, real
 
 ROOM = 100_000

@@ -9,19 +9,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members.held_up import LONG_S
-from learner.members.membership import Member
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.hub import PULSE_S, Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.errors import RunError
-from protocol.logs.long_wait import AGAIN_S, FIRST_S
-from protocol.messages import PROTOCOL_VERSION, Evaluated, Heartbeat, Hello, Weights
-from protocol.rollout import Episode, rollout_bytes
-from protocol.wire.codec import decode_to_worker
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.weight_dtypes import ActingDtype, to_float32
+from millrace.learner.members.held_up import LONG_S
+from millrace.learner.members.membership import Member
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.errors import RunError
+from millrace.protocol.logs.long_wait import AGAIN_S, FIRST_S
+from millrace.protocol.messages import PROTOCOL_VERSION, Evaluated, Heartbeat, Hello, Weights
+from millrace.protocol.rollout import Episode, rollout_bytes
+from millrace.protocol.wire.codec import decode_to_worker
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.rollouts.opponent_pool import FIRST_RATING, OpponentPool, PoolSettings, PoolState, Snapshot
-from protocol.rollout import Episode
+from millrace.learner.rollouts.opponent_pool import FIRST_RATING, OpponentPool, PoolSettings, PoolState, Snapshot
+from millrace.protocol.rollout import Episode
 
 DRAWS = 2_000
 CONFIDENCE = 4.5  # standard deviations; a fair draw is farther off once in 150,000 cases

@@ -7,10 +7,10 @@ import weakref
 
 import pytest
 
-from learner.members.membership import SUPERVISOR_WORD_S, Outgoing
-from learner.rollouts.opponent_pool import OpponentPool, PoolSettings
-from protocol.alive import SHARED_VERSIONS, Alive, WorkerActivity
-from protocol.messages import PROTOCOL_VERSION, Collect, HeartbeatReply, Hello, Weights
+from millrace.learner.members.membership import SUPERVISOR_WORD_S, Outgoing
+from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings
+from millrace.protocol.alive import SHARED_VERSIONS, Alive, WorkerActivity
+from millrace.protocol.messages import PROTOCOL_VERSION, Collect, HeartbeatReply, Hello, Weights
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.fake_ends import process_ends
 

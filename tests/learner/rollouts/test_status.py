@@ -12,19 +12,19 @@ from typing import Any
 import pytest
 import zmq
 
-from learner.members.events import Event, RejoinRequested, WorkerLeft, describe
-from learner.members.membership import MAX_LATE_ACTIONS
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.run_status import status
-from learner.run_folder.json_log import JsonLines, progress_line
-from learner.run_folder.progress import Progress
 from millrace.cli.status import as_table, ask, in_json, observer_name
+from millrace.learner.members.events import Event, RejoinRequested, WorkerLeft, describe
+from millrace.learner.members.membership import MAX_LATE_ACTIONS
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.run_status import status
+from millrace.learner.run_folder.json_log import JsonLines, progress_line
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.errors import RunError
+from millrace.protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello, Inquire, Status
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.terminal import progress_view
-from protocol.errors import RunError
-from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello, Inquire, Status
-from protocol.wire.codec import encode
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.worker_link import WorkerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.fake_ends import process_ends
 

@@ -8,15 +8,15 @@ from typing import cast, get_args
 
 import pytest
 
-from learner.config.rollout_config import RolloutConfig
-from learner.conversations import open_hub
-from learner.members.events import Failed, PolicyRaised, WorkerLeft, WorkerProcessFailed
-from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
-from protocol.alive import OUR_CODE, Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
-from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.conversations import open_hub
+from millrace.learner.members.events import Failed, PolicyRaised, WorkerLeft, WorkerProcessFailed
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
+from millrace.protocol.alive import OUR_CODE, Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
+from millrace.protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
+from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.conversation.fake_link import FakeLink

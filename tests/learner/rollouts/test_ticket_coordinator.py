@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.config.validation import MOST_TICKETS
-from learner.members.events import (
+from millrace.learner.config.validation import MOST_TICKETS
+from millrace.learner.members.events import (
     EnvironmentNoted,
     EnvironmentRaised,
     Failed,
@@ -21,13 +21,13 @@ from learner.members.events import (
     WorkerRefused,
     describe,
 )
-from learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
-from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.lanes import TicketedLane
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.ticket_coordinator import MOST_NOTES, STRIKES, TicketCoordinator
-from protocol.messages import (
+from millrace.learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.lanes import TicketedLane
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.ticket_coordinator import MOST_NOTES, STRIKES, TicketCoordinator
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     Described,
@@ -51,8 +51,8 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.specs import OwnPolicySpec
-from protocol.wire.codec import decode_to_worker, encode
+from millrace.protocol.specs import OwnPolicySpec
+from millrace.protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
 from tests.support.conversation.rules import check_ledger

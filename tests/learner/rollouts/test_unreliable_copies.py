@@ -6,12 +6,12 @@ from typing import cast
 
 import pytest
 
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.alive import Alive, WorkerExit
-from protocol.errors import EnvironmentFailed
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.alive import Alive, WorkerExit
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
+from millrace.protocol.wire.learner_link import LearnerLink
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from learner.members.held_up import LONG_S
-from learner.members.membership import Member
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
-from protocol.alive import Alive, Doing, WorkerActivity
-from protocol.messages import Evaluated, Goodbye, Heartbeat
-from protocol.random_streams import Purpose
-from protocol.rollout import Episode
+from millrace.learner.members.held_up import LONG_S
+from millrace.learner.members.membership import Member
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
+from millrace.protocol.alive import Alive, Doing, WorkerActivity
+from millrace.protocol.messages import Evaluated, Goodbye, Heartbeat
+from millrace.protocol.random_streams import Purpose
+from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
 

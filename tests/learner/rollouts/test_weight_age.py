@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from learner.rollouts.weight_age import REMEMBERED, WeightAge
+from millrace.learner.rollouts.weight_age import REMEMBERED, WeightAge
 
 
 def test_lags_are_counted() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from learner.run_folder import metrics_log
-from learner.run_folder.metrics_log import MetricsLog, read_rows
-from learner.run_folder.progress import Progress, Row
+from millrace.learner.run_folder import metrics_log
+from millrace.learner.run_folder.metrics_log import MetricsLog, read_rows
+from millrace.learner.run_folder.progress import Progress, Row
 
 
 def test_numbers_that_are_added_to_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from learner.run_folder import checkpoint
-from protocol.errors import CheckpointError, UsageError
+from millrace.learner.run_folder import checkpoint
+from millrace.protocol.errors import CheckpointError, UsageError
 
 
 def state(number: float) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def test_a_failure_at_any_step_leaves_the_old_one_whole(tmp_path: Path, monkeypa
     def fails(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(f"learner.run_folder.atomic_write.os.{step}", fails)
+    monkeypatch.setattr(f"millrace.learner.run_folder.atomic_write.os.{step}", fails)
     with pytest.raises(CheckpointError, match=r"000000000200\.pt not written: No space left on device; older .* untouched"):
         checkpoint.save(tmp_path, state(2), 200, keep=3)
     monkeypatch.undo()

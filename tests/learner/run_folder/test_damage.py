@@ -32,28 +32,28 @@ import tomli_w
 import torch
 
 import millrace
-from learner.algorithms import algorithm_class
-from learner.config.layers import resolve
-from learner.env_spaces import EnvSpaces
-from learner.report.page import page
-from learner.report.picture import draw
-from learner.resume_checks import unless_finished
-from learner.run_folder.json_log import kept_log
-from learner.run_folder.lease import Owner
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.newest_run import newest_run
-from learner.run_folder.run_folder import RunFolder
-from learner.run_folder.run_format import END, HEAD
-from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_of_run
-from learner.run_spec import run_spec
-from learner.run_state import RunState, restore
 from millrace.launch.training import train
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError, UserFacingError
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.config.layers import resolve
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.report.page import page
+from millrace.learner.report.picture import draw
+from millrace.learner.resume_checks import unless_finished
+from millrace.learner.run_folder.json_log import kept_log
+from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.newest_run import newest_run
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_folder.run_format import END, HEAD
+from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_of_run
+from millrace.learner.run_spec import run_spec
+from millrace.learner.run_state import RunState, restore
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError, UserFacingError
 from tests.support.in_process.described import described
 from tests.support.in_process.saved_policies import load_policy
 
-ENV = "workers.envs.toy:Identity-v0"
+ENV = "millrace.workers.envs.toy:Identity-v0"
 SETTINGS: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 1, "net": (4,),
     "steps": 200, "eval_episodes": 2, "eval_every": 60, "checkpoint_every_s": 0.0,

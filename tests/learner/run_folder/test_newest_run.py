@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 import millrace
-from learner.config.command_line import read_config
-from learner.config.config import Config
-from learner.config.layers import resolve
-from learner.run_folder.newest_run import newest_run
-from learner.run_folder.run_folder import RunFolder
 from millrace.launch import training
-from protocol.errors import UsageError
+from millrace.learner.config.command_line import read_config
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.newest_run import newest_run
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.errors import UsageError
 
 HOURS = 3_600.0
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from learner.config.config import Config
-from learner.run_folder import checkpoint
-from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.regular_files import open_regular, read, regular_files, subfolder
-from learner.run_folder.run_lock import RunLock
 from millrace.launch.local_worker_options import worker_flags
-from protocol.errors import UserFacingError
+from millrace.learner.config.config import Config
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.atomic_write import write_atomically
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.regular_files import open_regular, read, regular_files, subfolder
+from millrace.learner.run_folder.run_lock import RunLock
+from millrace.protocol.errors import UserFacingError
 
 KEY = b"a private key"
 

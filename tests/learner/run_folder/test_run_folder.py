@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from learner.config.config import Config
-from learner.config.layers import config_of_run, resolve
-from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import Evaluation, Summary
-from learner.run_folder.run_folder import RunFolder, as_folder_name
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import RunError, UsageError
-from protocol.policy.layout import acting_size, buffer_size, parameter_layout, total_size
-from protocol.rollout import Episode
-from protocol.specs import PolicySpec
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import config_of_run, resolve
+from millrace.learner.run_folder.episode_window import EpisodeWindow
+from millrace.learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import Evaluation, Summary
+from millrace.learner.run_folder.run_folder import RunFolder, as_folder_name
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import RunError, UsageError
+from millrace.protocol.policy.layout import acting_size, buffer_size, parameter_layout, total_size
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.saved_policies import policy_run
 
 STARTED_S = 1_700_000_000.0
@@ -185,7 +185,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     def fails(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("learner.run_folder.regular_files.os.fsync", fails)
+    monkeypatch.setattr("millrace.learner.run_folder.regular_files.os.fsync", fails)
     with pytest.raises(RunError, match=r"summary\.json not written: No space left on device"):
         folder.write_summary(summary)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["summary.json"]

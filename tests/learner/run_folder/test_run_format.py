@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from learner.config.command_line import read_config
-from learner.config.layers import config_of_run, resolve
-from learner.report.page import write_page
-from learner.report.picture import draw
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress
-from learner.run_folder.run_folder import RunFolder
-from learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, RUN_FORMAT, check_format
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import RunError, UsageError
-from protocol.own_module import refuse_modules_in
-from protocol.policy.layout import acting_size
-from protocol.specs import PolicySpec
+from millrace.learner.config.command_line import read_config
+from millrace.learner.config.layers import config_of_run, resolve
+from millrace.learner.report.page import write_page
+from millrace.learner.report.picture import draw
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, RUN_FORMAT, check_format
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import RunError, UsageError
+from millrace.protocol.own_module import refuse_modules_in
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.saved_policies import load_policy, policy_run
 
 

@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
-from learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run, living_owner
-from protocol.errors import RunError, RunTakenOver, UsageError
+from millrace.learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from millrace.learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run, living_owner
+from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
 ELSEWHERE = Owner(host="far", pid=77, boot="another kernel", token="theirs")
 SOCKET = Listens("ipc:///tmp/here/learner", "ipc:///tmp/here/learner")
@@ -27,7 +27,7 @@ NEVER = Pace(rewrite_every=1e6, dead_after=30.0, look_every=1.0, confirm_after=1
 OWNS = """
 import sys
 from pathlib import Path
-from learner.run_folder.run_lock import RunLock
+from millrace.learner.run_folder.run_lock import RunLock
 with RunLock(Path(sys.argv[1])):
     print("taken", flush=True)
     sys.stdin.read()

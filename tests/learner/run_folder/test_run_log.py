@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from learner.members.events import WorkerLeft
-from learner.run_folder import json_log
-from learner.run_folder.json_log import RUN_LOG_FILE, kept_log, newest_lines
-from protocol.logs.notices import log_notice
+from millrace.learner.members.events import WorkerLeft
+from millrace.learner.run_folder import json_log
+from millrace.learner.run_folder.json_log import RUN_LOG_FILE, kept_log, newest_lines
+from millrace.protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
 

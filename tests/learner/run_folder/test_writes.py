@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from learner.run_folder.atomic_write import SAY_AGAIN_S, TRY_FOR_S, Writes
-from protocol.errors import RunError
+from millrace.learner.run_folder.atomic_write import SAY_AGAIN_S, TRY_FOR_S, Writes
+from millrace.protocol.errors import RunError
 
 
 class Disk:

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.calls import _descriptions
-from learner.vector_env.infos import unpack_infos
-from learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds
-from learner.vector_env.settings import VectorEnvSettings
-from protocol.envs.description import describe_env
-from protocol.errors import BadMessage
-from protocol.messages import Described, Goodbye, Returned, ToLearner
-from protocol.wire.codec import encode
-from protocol.wire.plain_values import pack
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.calls import _descriptions
+from millrace.learner.vector_env.infos import unpack_infos
+from millrace.learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.envs.description import describe_env
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.messages import Described, Goodbye, Returned, ToLearner
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.plain_values import pack
 
 
 def test_lanes_have_consecutive_rows() -> None:

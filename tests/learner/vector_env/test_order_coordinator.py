@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members.events import WorkerLeft, WorkerRefused
-from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
-from learner.vector_env.vector_env_status import status
-from protocol.env_spec import EnvSpec
-from protocol.errors import EnvironmentFailed
-from protocol.messages import (
+from millrace.learner.members.events import WorkerLeft, WorkerRefused
+from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
+from millrace.learner.vector_env.vector_env_status import status
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Answer,
     Call,
@@ -31,8 +31,8 @@ from protocol.messages import (
     Step,
     Stepped,
 )
-from protocol.specs import Leaf, StepSpec
-from protocol.wire.plain_values import pack
+from millrace.protocol.specs import Leaf, StepSpec
+from millrace.protocol.wire.plain_values import pack
 from tests.support.conversation.fake_ends import fake_rollout, process_ends
 
 A, B = b"a", b"b"

@@ -1,4 +1,4 @@
-"""A vector environment with seats gives, to the bit, what a loop over `protocol.envs.seats` gives, in any order and mode."""
+"""A vector environment with seats gives, to the bit, what a loop over `millrace.protocol.envs.seats` gives, in any order and mode."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gymnasium.vector import AutoresetMode
 from pettingzoo.utils.wrappers import BaseParallelWrapper, BaseWrapper
 
 import millrace
-from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.infos import OfSomeRows
-from learner.vector_env.settings import VectorEnvSettings
-from protocol.envs.seats import SeatedEnv, SeatStep, seated, side_by_side
-from protocol.errors import EnvironmentFailed, UsageError
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.learner.vector_env.infos import OfSomeRows
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.envs.seats import SeatedEnv, SeatStep, seated, side_by_side
+from millrace.protocol.errors import EnvironmentFailed, UsageError
 from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import info_of
 from tests.support.numbers.bit_equality import bit_equal
@@ -209,7 +209,7 @@ class Turning(RandomCrowd):
 
 
 def test_nested_observations_and_actions() -> None:
-    with millrace.make_vec(Turning, 2, transport="inproc", wrappers=["protocol.envs.seats:seat_id"]) as env:
+    with millrace.make_vec(Turning, 2, transport="inproc", wrappers=["millrace.protocol.envs.seats:seat_id"]) as env:
         observation, infos = env.reset(seed=2)
         assert observation["seat"].tolist() == [*range(A)] * 2
         actions = env.action_space.sample()

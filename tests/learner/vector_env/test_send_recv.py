@@ -17,21 +17,21 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.lane_orders import packed, step_order
-from learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
-from learner.vector_env.settings import VectorEnvSettings
-from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
-from protocol.messages import LaneIncarnation, Reset, Step
-from protocol.wire.plain_values import unpack
-from protocol.wire.wake_up import WakeReason
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.learner.vector_env.lane_orders import packed, step_order
+from millrace.learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
+from millrace.protocol.messages import LaneIncarnation, Reset, Step
+from millrace.protocol.wire.plain_values import unpack
+from millrace.protocol.wire.wake_up import WakeReason
 from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
 from tests.support.numbers.bit_equality import bit_equal
 
-INFORMS = "workers.envs.toy:Informs-v0"
-COUNTDOWN = "workers.envs.toy:Countdown-v0"
+INFORMS = "millrace.workers.envs.toy:Informs-v0"
+COUNTDOWN = "millrace.workers.envs.toy:Countdown-v0"
 BOTH_WAYS = pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
 
 
@@ -514,7 +514,7 @@ def test_time_in_which_the_caller_did_other_things_counts_little() -> None:
 
 
 def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> None:
-    with made("workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
+    with made("millrace.workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
         env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
@@ -531,7 +531,7 @@ def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> 
 
 
 def test_an_error_that_a_step_in_lock_step_has_raised_is_not_told_again_by_the_next() -> None:
-    with made("workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
+    with made("millrace.workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
         env.reset(seed=1), env.step(zeros([0, 1, 2]))
         with pytest.raises(EnvironmentFailed, match="lane 1, copy 0, step 1: its environment raised ValueError"):
             env.step(zeros([0, 1, 2]))

@@ -15,26 +15,26 @@ import pytest
 from msgspec.structs import replace
 
 import millrace
-from learner.callbacks.callbacks import Callbacks
-from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.layers import resolve
-from learner.policy_player import PolicyPlayer
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.run_folder import checkpoint
-from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import Best, Evaluation, Summary
-from learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.cli.commands import COMMANDS
 from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.cli.main import main
 from millrace.cli.shown_run import next_commands
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed, NoWorkers
-from protocol.policy.layout import acting_size
-from protocol.specs import PolicySpec
+from millrace.learner.callbacks.callbacks import Callbacks
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
+from millrace.learner.policy_player import PolicyPlayer
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.metrics_log import MetricsLog
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import Best, Evaluation, Summary
+from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.saved_policies import policy_run
 
 ROOT = Path(__file__).parents[3]
@@ -517,7 +517,7 @@ def test_evaluate_says_mean_and_deviation(tmp_path: Path, capsys: Captured) -> N
 
 
 def test_evaluate_gives_up_after_the_number_of_failures_that_its_flag_says(tmp_path: Path, capsys: Captured) -> None:
-    run = a_run_that_acts(tmp_path, "workers.envs.toy:Raises-v0")
+    run = a_run_that_acts(tmp_path, "millrace.workers.envs.toy:Raises-v0")
     options = ("--transport", "inproc", "--workers", "1", "--max-env-failures", "0")
     assert main(["evaluate", str(run), *options]) == 1
     assert "; failure 1 in a row; max_env_failures allows 0 in a row" in capsys.readouterr().err

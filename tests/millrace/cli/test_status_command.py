@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from learner.run_folder.lease import Listens, Owner, decoded
-from learner.run_folder.metrics_log import METRICS_FILE
-from learner.run_folder.run_lock import LOCK_FILE, RunLock
 from millrace.cli.main import main
 from millrace.cli.status import status, whom_to_ask
-from protocol.errors import UsageError
-from protocol.keys.key_folder import KeyFolder, read_token
-from protocol.keys.keys import Key, Token
+from millrace.learner.run_folder.lease import Listens, Owner, decoded
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.run_lock import LOCK_FILE, RunLock
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import KeyFolder, read_token
+from millrace.protocol.keys.keys import Key, Token
 from tests.learner.report.test_page import a_run
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)

@@ -13,9 +13,10 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
-from learner.report.sentences import per_second
-from learner.run_folder.progress import Progress
-from learner.standard_streams import never_fails
+from millrace.learner.report.sentences import per_second
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.standard_streams import never_fails
+from millrace.protocol.logs.notices import log_notice
 from millrace.sparkline import ASCII, BLOCKS, COLUMNS, MOST_POINTS, Sparkline
 from millrace.terminal import (
     LINE_EVERY_S,
@@ -31,7 +32,6 @@ from millrace.terminal import (
     progress_view,
     render_block,
 )
-from protocol.logs.notices import log_notice
 
 PROGRESS = Progress(
     run="runs/CartPole-v1-ppo-s1", env_steps=62_208, total_steps=100_000, updates=243, wall_s=14.8, steps_per_s=4210.3,

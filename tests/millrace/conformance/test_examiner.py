@@ -33,10 +33,10 @@ from millrace.conformance.script import (
     Wait,
 )
 from millrace.conformance.watch import WatchedSession, check_stepped
-from protocol.env_spec import EnvSpec
-from protocol.errors import BadMessage
-from protocol.keys.keys import Key, Token
-from protocol.messages import (
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.keys.keys import Key, Token
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     Described,
@@ -56,8 +56,8 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.specs import DescribeSpec, Leaf, StepSpec
-from protocol.wire.codec import decode_to_worker
+from millrace.protocol.specs import DescribeSpec, Leaf, StepSpec
+from millrace.protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 

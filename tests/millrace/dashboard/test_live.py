@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import zmq
 
-from learner.run_folder.lease import Listens
-from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import live
 from millrace.dashboard.live import Lookout, Seen
-from protocol.messages import Status
-from protocol.wire.codec import encode
-from protocol.wire.worker_link import OF_OBSERVER
+from millrace.learner.run_folder.lease import Listens
+from millrace.learner.run_folder.run_lock import RunLock
+from millrace.protocol.messages import Status
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.worker_link import OF_OBSERVER
 from tests.millrace.dashboard.test_site import status, worker
 
 WITHIN_S = 20.0

@@ -14,7 +14,7 @@ from millrace.cli.dashboard import where_to_listen
 from millrace.dashboard import server as dashboard_server
 from millrace.dashboard.http import PageAnswer, PageRequest, parsed
 from millrace.dashboard.server import MOST_CONNECTIONS, MOST_HEAD_BYTES, DashboardServer
-from protocol.errors import UsageError
+from millrace.protocol.errors import UsageError
 
 TIMEOUT_S = 20.0
 

@@ -12,20 +12,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.metric_names import METRICS, described, label
-from learner.run_folder.json_log import kept_log
-from learner.run_folder.lease import Owner
-from learner.run_folder.metrics_log import METRICS_FILE
-from learner.run_folder.results import Best, Evaluation
-from learner.run_folder.run_lock import RunLock
 from millrace.dashboard import run_page, site
 from millrace.dashboard.http import PageAnswer, answer_parts, parsed
 from millrace.dashboard.known_runs import KnownRuns, key_of, newest_logs
 from millrace.dashboard.live import LaneSample, Seen, sample
 from millrace.dashboard.run_page import Choice, smoothed
 from millrace.dashboard.site import Site
-from protocol.logs.notices import log_notice
-from protocol.messages import Status, WorkerStatus
+from millrace.learner.metric_names import METRICS, described, label
+from millrace.learner.run_folder.json_log import kept_log
+from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.results import Best, Evaluation
+from millrace.learner.run_folder.run_lock import RunLock
+from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.messages import Status, WorkerStatus
 from tests.learner.report.test_page import Reader, a_run
 
 log = logging.getLogger("millrace.learner")

@@ -19,13 +19,13 @@ import pytest
 import yaml
 from prometheus_client.samples import Sample
 
-from learner.config.command_line import read_config
-from learner.config.config import Config
-from learner.prometheus import MetricsCollector, MetricsSnapshot
-from learner.rollouts.ledger import Ledger
-from learner.run_folder.progress import Progress
 from millrace.cli.main import NOT_IN_WORKERS
-from protocol.keys.key_folder import KeyFolder
+from millrace.learner.config.command_line import read_config
+from millrace.learner.config.config import Config
+from millrace.learner.prometheus import MetricsCollector, MetricsSnapshot
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.keys.key_folder import KeyFolder
 from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parents[3]
@@ -60,7 +60,7 @@ class Missing:
             raise ModuleNotFoundError(f"{{name}} is not in the worker image", name=name)
 
 sys.meta_path.insert(0, Missing())
-import workers.collect.collector, workers.worker, workers.__main__
+import millrace.workers.collect.collector, millrace.workers.worker, millrace.workers.__main__
 from millrace.cli.main import main
 sys.exit(main(["worker", "tcp://127.0.0.1:1", "--join-timeout-s", "0.01"]))
 """

@@ -9,15 +9,15 @@ from typing import Any
 
 import pytest
 
-from learner.members.bind_settings import BindSettings
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags
-from protocol.flags.parse import parse_flags
-from workers import worker_thread
-from workers.conversation.connection_rules import wait_limits_s
-from workers.conversation.session import Session, WorkerIdentity
-from workers.flags import WorkerFlags
-from workers.supervise import worker_process
+from millrace.learner.members.bind_settings import BindSettings
+from millrace.protocol.flags.parse import parse_flags
+from millrace.workers import worker_thread
+from millrace.workers.conversation.connection_rules import wait_limits_s
+from millrace.workers.conversation.session import Session, WorkerIdentity
+from millrace.workers.flags import WorkerFlags
+from millrace.workers.supervise import worker_process
 
 WITHIN_S = 60.0
 

@@ -17,9 +17,9 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from learner.config.command_line import read_config
 from millrace.cli.main import main
-from protocol.keys.key_folder import KeyFolder
+from millrace.learner.config.command_line import read_config
+from millrace.protocol.keys.key_folder import KeyFolder
 
 ROOT = Path(__file__).parents[3]
 KUBERNETES = ("1.29", "1.31", "1.34", "1.37")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from tests.model.conversation import Content, Event, Facts
 from tests.model.evaluation import learner_half, worker_half
 from tests.model.learner_part import first_learner

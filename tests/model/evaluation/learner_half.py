@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer
-from protocol.messages import EpisodeRows, ToLearner
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer
+from millrace.protocol.messages import EpisodeRows, ToLearner
 from tests.model import learner_part
 from tests.model.conversation import Content
 from tests.model.learner_part import Learner

@@ -13,7 +13,7 @@ from tests.model.mutations import COORDINATOR, HELD, PLACEMENT, SESSION, WEIGHTS
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
-TICKETS = "learner.rollouts.evaluation_dealer"
+TICKETS = "millrace.learner.rollouts.evaluation_dealer"
 
 MUTATIONS = {
     "an evaluation of the version before": Mutation(TICKETS, "version=self.version,", "version=max(0, self.version - 1),"),

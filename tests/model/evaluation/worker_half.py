@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protocol.messages import Evaluate, ToLearner, ToWorker
+from millrace.protocol.messages import Evaluate, ToLearner, ToWorker
+from millrace.workers.conversation.session import EvaluationTask, RolloutTask
 from tests.model import worker_part
 from tests.model.conversation import Content
 from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
 from tests.model.worker_part import Worker
 from tests.support.conversation.fake_ends import fake_rows
-from workers.conversation.session import EvaluationTask, RolloutTask
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating

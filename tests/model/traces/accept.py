@@ -34,11 +34,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from learner.rollouts.ledger import Ledger
-from protocol.messages import Alive, Hello, Rollout
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.protocol.messages import Alive, Hello, Rollout
+from millrace.workers.conversation.session import Session
 from tests.model.traces.record import SUFFIX, Record, Said, SaidRollout, SaidWeights, read
 from tests.model.traces.replay import NotAccepted, Replay
-from workers.conversation.session import Session
 
 OLD_CONNECTION = b"\0"  # the routing ids of workers begin with their name
 

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from learner.members.membership import Member
-from learner.rollouts.lanes import AcceptedRollout
-from protocol.arrays import Array
-from protocol.messages import Rollout, ToLearner, ToWorker, Weights
-from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
-from workers.conversation.session import CloseLanes, EvaluationTask, Leave, RolloutTask, SendMessage, StartSession
+from millrace.learner.members.membership import Member
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.protocol.arrays import Array
+from millrace.protocol.messages import Rollout, ToLearner, ToWorker, Weights
+from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
+from millrace.workers.conversation.session import CloseLanes, EvaluationTask, Leave, RolloutTask, SendMessage, StartSession
 
 SUFFIX = ".trace"
 KEPT_WEIGHTS = 64  # digests of weights: the learner of a soak must not grow by them

@@ -20,9 +20,9 @@ from types import ModuleType
 from typing import Any
 
 FOLDER = "MILLRACE_TRACE"
-COORDINATOR = "learner.rollouts.ticket_coordinator"
-DESCRIBE = "learner.members.describe_coordinator"
-SESSION = "workers.conversation.session"
+COORDINATOR = "millrace.learner.rollouts.ticket_coordinator"
+DESCRIBE = "millrace.learner.members.describe_coordinator"
+SESSION = "millrace.workers.conversation.session"
 COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent")
 METHODS = {
     "TicketCoordinator": (
@@ -88,7 +88,7 @@ class Recorder:
         return result
 
     def _published(self, given: Sequence[Any]) -> tuple[Any, ...]:
-        from protocol.messages import Weights
+        from millrace.protocol.messages import Weights
         from tests.model.traces.record import digest_of
 
         version, parameters, buffers = given

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from learner.members.describe_coordinator import DescribeCoordinator, accept_any
-from learner.rollouts.lanes import AcceptedRollout
-from learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.members.describe_coordinator import DescribeCoordinator, accept_any
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.workers.conversation.session import Session
 from tests.model import learner_part
 from tests.model.traces.record import Digests, Record, SaidMember, message_of
 from tests.support.conversation.rules import waiting_rollouts
-from workers.conversation.session import Session
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
 MADE_BY_THE_COORDINATOR = {"Membership": "membership", "RolloutDealer": "rollouts", "EvaluationDealer": "evaluation"}

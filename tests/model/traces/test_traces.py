@@ -13,14 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from learner.members.describe_coordinator import DescribeCoordinator
-from learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.members.describe_coordinator import DescribeCoordinator
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.workers.conversation.session import Session
 from tests.model.traces.accept import Acceptance, LearnerTrace, Moment, WorkerTrace, accept, check_order, processes_by_sender
 from tests.model.traces.record import Record, SaidRollout, read
 from tests.model.traces.recorder import FOLDER, METHODS, NOT_RECORDED
 from tests.model.traces.replay import NotAccepted
 from tests.system.stage.processes import ROOT, SMALL, TOY, Stage, free_port
-from workers.conversation.session import Session
 
 ADDRESS = "tcp://127.0.0.1:{}"
 UPDATES = 4
@@ -183,7 +183,7 @@ def test_a_trace_that_is_cut_in_a_record_is_read_up_to_there(copy: Path) -> None
 
 def test_without_a_wish_for_traces_the_program_is_what_it_always_is() -> None:
     """The hook alone imports nothing; the classes are the program's own."""
-    code = "import sys, learner.rollouts.ticket_coordinator as t, workers.conversation.session as s; "
+    code = "import sys, millrace.learner.rollouts.ticket_coordinator as t, millrace.workers.conversation.session as s; "
     code += "print(t.TicketCoordinator.__module__ == t.__name__, s.Session.__module__ == s.__name__, "
     code += "'sitecustomize' in sys.modules, any('traces' in name for name in sys.modules))"
     path = os.pathsep.join(map(str, (ROOT / "tests/model/traces/hook", ROOT)))

@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, cast
 import gymnasium
 import numpy as np
 
-from learner.members.membership import Outgoing
-from learner.vector_env.batch_arrays import BatchArrays
-from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.lost_lanes import LostLanes
-from learner.vector_env.order_coordinator import OrderCoordinator
-from learner.vector_env.send_recv import SendRecv, VectorEnvParts
-from learner.vector_env.sent_lanes import Asked, AskedReset, Sent
-from learner.vector_env.step_hub import StepHub
-from protocol.errors import NoWorkers, WorkerLost
-from protocol.messages import Answer, LaneIncarnation
-from protocol.wire.learner_link import LearnerLink
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.vector_env.batch_arrays import BatchArrays
+from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.lost_lanes import LostLanes
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
+from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.protocol.errors import NoWorkers, WorkerLost
+from millrace.protocol.messages import Answer, LaneIncarnation
+from millrace.protocol.wire.learner_link import LearnerLink
 from tests.model.settings import TICK_S
 from tests.model.vector_env.order_content import NEW, Copy, executed, make_order, state_in
 from tests.support.conversation.fake_link import FakeLink

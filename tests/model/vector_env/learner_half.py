@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from learner.members.membership import Member, Outgoing
-from learner.vector_env.order_coordinator import OrderCoordinator
-from learner.vector_env.sent_lanes import Asked, AskedReset, Sent
-from protocol.messages import ToLearner, WorkerExit
+from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
+from millrace.protocol.messages import ToLearner, WorkerExit
 from tests.model import membership_part
 from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, peer_of, session, ticket, worker_of

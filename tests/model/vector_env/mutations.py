@@ -16,12 +16,12 @@ from tests.model.mutations import HELD, SESSION, Mutation, play
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
-COORDINATOR = "learner.vector_env.order_coordinator"
-MEMBERS = "learner.members.coordinator"
-HUB = "learner.vector_env.step_hub"
-LOST = "learner.vector_env.lost_lanes"
-SENT = "learner.vector_env.sent_lanes"
-SEND_RECV = "learner.vector_env.send_recv"
+COORDINATOR = "millrace.learner.vector_env.order_coordinator"
+MEMBERS = "millrace.learner.members.coordinator"
+HUB = "millrace.learner.vector_env.step_hub"
+LOST = "millrace.learner.vector_env.lost_lanes"
+SENT = "millrace.learner.vector_env.sent_lanes"
+SEND_RECV = "millrace.learner.vector_env.send_recv"
 
 MUTATIONS = {
     "a lost order is not sent again": Mutation(

@@ -11,13 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from learner.vector_env.lane_orders import call_order, packed, reset_order, step_order
-from learner.vector_env.order_coordinator import MakeOrder
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.messages import Answer, Call, LaneIncarnation, Order, Reset, Returned, Step, Stepped, ToLearner, ToWorker
-from protocol.specs import Leaf, StepSpec
-from protocol.wire.plain_values import pack, unpack
+from millrace.learner.vector_env.lane_orders import call_order, packed, reset_order, step_order
+from millrace.learner.vector_env.order_coordinator import MakeOrder
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.messages import (
+    Answer,
+    Call,
+    LaneIncarnation,
+    Order,
+    Reset,
+    Returned,
+    Step,
+    Stepped,
+    ToLearner,
+    ToWorker,
+)
+from millrace.protocol.specs import Leaf, StepSpec
+from millrace.protocol.wire.plain_values import pack, unpack
 from tests.model import message_content
 from tests.model.conversation import Content
 from tests.model.message_content import incarnation, session, ticket

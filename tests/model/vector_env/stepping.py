@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protocol.specs import StepSpec
+from millrace.protocol.specs import StepSpec
 from tests.model import process_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.message_content import worker_of

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protocol.messages import Answer, Call, Reset, Step, ToLearner
+from millrace.protocol.messages import Answer, Call, Reset, Step, ToLearner
+from millrace.workers.conversation.held import OrderLane
+from millrace.workers.conversation.session import CloseLanes, Leave, SendMessage, SharedOrders, StartSession, WorkerEffect
 from tests.model import process_part
 from tests.model.conversation import Content
 from tests.model.message_content import incarnation, ticket
@@ -24,8 +26,6 @@ from tests.model.vector_env.order_content import (
     order_content,
     order_of,
 )
-from workers.conversation.held import OrderLane
-from workers.conversation.session import CloseLanes, Leave, SendMessage, SharedOrders, StartSession, WorkerEffect
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping

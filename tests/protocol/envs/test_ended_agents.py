@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from protocol.envs.answers import WrongAnswer
-from protocol.envs.seats import SeatedEnv, SeatStep, seated
+from millrace.protocol.envs.answers import WrongAnswer
+from millrace.protocol.envs.seats import SeatedEnv, SeatStep, seated
 
 A, B = 0, 1
 

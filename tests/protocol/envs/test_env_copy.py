@@ -9,10 +9,10 @@ from typing import Any
 import gymnasium
 import pytest
 
-from protocol.env_spec import AllowedCode, EnvSpec
-from protocol.envs.which_copy import EnvCopy, being_made, filled, takes_copy
-from protocol.errors import UsageError
-from workers.envs.toy import Countdown
+from millrace.protocol.env_spec import AllowedCode, EnvSpec
+from millrace.protocol.envs.which_copy import EnvCopy, being_made, filled, takes_copy
+from millrace.protocol.errors import UsageError
+from millrace.workers.envs.toy import Countdown
 
 MODULE = __name__
 COPY = EnvCopy(number=7, lane=3, copy=1, evaluation=False, slot=12)

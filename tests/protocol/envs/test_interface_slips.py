@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import describe_env
-from protocol.envs.seats import MAX_AGENT_NAME
-from protocol.errors import UsageError
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import describe_env
+from millrace.protocol.envs.seats import MAX_AGENT_NAME
+from millrace.protocol.errors import UsageError
+from millrace.workers.envs.toy import Countdown
 from tests.support.users_code.seat_envs import RandomCrowd
-from workers.envs.toy import Countdown
 
 MODULE = __name__
 

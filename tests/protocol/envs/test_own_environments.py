@@ -17,12 +17,12 @@ import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
-from protocol.env_spec import AllowedCode, EnvSpec, remembered_name
-from protocol.envs.found_names import found_by_others, moved, name_of
-from protocol.envs.unknown_ids import ids_of_gymnasium
-from protocol.envs.wrappers import read_wrapper, wrapper_name
-from protocol.errors import UsageError
-from workers.envs.toy import Countdown
+from millrace.protocol.env_spec import AllowedCode, EnvSpec, remembered_name
+from millrace.protocol.envs.found_names import found_by_others, moved, name_of
+from millrace.protocol.envs.unknown_ids import ids_of_gymnasium
+from millrace.protocol.envs.wrappers import read_wrapper, wrapper_name
+from millrace.protocol.errors import UsageError
+from millrace.workers.envs.toy import Countdown
 
 MODULE = __name__
 
@@ -264,7 +264,7 @@ def test_an_id_that_an_imported_module_registers_is_remembered_with_it(
     registry: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "arcade_of_mine.py").write_text(
-        "import gymnasium\nfrom workers.envs.toy import Countdown\nclass Game(Countdown): pass\n"
+        "import gymnasium\nfrom millrace.workers.envs.toy import Countdown\nclass Game(Countdown): pass\n"
         'gymnasium.register(id="Game-v0", entry_point="arcade_of_mine:Game")\n'
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -402,14 +402,17 @@ def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     for spec, what in ((named, "a wrapper"), (pickled, "an environment factory"), (function, "an environment factory")):
         assert [bool(spec.rejection_reason(code)) for code in codes] == [True, True, False]
         assert spec.called_code == what
-    by_id = EnvSpec("workers.envs.toy:Countdown-v0")
+    by_id = EnvSpec("millrace.workers.envs.toy:Countdown-v0")
     assert [bool(by_id.rejection_reason(code)) for code in codes] == [True, False, False]
     assert by_id.called_code == ""
     for spec in (function, pickled):
         assert "; or register an id for it (gymnasium.register" in spec.rejection_reason(AllowedCode.MODULES)
     assert "register" not in named.rejection_reason(AllowedCode.MODULES), "an id does not help a wrapper"
     assert "an id that a package installed there registers" in by_id.rejection_reason(AllowedCode.REGISTERED)
-    assert cloudpickle.loads(pickled.factory.data if pickled.factory else b"").__class__.__module__ == "protocol.env_spec"
+    assert (
+        cloudpickle.loads(pickled.factory.data if pickled.factory else b"").__class__.__module__
+        == "millrace.protocol.env_spec"
+    )
 
 
 @pytest.mark.parametrize("value", [[1], None, 10**30, np.float32(1)])

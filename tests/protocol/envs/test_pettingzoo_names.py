@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from protocol.env_spec import AllowedCode, EnvSpec
-from protocol.envs.seats import ParallelSeats, TurnSeats
-from protocol.errors import UsageError
+from millrace.protocol.env_spec import AllowedCode, EnvSpec
+from millrace.protocol.envs.seats import ParallelSeats, TurnSeats
+from millrace.protocol.errors import UsageError
 
 GAMES = "tests.support.users_code.seat_envs"
 

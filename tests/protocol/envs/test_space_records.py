@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from protocol.bounds import MAX_NAME
-from protocol.envs.description import DescribedEnv, describe_env, read_description
-from protocol.envs.space_records import describe_space, make_space
-from protocol.errors import BadMessage, UsageError
-from protocol.messages import Described
-from protocol.space_spec import (
+from millrace.protocol.bounds import MAX_NAME
+from millrace.protocol.envs.description import DescribedEnv, describe_env, read_description
+from millrace.protocol.envs.space_records import describe_space, make_space
+from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.messages import Described
+from millrace.protocol.space_spec import (
     MAX_ELEMENTS,
     MAX_LEAVES,
     MAX_SEATS,
@@ -30,11 +30,11 @@ from protocol.space_spec import (
     TupleSpace,
     check_size,
 )
-from protocol.wire.codec import decode_to_learner, encode
-from protocol.wire.plain_values import pack
+from millrace.protocol.wire.codec import decode_to_learner, encode
+from millrace.protocol.wire.plain_values import pack
+from millrace.workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
 from tests.support.in_process.described import with_spaces
 from tests.support.numbers.bit_equality import bit_equal
-from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
 
 FLOATS, WHOLE = ("float16", "float32", "float64"), ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
 

@@ -12,14 +12,14 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from protocol.arrays import Array
-from protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
-from protocol.errors import BadRollout, UsageError
-from protocol.rollout import Episode, Rollout
-from protocol.rows.rollout_checks import validate, wrong_facts
-from protocol.specs import RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
+from millrace.protocol.errors import BadRollout, UsageError
+from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rows.rollout_checks import validate, wrong_facts
+from millrace.protocol.specs import RunSpec
+from millrace.workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
-from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
 ROOT = Path(__file__).parents[3]
 SEEN = sorted(OBSERVATIONS.keys() - UNSUPPORTED_OBSERVATIONS)

@@ -16,18 +16,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.config.config import Config
-from learner.config.layers import resolve
-from protocol.env_spec import EnvSpec
-from protocol.envs.envpool import envpool_spec
-from protocol.envs.vectorized import make_native
-from protocol.errors import UsageError
-from protocol.specs import RunSpec
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import resolve
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.envpool import envpool_spec
+from millrace.protocol.envs.vectorized import make_native
+from millrace.protocol.errors import UsageError
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import LoopedCopies, StepResult, VectorCopies, copy_seeds
+from millrace.workers.copies.envpool_copies import EnvpoolCopies
+from millrace.workers.envs.toy import Countdown
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from tests.support.in_process.described import run_spec
-from workers.copies.env_copies import LoopedCopies, StepResult, VectorCopies, copy_seeds
-from workers.copies.envpool_copies import EnvpoolCopies
-from workers.envs.toy import Countdown
 
 Vector = Literal["native", "envpool"]
 here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install envpool")

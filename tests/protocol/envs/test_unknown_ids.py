@@ -16,10 +16,10 @@ import gymnasium
 import pytest
 from gymnasium import spaces
 
-from protocol.env_spec import EnvSpec, remembered_name
-from protocol.envs.description import describe_env
-from protocol.envs.unknown_ids import installed_packages
-from protocol.errors import UsageError
+from millrace.protocol.env_spec import EnvSpec, remembered_name
+from millrace.protocol.envs.description import describe_env
+from millrace.protocol.envs.unknown_ids import installed_packages
+from millrace.protocol.errors import UsageError
 
 GAME = """
 import gymnasium
@@ -213,7 +213,7 @@ def test_a_plugin_that_fails_costs_no_more_than_its_ids(site: Site) -> None:
 
 def test_no_plugin_is_imported_for_an_id_that_is_known(site: Site) -> None:
     site.install("fake_broken", "raise OSError('no display')", "[gymnasium.envs]\n__root__ = fake_broken:register_all\n")
-    for env in ("CartPole-v1", "workers.envs.toy:Countdown-v0", "millrace/CartDoublePendulum-v0"):
+    for env in ("CartPole-v1", "millrace.workers.envs.toy:Countdown-v0", "millrace/CartDoublePendulum-v0"):
         EnvSpec.of(env).make().close()
     assert "fake_broken" not in sys.modules
 
@@ -324,6 +324,6 @@ def test_the_line_about_observations_names_a_wrapper_that_helps(env: gymnasium.E
     assert "\n" not in line
     wrapper = line.partition("--wrappers ")[2].partition(" leaves")[0].partition(" makes")[0].strip('"')
     if wrapper.startswith("gymnasium."):
-        from protocol.envs.wrappers import wrap
+        from millrace.protocol.envs.wrappers import wrap
 
         describe_env(wrap(env, wrapper))

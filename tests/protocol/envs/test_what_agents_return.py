@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.arrays import Array
-from protocol.envs.answers import WrongAnswer
-from protocol.envs.seats import seated, with_state
-from protocol.errors import UsageError
+from millrace.protocol.arrays import Array
+from millrace.protocol.envs.answers import WrongAnswer
+from millrace.protocol.envs.seats import seated, with_state
+from millrace.protocol.errors import UsageError
 from tests.support.users_code.seat_envs import RockPaperScissors
 
 

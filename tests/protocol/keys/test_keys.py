@@ -13,10 +13,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import UsageError
-from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring, chosen_key_folder, read_token
-from protocol.keys.keys import TOKEN_CHARACTERS, TOKEN_PREFIX, Client, ClientList, Key, Token, fingerprint, public_key
-from protocol.logs.log_rate_limiter import LogRateLimiter
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring, chosen_key_folder, read_token
+from millrace.protocol.keys.keys import (
+    TOKEN_CHARACTERS,
+    TOKEN_PREFIX,
+    Client,
+    ClientList,
+    Key,
+    Token,
+    fingerprint,
+    public_key,
+)
+from millrace.protocol.logs.log_rate_limiter import LogRateLimiter
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 LATER = datetime(2026, 11, 22, 10, tzinfo=UTC)

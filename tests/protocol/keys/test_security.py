@@ -14,16 +14,22 @@ from pathlib import Path
 import pytest
 import zmq
 
-from learner.members.membership import REMEMBERED
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.address import worker_name
-from protocol.errors import BadMessage, RunError, UsageError
-from protocol.keys.handshake import NO_ZEROMQ, ConnectionProblem, PendingHandshakes, connection_problem, handshake_failure
-from protocol.keys.key_folder import KeyFolder, Keyring
-from protocol.keys.keys import ClientList, Key, Token
-from protocol.keys.zap import DOMAIN, ZAP, answer
-from protocol.messages import (
+from millrace.learner.members.membership import REMEMBERED
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.address import worker_name
+from millrace.protocol.errors import BadMessage, RunError, UsageError
+from millrace.protocol.keys.handshake import (
+    NO_ZEROMQ,
+    ConnectionProblem,
+    PendingHandshakes,
+    connection_problem,
+    handshake_failure,
+)
+from millrace.protocol.keys.key_folder import KeyFolder, Keyring
+from millrace.protocol.keys.keys import ClientList, Key, Token
+from millrace.protocol.keys.zap import DOMAIN, ZAP, answer
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     Heartbeat,
@@ -35,9 +41,9 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.wire.codec import encode
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.worker_link import WorkerLink
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.worker_link import WorkerLink
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 
 DEADLINE_S = 5.0  # within so long both sides must have said what is wrong
@@ -404,7 +410,7 @@ def test_whatever_goes_wrong_with_one_visitor_the_next_is_answered(net: Net, mon
             raise RuntimeError("a fault of ours")
         return answer(request, keyring)
 
-    monkeypatch.setattr("protocol.keys.zap.answer", once)
+    monkeypatch.setattr("millrace.protocol.keys.zap.answer", once)
     learner = net.keyed()
     net.worker(learner, token(), "first")
     until(lambda: len(calls) == 1)
@@ -575,7 +581,7 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
 
 
 def test_the_table_of_who_spoke_last_stays_small(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("protocol.wire.learner_link.MAX_REMEMBERED_KEYS", 10)
+    monkeypatch.setattr("millrace.protocol.wire.learner_link.MAX_REMEMBERED_KEYS", 10)
     learner = net.keyed()
     for number in range(100):
         learner._peer(b"%d" % number, LAB.public.hex())

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from learner.algorithms.replay.available_memory import available_bytes
-from protocol.machine.control_groups import cpu_quota, free_bytes
-from protocol.machine.cpu_cores import usable_cores
+from millrace.learner.algorithms.replay.available_memory import available_bytes
+from millrace.protocol.machine.control_groups import cpu_quota, free_bytes
+from millrace.protocol.machine.cpu_cores import usable_cores
 
 V2 = "31 23 0:28 / /sys/fs/cgroup rw,relatime shared:9 - cgroup2 cgroup2 rw,nsdelegate"
 V1_MEMORY = "35 31 0:32 / /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory"

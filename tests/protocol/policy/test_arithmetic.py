@@ -7,11 +7,11 @@ import torch
 from msgspec.structs import replace
 from torch.utils.flop_counter import FlopCounterMode
 
-from protocol.policy.arithmetic import multiply_adds
-from protocol.policy.encoder import describe_encoder
-from protocol.policy.features import feature_size
-from protocol.policy.networks import ActorCriticNetwork
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.policy.arithmetic import multiply_adds
+from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.features import feature_size
+from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
 VECTOR = Leaf("v", "box", (5,), "float32")

@@ -11,18 +11,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from learner.algorithms import algorithm_class
-from learner.config.hyperparameters import HYPERPARAMETERS
-from learner.config.layers import resolve
-from learner.run_folder.run_folder import RunFolder
-from protocol.env_spec import AllowedCode, EnvSpec
-from protocol.errors import UsageError
-from protocol.policy.encoder import describe_encoder, make_encoder
-from protocol.policy.layout import acting_size
-from protocol.policy.networks import ActorCriticNetwork, QNetwork
-from protocol.policy.policy import make_policy
-from protocol.policy.torch_policy import TorchPolicy
-from protocol.specs import NamedShape, PolicySpec
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.env_spec import AllowedCode, EnvSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.encoder import describe_encoder, make_encoder
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.policy.networks import ActorCriticNetwork, QNetwork
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.specs import NamedShape, PolicySpec
 from tests.support.in_process.described import run_spec
 from tests.support.in_process.saved_policies import load_policy, policy_run
 from tests.support.numbers.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent

@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.minibatches import log_probs
-from learner.algorithms.normalization import ObservationNormalizer
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import PPOConfig
-from learner.run_folder.run_folder import RunFolder
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import observation_leaves
-from protocol.policy.features import feature_size, features, normalize
-from protocol.policy.layout import acting_size, buffer_size, convolutions
-from protocol.policy.policy import make_policy
-from protocol.rollout import stack_rollouts
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms.minibatches import log_probs
+from millrace.learner.algorithms.normalization import ObservationNormalizer
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import observation_leaves
+from millrace.protocol.policy.features import feature_size, features, normalize
+from millrace.protocol.policy.layout import acting_size, buffer_size, convolutions
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import stack_rollouts
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.workers.envs.toy import Countdown
 from tests.docs.pages import blocks, written
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around
 from tests.support.in_process.saved_policies import policy_run
-from workers.envs.toy import Countdown
 
 TWO = ActionSpec("discrete", (), "int64", (2,), (0,))
 IMAGE = gymnasium.spaces.Box(0, 255, (12, 12, 3), np.uint8)

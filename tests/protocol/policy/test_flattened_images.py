@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import millrace
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import observation_leaves
-from protocol.policy.flattened_images import flattened_images
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import observation_leaves
+from millrace.protocol.policy.flattened_images import flattened_images
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 ACTION = ActionSpec("discrete", (), "int64", sizes=(2,), start=(0,))
 

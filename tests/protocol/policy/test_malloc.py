@@ -7,9 +7,9 @@ import resource
 import numpy as np
 import pytest
 
-from protocol.policy.malloc import keep_freed_memory
-from protocol.policy.networks import ActorCriticNetwork
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.policy.malloc import keep_freed_memory
+from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 def faults(megabytes: int, rounds: int) -> int:
@@ -32,7 +32,7 @@ def test_freed_memory_is_used_again() -> None:
 
 def test_networks_that_look_at_images_keep_it_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[bool] = []
-    monkeypatch.setattr("protocol.policy.networks.keep_freed_memory", lambda: kept.append(True))
+    monkeypatch.setattr("millrace.protocol.policy.networks.keep_freed_memory", lambda: kept.append(True))
     action = ActionSpec("discrete", (), "int64", (4,), (0,))
     ActorCriticNetwork(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
     assert kept == []

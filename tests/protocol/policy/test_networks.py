@@ -14,15 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from protocol.arrays import Array
-from protocol.policy.distributions import distribution
-from protocol.policy.features import features, normalize
-from protocol.policy.layout import buffer_size, convolutions, parameter_layout, total_size
-from protocol.policy.networks import ActorCriticNetwork, MLPNode
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.policy.torch_distributions import log_prob_and_entropy
-from protocol.policy.torch_policy import TorchPolicy
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.layout import buffer_size, convolutions, parameter_layout, total_size
+from millrace.protocol.policy.networks import ActorCriticNetwork, MLPNode
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
+from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.support.numbers.rounding import in_double, in_float64, sampled
 
 BOX = Leaf("x", "box", (2, 3), "float32")

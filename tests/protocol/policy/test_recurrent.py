@@ -10,33 +10,33 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import algorithm_class
-from learner.algorithms.minibatches import Minibatch, log_probs
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
-from learner.torch_setup import one_thread
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.errors import BadRollout
-from protocol.messages import Evaluate
-from protocol.policy.distributions import distribution
-from protocol.policy.layout import buffer_size
-from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.policy.policy import make_policy
-from protocol.policy.recurrent import advance, zero_state
-from protocol.policy.torch_distributions import log_prob_and_entropy
-from protocol.policy.torch_policy import TorchPolicy
-from protocol.rollout import Rollout, stack_rollouts
-from protocol.rows.rollout_checks import validate
-from protocol.specs import PolicySpec, RunSpec
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.minibatches import Minibatch, log_probs
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from millrace.learner.torch_setup import one_thread
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import BadRollout
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.layout import buffer_size
+from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.policy.recurrent import advance, zero_state
+from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
+from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.rollout import Rollout, stack_rollouts
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.envs.toy import Scripted
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
 from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, in_double, in_float64, sampled
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
-from workers.envs.toy import Scripted
-from workers.evaluate.evaluator import Evaluator
 
 Core = Literal["lstm", "gru"]
 CORES: tuple[Core, Core] = ("lstm", "gru")
@@ -260,7 +260,7 @@ def test_values_are_the_same_however_many_columns_are_evaluated_together(monkeyp
     rows = batch(ppo, 0)
     observations = ppo.observations(rows)
     whole = ppo.values(observations, no_pulse)
-    monkeypatch.setattr("learner.algorithms.minibatches.CHUNK_ROWS", 45)
+    monkeypatch.setattr("millrace.learner.algorithms.minibatches.CHUNK_ROWS", 45)
     assert observations.recurrent is not None
     exact, x, recurrent_input = in_float64(ppo.net), observations.features.double(), doubles(observations.recurrent)
     (expected,) = sampled(lambda: [exact.value(x, (), recurrent_input).view(whole.shape)])

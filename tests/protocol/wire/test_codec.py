@@ -19,9 +19,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from protocol.env_spec import PickledCallable
-from protocol.errors import BadMessage
-from protocol.messages import (
+from millrace.protocol.env_spec import PickledCallable
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.messages import (
     Alive,
     EpisodeRows,
     Evaluate,
@@ -36,8 +36,8 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
-from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
+from millrace.protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
+from millrace.protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 KINDS = [*typing.get_args(ToLearner), *typing.get_args(ToWorker)]
@@ -128,7 +128,7 @@ def test_no_message_is_taken_for_one_of_the_other_side(kind: type) -> None:
 
 FIRST_DECODE_IN_MANY_THREADS = """
 import os, sys, threading
-from protocol.wire.codec import decode_to_worker
+from millrace.protocol.wire.codec import decode_to_worker
 
 frames = [bytes.fromhex(sys.argv[1])]
 sys.setswitchinterval(1e-6)

@@ -18,14 +18,14 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.arrays import Bytes
-from protocol.env_spec import EnvSpec
-from protocol.errors import BadMessage
-from protocol.rollout import Rollout, rollout_bytes
-from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec
-from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
-from protocol.wire.compression import Packing, has_zstd, pack_stack, unpack_array, unpack_stack
-from protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.arrays import Bytes
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.rollout import Rollout, rollout_bytes
+from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec
+from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
+from millrace.protocol.wire.compression import Packing, has_zstd, pack_stack, unpack_array, unpack_stack
+from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around, run_of
 
 U1 = np.dtype(np.uint8)

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 import zmq
 
-import protocol.wire.sockets
-from protocol.address import check_address, is_local
-from protocol.errors import BadMessage, UsageError
-from protocol.messages import (
+import millrace.protocol.wire.sockets
+from millrace.protocol.address import check_address, is_local
+from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Drain,
     Goodbye,
@@ -31,11 +31,11 @@ from protocol.messages import (
     ToWorker,
     Weights,
 )
-from protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
-from protocol.wire.compression import Packing, has_zstd
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.sockets import COPY_BELOW_BYTES
-from protocol.wire.worker_link import OF_OBSERVER, WorkerLink
+from millrace.protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
+from millrace.protocol.wire.compression import Packing, has_zstd
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.sockets import COPY_BELOW_BYTES
+from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 from tests.support.conversation.every_message import to_learner, to_worker
 from tests.support.conversation.fake_ends import fake_rollout
 

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from protocol.errors import BadMessage
-from protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
 from tests.support.numbers.bit_equality import bit_equal
 
 scalars = hnp.arrays(

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from learner.vector_env.settings import VectorEnvSettings
-from protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
-from protocol.wire.wake_up import CAN_SPIN, SpinWait, WakePipe, WakeReason
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
+from millrace.protocol.wire.wake_up import CAN_SPIN, SpinWait, WakePipe, WakeReason
 from tests.support.in_process.described import step_spec
 
 pytestmark = pytest.mark.skipif(not SUPPORTED, reason="needs Linux")

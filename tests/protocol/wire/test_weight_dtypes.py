@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.arrays import Floats
-from protocol.errors import RunError
-from protocol.wire.weight_dtypes import BOUND, ActingDtype, to_float32, to_wire_dtype
+from millrace.protocol.arrays import Floats
+from millrace.protocol.errors import RunError
+from millrace.protocol.wire.weight_dtypes import BOUND, ActingDtype, to_float32, to_wire_dtype
 
 
 def of_bits(bits: Any) -> Floats:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocol.messages import (
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
     Call,
@@ -39,9 +39,9 @@ from protocol.messages import (
     WorkerActivity,
     WorkerExit,
 )
-from protocol.rollout import Episode
-from protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiBinarySpace, TupleSpace
-from protocol.wire.plain_values import pack
+from millrace.protocol.rollout import Episode
+from millrace.protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiBinarySpace, TupleSpace
+from millrace.protocol.wire.plain_values import pack
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 PACKED = np.frombuffer(pack([(0, {"ünï": [1.5, "text"]})]), np.uint8)

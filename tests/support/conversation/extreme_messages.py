@@ -16,7 +16,7 @@ import msgspec
 import msgspec.inspect as mi
 import numpy as np
 
-from protocol.wire.codec import DTYPES, encode
+from millrace.protocol.wire.codec import DTYPES, encode
 
 MARK = "\x1b[7777m"
 """A sequence that nobody else writes. Where it is shown as it is, a peer can control the terminal."""

@@ -16,14 +16,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from learner.members.coordinator import Coordinator
-from learner.members.membership import Outgoing
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.rollouts.ledger import Ledger
-from learner.rollouts.ticket_coordinator import TicketCoordinator
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.messages import (
+from millrace.learner.members.coordinator import Coordinator
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.messages import (
     Alive,
     EpisodeRows,
     Evaluated,
@@ -35,10 +35,9 @@ from protocol.messages import (
     WorkerActivity,
     WorkerExit,
 )
-from protocol.rollout import Episode
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from tests.support.conversation.rules import check_tickets
-from workers.conversation.session import (
+from millrace.protocol.rollout import Episode
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
+from millrace.workers.conversation.session import (
     EvaluationTask,
     Leave,
     RolloutTask,
@@ -47,7 +46,8 @@ from workers.conversation.session import (
     WorkerEffect,
     WorkerIdentity,
 )
-from workers.shared_weights import is_of_learner
+from millrace.workers.shared_weights import is_of_learner
+from tests.support.conversation.rules import check_tickets
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)

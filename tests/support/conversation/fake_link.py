@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from protocol.messages import ToLearner
-from protocol.wire.codec import Buffer
+from millrace.protocol.messages import ToLearner
+from millrace.protocol.wire.codec import Buffer
 
 
 class FakeLink:

@@ -9,9 +9,9 @@ import msgpack
 import msgspec
 import numpy as np
 
-from protocol.messages import Inquire, ToLearner
-from protocol.wire.codec import encode
-from protocol.wire.compression import Packing
+from millrace.protocol.messages import Inquire, ToLearner
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.compression import Packing
 from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.fake_ends import fake_rollout, seated_rollout
 

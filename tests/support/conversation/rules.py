@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE
-from learner.rollouts.lanes import AcceptedRollout
-from learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 
 
 def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:

@@ -11,24 +11,24 @@ from contextlib import ExitStack, contextmanager
 from functools import cache
 from typing import cast
 
-from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.settings import VectorEnvSettings
-from learner.vector_env.shared_steps import SharedSteps
-from learner.vector_env.spec import requested_copies
-from learner.vector_env.step_hub import StepHub
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import DescribedEnv
-from protocol.errors import EnvironmentFailed
-from protocol.messages import PROTOCOL_VERSION, Call, Failure, Goodbye, Hello, Order, Refuse, Reset, Step, Welcome
-from protocol.specs import StepSpec
-from protocol.wire.codec import Buffer, decode_to_worker
-from protocol.wire.learner_link import LearnerLink
-from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_memory
-from protocol.wire.wake_up import WakePipe
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.learner.vector_env.shared_steps import SharedSteps
+from millrace.learner.vector_env.spec import requested_copies
+from millrace.learner.vector_env.step_hub import StepHub
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import PROTOCOL_VERSION, Call, Failure, Goodbye, Hello, Order, Refuse, Reset, Step, Welcome
+from millrace.protocol.specs import StepSpec
+from millrace.protocol.wire.codec import Buffer, decode_to_worker
+from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_memory
+from millrace.protocol.wire.wake_up import WakePipe
+from millrace.workers.vector_env.stepper import Stepper
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.described import described
 from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
-from workers.vector_env.stepper import Stepper
 
 Choose = Callable[[int], int]
 """Chooses one of so many."""

@@ -11,24 +11,24 @@ import msgspec
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
-from learner.config.layers import resolve
-from learner.rollouts.evaluation_dealer import episode_seeds
 from millrace.launch.training import train
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.messages import Evaluate
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.policy.policy import Policy, make_policy
-from protocol.rollout import Episode, Rollout
-from protocol.rows.rollout_checks import validate
-from protocol.specs import PolicySpec, RunSpec
-from workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
-from workers.conversation.held import Assignment
-from workers.copies.env_copies import LoopedCopies, VectorCopies
-from workers.evaluate.evaluator import Evaluator
+from millrace.learner.config.layers import resolve
+from millrace.learner.rollouts.evaluation_dealer import episode_seeds
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
+from millrace.workers.evaluate.evaluator import Evaluator
 
-TOY = "workers.envs.toy:"
+TOY = "millrace.workers.envs.toy:"
 VERSION, SESSION = 7, 3
 
 

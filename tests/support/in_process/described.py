@@ -6,17 +6,17 @@ from typing import Any
 
 import gymnasium
 
-from learner.config.config import Config
-from learner.env_spaces import EnvSpaces
-from learner.run_spec import run_spec as spec_of_run
-from learner.vector_env.settings import VectorEnvSettings
-from learner.vector_env.spec import requested_copies
-from protocol.env_spec import EnvSpec
-from protocol.envs.description import DescribedEnv, read_description
-from protocol.messages import Described
-from protocol.specs import DescribeSpec, RunSpec, StepSpec, Vector
-from protocol.wire.codec import decode_to_learner, encode
-from workers.described_copy import describing
+from millrace.learner.config.config import Config
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.run_spec import run_spec as spec_of_run
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.learner.vector_env.spec import requested_copies
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.description import DescribedEnv, read_description
+from millrace.protocol.messages import Described
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec, Vector
+from millrace.protocol.wire.codec import decode_to_learner, encode
+from millrace.workers.described_copy import describing
 
 
 def described(env: EnvSpec, vector: Vector = "loop", render_mode: str | None = None) -> DescribedEnv:

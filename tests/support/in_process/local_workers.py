@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from workers.supervise.supervisor import Running, Supervisor
+from millrace.workers.supervise.supervisor import Running, Supervisor
 
 
 def _never(name: str) -> Running:

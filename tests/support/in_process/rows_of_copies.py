@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import iterate
 
-from learner.vector_env.env import ZmqVectorEnv
+from millrace.learner.vector_env.env import ZmqVectorEnv
 
 
 class Row(NamedTuple):

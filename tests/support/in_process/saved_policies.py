@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from learner.policy_player import saved_policy
-from learner.run_folder.run_folder import Which
-from protocol.env_spec import EnvSpec
-from protocol.policy.policy import Policy, make_policy
-from protocol.specs import PolicySpec, RunSpec
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.run_folder.run_folder import Which
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.specs import PolicySpec, RunSpec
 
 
 def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:

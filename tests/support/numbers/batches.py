@@ -7,13 +7,13 @@ from typing import Literal, Protocol
 import msgspec
 import numpy as np
 
-from learner.algorithm_check import toy_batches
-from learner.algorithm_check.toy_batches import ToyActor
-from protocol.arrays import Array
-from protocol.policy.distributions import distribution
-from protocol.policy.numpy_policy import NumpyPolicy
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithm_check import toy_batches
+from millrace.learner.algorithm_check.toy_batches import ToyActor
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.numpy_policy import NumpyPolicy
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 BOX = Leaf("", "box", (4,), "float32")
 DISCRETE = PolicySpec((BOX,), ActionSpec("discrete", (), "int64", (4,), (0,)), (16,))

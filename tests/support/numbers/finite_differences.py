@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from protocol.arrays import Array
+from millrace.protocol.arrays import Array
 
 STEP = 1e-6
 

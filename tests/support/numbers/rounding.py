@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from protocol.arrays import Array
-from protocol.policy.networks import FlatNetwork, network_of
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.networks import FlatNetwork, network_of
 
 UNIT = 2.0**-24
 ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability adds

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.algorithms.actor_critic import ActorCritic
-from learner.algorithms.minibatches import LossInput, Minibatch
-from protocol.arrays import Array
-from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.minibatches import LossInput, Minibatch
+from millrace.protocol.arrays import Array
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
 from tests.support.numbers.batches import no_pulse
 from tests.support.numbers.rounding import SAMPLES, assert_within, flat_gradient, in_double, in_float64, sampled
 

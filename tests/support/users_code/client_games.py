@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from protocol.arrays import Array
+from millrace.protocol.arrays import Array
 
 
 class Tag:

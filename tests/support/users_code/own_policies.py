@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.arrays import Array
+from millrace.protocol.arrays import Array
 
 ARRAYS = {"w": (4, 2), "b": (2,)}
 EXTRAS = {"log_prob": "float32", "logits": ("float32", (2,)), "side": "uint8"}

@@ -16,19 +16,19 @@ import pytest
 import torch
 
 import millrace
-from learner.algorithms.minibatches import LossInput
-from learner.algorithms.ppo import PPO
-from learner.callbacks.callbacks import Callbacks
-from learner.config.layers import resolve
-from learner.run_folder import atomic_write, checkpoint
-from learner.run_folder.last_line import resume_command
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.progress import Progress
 from millrace.launch.training import train
-from protocol.errors import RunError, UsageError
+from millrace.learner.algorithms.minibatches import LossInput
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.callbacks.callbacks import Callbacks
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder import atomic_write, checkpoint
+from millrace.learner.run_folder.last_line import resume_command
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.errors import RunError, UsageError
+from millrace.workers.envs.toy import Identity
 from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
-from workers.envs.toy import Identity
 
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 2, "batch_size": 16,
@@ -43,7 +43,9 @@ class UsersError(Exception):
 
 def run(tmp_path: Path, watch: Watch = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
     return train(
-        resolve("workers.envs.toy:Identity-v0", run_dir=str(tmp_path / "runs"), **{**SMALL, **settings}), resume, watch
+        resolve("millrace.workers.envs.toy:Identity-v0", run_dir=str(tmp_path / "runs"), **{**SMALL, **settings}),
+        resume,
+        watch,
     )
 
 
@@ -288,7 +290,7 @@ class FullDisk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, from_update: int, refuses: float = math.inf) -> None:
         self._full, self._from_update, self._refuses, self._fsync = False, from_update, refuses, os.fsync
-        monkeypatch.setattr("learner.run_folder.atomic_write.os.fsync", self._flush)
+        monkeypatch.setattr("millrace.learner.run_folder.atomic_write.os.fsync", self._flush)
 
     def watch(self, progress: Progress) -> None:
         self._full = self._full or progress.updates >= self._from_update

@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-import learner.interrupts
-from learner.algorithm_check.same_bits import first_difference
-from learner.algorithms.ppo import PPO
-from learner.config.layers import resolve
-from learner.interrupts import Interrupts
-from learner.rollouts.evaluation_dealer import PlayedEpisode
-from learner.rollouts.hub import Hub
-from learner.run_folder import checkpoint
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.progress import Progress
-from learner.run_folder.run_folder import Interrupted
+import millrace.learner.interrupts
 from millrace.launch.training import train
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.layers import resolve
+from millrace.learner.interrupts import Interrupts
+from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.run_folder import Interrupted
 from tests.system.stage.processes import START_S, Stage, crowding
 from tests.system.stage.run_folders import folder_of, policy_of, summary
 

@@ -10,12 +10,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from learner.config.layers import resolve
-from learner.run_folder import checkpoint
-from learner.run_folder.metrics_log import read_rows
 from millrace.launch.training import train
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError
 from tests.learner.config.test_resume_rules import content
 from tests.system.stage.run_folders import summary
 from tests.system.stage.runs import balanced

@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 
-from learner.config.layers import resolve
-from learner.run_folder.lease import Owner
-from learner.run_folder.run_lock import LOCK_FILE
 from millrace.launch.training import train
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.run_lock import LOCK_FILE
 from tests.learner.config.test_resume_rules import content
 from tests.system.stage.processes import SMALL, START_S, TOY, Learner, Stage, free_port
 from tests.system.stage.run_folders import policy_of

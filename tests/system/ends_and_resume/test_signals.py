@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.program import _run
-from learner.interrupts import SIGNALS, Interrupts, Stopped, stopped_by_signals
+from millrace.learner.interrupts import SIGNALS, Interrupts, Stopped, stopped_by_signals
 
 INTERRUPTED = """
 import os, signal, sys, types

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from learner.run_folder import checkpoint
-from learner.run_folder.metrics_log import read_rows
-from learner.standard_streams import prepare_streams
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.standard_streams import prepare_streams
 from tests.system.stage import preloaded
 
 COMMAND = [sys.executable, "-m", "millrace"]

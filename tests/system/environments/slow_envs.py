@@ -18,8 +18,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.classic_control import CartPoleEnv, PendulumEnv
 
-from protocol.arrays import Floats
-from workers.envs.toy import Countdown, Info
+from millrace.protocol.arrays import Floats
+from millrace.workers.envs.toy import Countdown, Info
 
 IN_WORKER = "--parent" in sys.argv
 

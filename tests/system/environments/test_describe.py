@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 
 import millrace
-from protocol.errors import EnvironmentFailed
-from protocol.messages import PROTOCOL_VERSION, Described, Hello, Refuse, Welcome
-from protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescription
-from protocol.wire.codec import encode
-from protocol.wire.plain_values import pack
-from protocol.wire.worker_link import WorkerLink
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import PROTOCOL_VERSION, Described, Hello, Refuse, Welcome
+from millrace.protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescription
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.plain_values import pack
+from millrace.protocol.wire.worker_link import WorkerLink
+from millrace.workers.envs.toy import Countdown
 from tests.learner.config.test_resume_rules import content
 from tests.system.stage import preloaded
 from tests.system.stage.processes import ROOT, START_S, Stage, crowding, free_port, wait_for
 from tests.system.stage.runs import finish
-from workers.envs.toy import Countdown
 
 SIMULATOR = '''
 """A simulator that only some machines have. Its keyword argument says what is wrong with it."""

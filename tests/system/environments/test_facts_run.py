@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 import millrace
-from learner.report.page import write_page
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.run_folder import RunFolder
 from millrace.cli.main import main
+from millrace.learner.report.page import write_page
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.run_folder import RunFolder
 
 ENV = "tests.support.users_code.fact_envs:Facts-v0"
 SMALL: dict[str, Any] = {

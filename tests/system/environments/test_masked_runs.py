@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.config.layers import resolve
-from learner.conversations import rollout_spec
-from learner.env_spaces import EnvSpaces
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import MillraceError, UsageError
-from protocol.specs import PolicySpec
+from millrace.learner.config.layers import resolve
+from millrace.learner.conversations import rollout_spec
+from millrace.learner.env_spaces import EnvSpaces
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import MillraceError, UsageError
+from millrace.protocol.specs import PolicySpec
 from tests.support.users_code.mask_envs import CHOICES, InInfo, InObservation, Parts
 
 NAMED = "tests.support.users_code.mask_envs:{}-v0"

@@ -13,11 +13,11 @@ from pathlib import Path
 import psutil
 import pytest
 
+from millrace.workers.slots import FILE_VARIABLE, Slots
 from tests.system.stage.network import Host, Network
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, Stage, Worker, wait_for
 from tests.system.stage.runs import accounted
-from workers.slots import FILE_VARIABLE, Slots
 
 ENV = "tests.system.environments.slot_env:SlotEnv"
 LANES, COPIES, T, UPDATES = 4, 4, 16, 40

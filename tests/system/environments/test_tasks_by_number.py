@@ -11,7 +11,7 @@ import pytest
 
 import millrace
 from examples import tasks_by_number
-from learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.metrics_log import read_rows
 from tests.system.stage.run_folders import policy_of
 
 SMALL: dict[str, Any] = {

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.arrays import Array
+from millrace.protocol.arrays import Array
 
 LEARNER = "PROCESS_THAT_DOES_NOT_HANG"
 """environment variable with a process id: an encoder also computes in the learner"""

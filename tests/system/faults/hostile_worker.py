@@ -16,8 +16,8 @@ from pathlib import Path
 
 import zmq
 
-from protocol.keys.key_folder import read_token
-from protocol.messages import (
+from millrace.protocol.keys.key_folder import read_token
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
     Failure,
@@ -28,8 +28,8 @@ from protocol.messages import (
     ToLearner,
     Welcome,
 )
-from protocol.wire.codec import encode
-from protocol.wire.worker_link import WorkerLink
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.worker_link import WorkerLink
 from tests.support.conversation.extreme_messages import MARK, SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import fake_rollout
 from tests.support.conversation.hostile_messages import real

@@ -11,8 +11,8 @@ import sys
 
 import zmq
 
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello
-from protocol.wire.codec import encode
+from millrace.protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello
+from millrace.protocol.wire.codec import encode
 
 NAME = b"stranger"
 

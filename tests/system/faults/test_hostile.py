@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 import zmq
 
-from protocol.errors import BadMessage
-from protocol.messages import Inquire, Status
-from protocol.wire.codec import decode_to_observer, encode
+from millrace.protocol.errors import BadMessage
+from millrace.protocol.messages import Inquire, Status
+from millrace.protocol.wire.codec import decode_to_observer, encode
+from millrace.workers.copies.env_copies import copy_seeds
 from tests.support.conversation.hostile_messages import hostile, real
 from tests.system.stage.processes import START_S, Learner, Stage, free_port
 from tests.system.stage.run_folders import policy_of
 from tests.system.stage.runs import accounted
-from workers.copies.env_copies import copy_seeds
 
 MESSAGES, STRANGERS = 100_000, 5
 GROWTH_MB = 20  # growth in the second half: by then the heap has the memory for messages that wait to be read
@@ -110,7 +110,7 @@ def test_two_runs_in_which_the_same_ticket_kills_its_worker_give_the_same_weight
         }
         with closing(Stage(tmp_path / name)) as stage:
             address = f"tcp://127.0.0.1:{free_port()}"
-            learner = stage.learner(address, settings, env="workers.envs.toy:Dies-v0")
+            learner = stage.learner(address, settings, env="millrace.workers.envs.toy:Dies-v0")
             for number in range(2):
                 stage.worker(address, f"w{number}")
             return result(learner)

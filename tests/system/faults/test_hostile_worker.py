@@ -28,11 +28,11 @@ from typing import get_args
 
 import pytest
 
-from learner.report.page import write_page
 from millrace.cli.status import as_table, ask, in_json, observer_name
-from protocol.bounds import Stage as WorkerStage
-from protocol.keys.key_folder import KeyFolder, read_token
-from protocol.wire.worker_link import WorkerLink
+from millrace.learner.report.page import write_page
+from millrace.protocol.bounds import Stage as WorkerStage
+from millrace.protocol.keys.key_folder import KeyFolder, read_token
+from millrace.protocol.wire.worker_link import WorkerLink
 from tests.support.conversation.extreme_messages import MARK
 from tests.system.faults.hostile_worker import FLOODS, NAME, Hostile, sayings
 from tests.system.stage.preloaded import start

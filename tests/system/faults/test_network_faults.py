@@ -11,13 +11,13 @@ import time
 
 import pytest
 
-from protocol.messages import PROTOCOL_VERSION
+from millrace.protocol.messages import PROTOCOL_VERSION
+from millrace.workers.worker import CONNECT_AGAIN_S
 from tests.system.faults.rubbish import talk_rubbish
 from tests.system.stage.network import Network
 from tests.system.stage.processes import START_S, Stage, free_port, wait_for
 from tests.system.stage.proxy import Proxy
 from tests.system.stage.runs import NOTICED_S, dealt_again, far_apart, finish, play, within
-from workers.worker import CONNECT_AGAIN_S
 
 LEARNER_TIMEOUT_S = 30.0  # after so long a worker says Hello again
 AGAIN_S = 5.0  # after a cut: at most 2 s until a connection attempt fails, 2 s until the next attempt, and a Hello
@@ -239,9 +239,7 @@ def test_training_goes_on_while_peers_send_invalid_data(stage: Stage) -> None:
 def test_a_worker_of_another_protocol_version_is_refused(stage: Stage) -> None:
     learner, workers = play(stage)
     address = learner.hears("waiting for workers").split()[-1]
-    newer = (
-        "import sys, workers.conversation.session as s, workers.__main__ as m; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"
-    )
+    newer = "import sys, millrace.workers.conversation.session as s, millrace.workers.__main__ as m; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"
     as_worker = ["--name", "newer", "--parent", str(os.getpid())]  # its supervisor would start one of this version
     stranger = stage.start([sys.executable, "-c", newer, address, *as_worker], "newer")
     assert stranger.ends() == 2

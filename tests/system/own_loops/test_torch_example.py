@@ -11,7 +11,7 @@ from safetensors.numpy import load_file
 
 import millrace
 from examples.ppo_torch import Settings, train
-from learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_folder.run_folder import RunFolder
 
 NOT_SETTINGS_OF_TRAINING = {"env"}
 

@@ -22,13 +22,13 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import millrace
-from learner.vector_env import settings
-from learner.vector_env.env import ZmqVectorEnv
 from millrace.launch import vector
-from protocol.alive import CallTimeouts
-from protocol.env_spec import EnvLike
-from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
-from protocol.keys.key_folder import KeyFolder
+from millrace.learner.vector_env import settings
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.env_spec import EnvLike
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
+from millrace.protocol.keys.key_folder import KeyFolder
 from tests.system.stage.preloaded import command_line
 from tests.system.stage.processes import START_S, Worker, free_port, wait_for
 
@@ -88,7 +88,7 @@ def test_a_worker_killed_between_steps_comes_back_truncated(shared_memory: bool)
 
 
 def test_a_loss_is_reported_beside_infos_too_long_for_shared_memory() -> None:
-    env = make("workers.envs.toy:Informs-v0", wordy=1_000_000)
+    env = make("millrace.workers.envs.toy:Informs-v0", wordy=1_000_000)
     env.reset(seed=1)
     action = env.action_space.sample()
     assert "worker_lost" not in env.step(action)[4]
@@ -120,7 +120,7 @@ def test_a_lost_worker_is_truncated_in_the_other_autoreset_modes(mode: Autoreset
 
 
 def test_a_worker_that_dies_during_a_step_is_noticed_at_once(tmp_path: Path, shared_memory: bool) -> None:
-    env = make("workers.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared_memory)
+    env = make("millrace.workers.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared_memory)
     env.reset(seed=1)
     began = time.monotonic()
     truncated = [env.step(ZEROS)[3] for _ in range(4)]
@@ -134,7 +134,7 @@ def test_a_worker_that_dies_during_a_step_is_noticed_at_once(tmp_path: Path, sha
 def test_an_environment_that_ends_its_workers_again_and_again_ends_the_vector_environment(
     allowed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    env = make("workers.envs.toy:Dies-v0", after=2, k=50, workers=1, max_env_failures=allowed)
+    env = make("millrace.workers.envs.toy:Dies-v0", after=2, k=50, workers=1, max_env_failures=allowed)
     env.reset(seed=1)
     why = rf"^worker w0 \(.*\): its process .* SIGKILL.*; max_env_failures allows {allowed}"
     with pytest.raises(EnvironmentFailed, match=why):
@@ -146,7 +146,7 @@ def test_an_environment_that_ends_its_workers_again_and_again_ends_the_vector_en
 
 def test_a_lane_that_answered_before_its_worker_died_is_reported_in_the_next_step(tmp_path: Path) -> None:
     once = str(tmp_path / "once")
-    env = make("workers.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
+    env = make("millrace.workers.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
     env.reset(seed=1)  # copy 2 has seed 3: its lane, the second, dies after the first lane has stepped
     results = [env.step(ZEROS) for _ in range(6)]
     assert [step[3].tolist() for step in results[:3]] == [[False] * 4, [False] * 4, [False, False, True, True]]
@@ -173,7 +173,7 @@ def test_a_loss_is_raised_with_on_worker_loss_raise(shared_memory: bool) -> None
 
 
 def test_an_error_of_an_environment_has_the_traceback_of_the_worker() -> None:
-    env = make("workers.envs.toy:Raises-v0", after=2)
+    env = make("millrace.workers.envs.toy:Raises-v0", after=2)
     env.reset(seed=1)
     with pytest.raises(EnvironmentFailed, match=r"lane \d, copy 0, step 2: its environment raised ValueError") as raised:
         for _ in range(4):
@@ -204,7 +204,7 @@ def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
 @pytest.mark.parametrize("loss", ["truncate", "raise"])
 def test_a_worker_whose_environment_hangs_is_lost_at_the_deadline(tmp_path: Path, loss: str) -> None:
     once = str(tmp_path / "once")
-    env = make("workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
+    env = make("millrace.workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
     env.reset(seed=1)
     env.step(ZEROS)
     began = time.monotonic()
@@ -220,7 +220,7 @@ def test_a_worker_whose_environment_hangs_is_lost_at_the_deadline(tmp_path: Path
 
 
 def test_close_returns_while_an_environment_hangs() -> None:
-    env = make("workers.envs.toy:Hangs-v0", after=0)
+    env = make("millrace.workers.envs.toy:Hangs-v0", after=0)
     env.reset(seed=1)
     env.step_async(ZEROS)
     close_and_check(env)
@@ -253,7 +253,7 @@ def test_a_reset_is_repeated_when_workers_are_lost() -> None:
 
 
 def test_a_loop_by_recv_does_not_wait_for_a_copy_that_hangs(tmp_path: Path, shared_memory: bool) -> None:
-    env = make("workers.envs.toy:Hangs-v0", after=1, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
+    env = make("millrace.workers.envs.toy:Hangs-v0", after=1, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
                timeout=60.0, shared_memory=shared_memory)  # fmt: skip
     env.reset_async(seed=1)
     rows = dict.fromkeys(range(4), 0)
@@ -269,7 +269,7 @@ def test_a_loop_by_recv_does_not_wait_for_a_copy_that_hangs(tmp_path: Path, shar
 
 
 def test_recv_reports_a_worker_that_is_killed_or_hangs_and_goes_on(tmp_path: Path, shared_memory: bool) -> None:
-    env = make("workers.envs.toy:Hangs-v0", after=3, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
+    env = make("millrace.workers.envs.toy:Hangs-v0", after=3, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
                timeout=10.0, shared_memory=shared_memory)  # fmt: skip
     env.reset_async(seed=1)
     local_workers()[3].kill()  # perhaps during its reset, which is then repeated
@@ -295,7 +295,7 @@ def test_recv_reports_a_worker_that_is_killed_or_hangs_and_goes_on(tmp_path: Pat
 
 
 def test_close_does_not_wait_for_what_was_sent() -> None:
-    env = make("workers.envs.toy:Hangs-v0", after=0, workers=4, lanes=4)
+    env = make("millrace.workers.envs.toy:Hangs-v0", after=0, workers=4, lanes=4)
     env.reset_async(seed=1)
     env.recv(4)
     env.send(ZEROS)
@@ -454,7 +454,7 @@ def test_a_slow_step_or_a_slow_caller_does_not_lose_a_worker(elsewhere: Elsewher
     """Both take longer than the time after which a silent worker counts as lost."""
     monkeypatch.setattr(settings, "VectorEnvSettings", partial(settings.VectorEnvSettings, worker_timeout_s=2.0))
     elsewhere.start("a")
-    with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
+    with millrace.make_vec("millrace.workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
         env.reset(seed=1)
         assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
         time.sleep(3.0)
@@ -479,7 +479,7 @@ def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -
     with pytest.raises(
         UserFacingError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"
     ):
-        make("workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
+        make("millrace.workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
     assert elsewhere.started[0].process.wait(10) == 2
 
 
@@ -488,7 +488,7 @@ def test_a_worker_whose_step_hangs_is_ended_and_another_gets_its_lane(
 ) -> None:
     monkeypatch.setattr(vector, "_call_timeouts", lambda timeout_s: CallTimeouts(60.0, 3.0))
     elsewhere.start("h", "--processes", "2")
-    with make("workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
+    with make("millrace.workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
               timeout=60.0) as env:  # fmt: skip
         env.reset(seed=1)
         env.step(ZEROS)

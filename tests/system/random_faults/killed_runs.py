@@ -31,8 +31,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, NamedTuple, Protocol
 
-from learner.run_folder import checkpoint
-from learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.metrics_log import read_rows
 from tests.system.random_faults.marked_train import Marks, Phase, read_marks
 from tests.system.stage.processes import ROOT, crowding, wait_for
 from tests.system.stage.runs import accounted

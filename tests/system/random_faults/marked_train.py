@@ -22,8 +22,8 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 IMPORTED = (
     "millrace.cli.main", "millrace.launch.training", "millrace.launch.learner_inference",
-    "learner.train", "learner.run_spec", "learner.run_state", "learner.torch_setup", "learner.algorithms.ppo",
-    "learner.algorithms.dqn", "learner.algorithms.a2c", "learner.algorithms.impala", "learner.algorithms.reinforce",
+    "millrace.learner.train", "millrace.learner.run_spec", "millrace.learner.run_state", "millrace.learner.torch_setup", "millrace.learner.algorithms.ppo",
+    "millrace.learner.algorithms.dqn", "millrace.learner.algorithms.a2c", "millrace.learner.algorithms.impala", "millrace.learner.algorithms.reinforce",
     "tensorboard.compat.proto.event_pb2", "tensorboard.summary.writer.record_writer", "safetensors.numpy",
 )  # fmt: skip
 P = ParamSpec("P")
@@ -101,9 +101,9 @@ class Marker:
 
     def wrap(self) -> None:
         """Wrap the functions in which the phases of a learner begin."""
-        from learner.rollouts.hub import Hub
-        from learner.run_folder import checkpoint
-        from learner.run_folder.run_folder import RunFolder
+        from millrace.learner.rollouts.hub import Hub
+        from millrace.learner.run_folder import checkpoint
+        from millrace.learner.run_folder.run_folder import RunFolder
 
         gather, publish, save = Hub.gather, Hub.publish, checkpoint.save
 

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from protocol.keys.key_folder import KeyFolder
+from millrace.protocol.keys.key_folder import KeyFolder
 from tests.model.traces.accept import accept
 from tests.model.traces.replay import NotAccepted
 from tests.system.random_faults.soak_faults import FAULTS, KILL_A_WORKER, PORT, Fault, Scene

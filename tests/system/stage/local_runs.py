@@ -10,11 +10,11 @@ from typing import Any
 
 import psutil
 
-from learner.config.layers import resolve
 from millrace.launch.training import train
+from millrace.learner.config.layers import resolve
 from tests.system.stage import preloaded
 
-TOY = "workers.envs.toy:"
+TOY = "millrace.workers.envs.toy:"
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # for a run that need not learn much
 
 

@@ -24,7 +24,7 @@ from typing import IO, Any, Literal
 
 import psutil
 
-from workers.supervise.worker_process import NONCE_VARIABLE
+from millrace.workers.supervise.worker_process import NONCE_VARIABLE
 
 PROGRAM = Path(__file__).with_name("preloaded_parent.py")
 LEARNERS = (["millrace", "train"], ["millrace", "learner"], ["millrace", "evaluate"], ["millrace", "record"])

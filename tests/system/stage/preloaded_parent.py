@@ -34,23 +34,28 @@ ADOPTED_WITHIN_S = 10.0
 LEARNER = (
     "torch",
     "torch.utils.tensorboard",
-    "learner.config.command_line",
-    "learner.imports_ahead",
-    "learner.run",
-    "learner.run_spec",
+    "millrace.learner.config.command_line",
+    "millrace.learner.imports_ahead",
+    "millrace.learner.run",
+    "millrace.learner.run_spec",
     "threadpoolctl",
-    "learner.train",
-    "learner.algorithms.a2c",
-    "learner.algorithms.dqn",
-    "learner.algorithms.impala",
-    "learner.algorithms.ppo",
-    "learner.algorithms.reinforce",
+    "millrace.learner.train",
+    "millrace.learner.algorithms.a2c",
+    "millrace.learner.algorithms.dqn",
+    "millrace.learner.algorithms.impala",
+    "millrace.learner.algorithms.ppo",
+    "millrace.learner.algorithms.reinforce",
     "millrace.launch.learner_inference",
     "millrace.launch.training",
     "millrace.terminal",
     "safetensors.numpy",
 )
-WORKER = ("gymnasium.envs.classic_control", "tests.system.stage.preloaded", "workers.__main__", "workers.program")
+WORKER = (
+    "gymnasium.envs.classic_control",
+    "tests.system.stage.preloaded",
+    "millrace.workers.__main__",
+    "millrace.workers.program",
+)
 START_WORKERS = (["workers"], *(["millrace", command] for command in ("evaluate", "record", "train", "worker")))
 
 
@@ -123,8 +128,8 @@ def fork_for_our_parent() -> int:
 
 def ask_for_workers(parent: socket.socket) -> None:
     """Let this process start its workers by asking the preloaded parent at the other end."""
+    from millrace.workers.supervise import worker_process
     from tests.system.stage import preloaded
-    from workers.supervise import worker_process
 
     preloaded.use_parent(parent)
     worker_process.popen = preloaded.start_worker  # type: ignore[assignment]

@@ -23,8 +23,8 @@ from typing import Any, TypeVar
 
 import psutil
 
-from learner.run_folder.metrics_log import read_rows
-from protocol.keys.key_folder import KeyFolder
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.protocol.keys.key_folder import KeyFolder
 from tests.model.traces.recorder import FOLDER
 from tests.system.stage.preloaded import start, workers_of
 
@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[3]
 T = TypeVar("T")
 LOOK_EVERY_S = 0.02
 START_S = 90.0  # importing torch takes seconds, and longer on a busy machine
-TOY = "workers.envs.toy:Slow-v0"
+TOY = "millrace.workers.envs.toy:Slow-v0"
 WORKER_TIMEOUT_S = 1.5
 SMALL: dict[str, object] = {
     "env-kwargs": "seconds 0.001",

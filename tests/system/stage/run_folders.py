@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from learner.run_folder import checkpoint
+from millrace.learner.run_folder import checkpoint
 
 
 def folder_of(runs: Path) -> Path:

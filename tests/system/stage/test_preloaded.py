@@ -13,6 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
+from millrace.workers.supervise import worker_process
 from tests.system.stage.network import Network
 from tests.system.stage.preloaded import (
     ENVIRONMENT,
@@ -26,7 +27,6 @@ from tests.system.stage.preloaded import (
 )
 from tests.system.stage.processes import ROOT, Stage, wait_for
 from tests.system.stage.run_folders import policy_of
-from workers.supervise import worker_process
 
 WITHIN_S = 60.0
 PIPES = (subprocess.DEVNULL, subprocess.PIPE, subprocess.PIPE)

@@ -19,10 +19,10 @@ import gymnasium
 import pytest
 
 import millrace
-from learner.run_folder import checkpoint
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.progress import Progress
-from protocol.errors import EnvironmentFailed
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.errors import EnvironmentFailed
 from tests.system.stage import preloaded
 from tests.system.stage.local_runs import run, worker_processes
 from tests.system.stage.processes import START_S, Stage, crowding, free_port, wait_for

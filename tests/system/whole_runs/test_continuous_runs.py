@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.config.layers import resolve
-from learner.run_folder.metrics_log import read_rows
 from millrace.launch.training import train
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.metrics_log import read_rows
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, Learner, Stage
 from tests.system.stage.run_folders import policy_of

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 import millrace
-from learner.algorithms import algorithm_class
-from learner.config.hyperparameters import PPOConfig
-from learner.config.layers import resolve
-from learner.policy_player import saved_policy
-from learner.run_folder import checkpoint
 from millrace.launch.training import train
-from protocol.errors import UsageError
-from protocol.policy.layout import acting_size
-from protocol.policy.networks import RecurrentInput
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.config.layers import resolve
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.run_folder import checkpoint
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.policy.networks import RecurrentInput
 from tests.support.users_code.hidden_envs import REWARDS
 from tests.system.stage.run_folders import policy_of
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from learner.config.layers import resolve
-from learner.run_folder.metrics_log import read_rows
 from millrace.launch.training import train
-from protocol.errors import UsageError
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.protocol.errors import UsageError
 from tests.system.stage.run_folders import policy_of
 
 SMALL: dict[str, Any] = {
@@ -75,7 +75,7 @@ def test_the_replay_ratio_holds_while_collecting_and_learning_overlap(tmp_path: 
 
 def test_dqn_learns_from_images(tmp_path: Path) -> None:
     kwargs = {"observation": "nested", "action": "offset"}
-    folder = run(tmp_path, env="workers.envs.toy:Spaces-v0", env_kwargs=kwargs, steps=800, gradient_steps=2)
+    folder = run(tmp_path, env="millrace.workers.envs.toy:Spaces-v0", env_kwargs=kwargs, steps=800, gradient_steps=2)
     assert ratios(folder)
 
 

@@ -13,14 +13,14 @@ from typing import Any, Literal
 import pytest
 
 import millrace
-from learner.config.layers import resolve
-from learner.config.rollout_config import RolloutConfig
-from learner.policy_player import SavedPolicy
-from learner.rollouts.evaluation_dealer import EvaluationPlan
-from learner.run_folder.metrics_log import read_rows
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.launch.training import train
-from protocol.errors import EnvironmentFailed, UserFacingError
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.policy_player import SavedPolicy
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.protocol.errors import EnvironmentFailed, UserFacingError
 from tests.support.in_process.collectors import TOY, random_weights, run_of
 from tests.system.stage.processes import START_S, Stage, crowding, wait_for
 from tests.system.stage.run_folders import policy_of
@@ -81,7 +81,7 @@ def test_wrong_arguments_of_evaluations_are_refused_before_training(
 ) -> None:
     with pytest.raises(UserFacingError, match=says) as caught:
         millrace.train(
-            "workers.envs.toy:Spaces-v0", inference=inference, steps=10_000, workers=1, run_dir=str(tmp_path / "runs"),
+            "millrace.workers.envs.toy:Spaces-v0", inference=inference, steps=10_000, workers=1, run_dir=str(tmp_path / "runs"),
             progress=False, eval_env_kwargs=kwargs,
         )  # fmt: skip
     assert "\n" not in str(caught.value)

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from learner.config.layers import resolve
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.progress import Progress
-from protocol.errors import EnvironmentFailed, UsageError
+from millrace.learner.config.layers import resolve
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.errors import EnvironmentFailed, UsageError
 from tests.system.stage.local_runs import SMALL, TOY, run, worker_processes
 from tests.system.stage.processes import Learner, Stage, free_port
 from tests.system.stage.run_folders import policy_of, summary

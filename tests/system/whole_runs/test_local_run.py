@@ -22,16 +22,18 @@ import psutil
 import pytest
 
 import millrace
-from learner.config.config import Config
-from learner.config.layers import resolve
-from learner.report.reported_runs import read_run
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.progress import Progress
-from learner.run_folder.results import ALL_STEPS_DONE
-from learner.run_folder.run_format import check_format
 from millrace.launch import learner_inference
 from millrace.launch.training import train
-from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import resolve
+from millrace.learner.report.reported_runs import read_run
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import ALL_STEPS_DONE
+from millrace.learner.run_folder.run_format import check_format
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
+from millrace.workers.envs.toy import Countdown
+from millrace.workers.slots import LIMIT_VARIABLE
 from tests.support.in_process.saved_policies import load_policy
 from tests.system.stage import preloaded
 from tests.system.stage.local_runs import SMALL, TOY, run, start, worker_processes
@@ -39,8 +41,6 @@ from tests.system.stage.processes import START_S, wait_for
 from tests.system.stage.run_folders import policy_of, summary
 from tests.system.stage.runs import balanced
 from tests.system.stage.small_disk import filled, small_disk
-from workers.envs.toy import Countdown
-from workers.slots import LIMIT_VARIABLE
 
 
 @pytest.fixture(params=["workers", "learner"])
@@ -148,7 +148,7 @@ def test_a_run_with_rounded_weights_learns(tmp_path: Path) -> None:
 def test_workers_have_a_lower_priority_than_updates_that_use_all_cores_meanwhile(
     tmp_path: Path, max_lag: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("learner.torch_setup.usable_cores", lambda: 2)
+    monkeypatch.setattr("millrace.learner.torch_setup.usable_cores", lambda: 2)
     found: list[int] = []
     settings: dict[str, Any] = {"max_lag": max_lag, "torch_threads": 2, "steps": 500, "eval_episodes": 1}
     run(tmp_path, "CartPole-v1", lambda progress: found.extend(each.nice() for each in worker_processes()), **settings)
@@ -208,7 +208,7 @@ def test_a_dataset_for_which_there_is_no_space_costs_no_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, chunk_bytes: int
 ) -> None:
     """HDF5 would end the process. The run is complete, and fails as one whose summary cannot be written."""
-    monkeypatch.setattr("learner.recording.minari.CHUNK_BYTES", chunk_bytes)
+    monkeypatch.setattr("millrace.learner.recording.minari.CHUNK_BYTES", chunk_bytes)
     with small_disk(tmp_path / "disk") as disk:
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(disk))
         filler = filled(disk)
@@ -314,7 +314,7 @@ def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str
 
 def test_a_run_whose_workers_cannot_start_fails(tmp_path: Path, inference: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The workers cannot start. The run ends at its deadline and says what it waited for."""
-    monkeypatch.setattr("workers.supervise.worker_process.sys.executable", "/bin/false")
+    monkeypatch.setattr("millrace.workers.supervise.worker_process.sys.executable", "/bin/false")
     with pytest.raises(NoWorkers, match="waited 1 s for 1 worker"):
         run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, inference=inference, **SMALL)
 

@@ -14,8 +14,8 @@ import psutil
 import pytest
 
 import millrace
-from learner.run_folder.progress import Progress
-from protocol.errors import RunError
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.errors import RunError
 from tests.system.stage.local_runs import SMALL, run
 from tests.system.stage.processes import START_S, wait_for
 

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.dqn import DQN
-from learner.algorithms.ppo import PPO
-from learner.algorithms.replay.off_policy import Transitions
-from learner.config.layers import resolve
-from learner.recording.prior_dataset import PriorDataset
-from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.run_folder import Interrupted
 from millrace.cli.main import main
 from millrace.launch.training import train
-from protocol.errors import UsageError
-from protocol.rollout import Batch
+from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
+from millrace.learner.algorithms.dqn import DQN
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.replay.off_policy import Transitions
+from millrace.learner.config.layers import resolve
+from millrace.learner.recording.prior_dataset import PriorDataset
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.run_folder import Interrupted
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Batch
 from tests.system.stage.run_folders import policy_of
 
 minari = pytest.importorskip("minari")

@@ -15,19 +15,19 @@ import pytest
 import torch
 
 import millrace
-from learner.algorithms import algorithm_class
-from learner.config.hyperparameters import PPOConfig
-from learner.config.layers import resolve
-from learner.policy_player import saved_policy
-from learner.run_folder import checkpoint
-from learner.run_folder.progress import Progress
-from learner.run_setup import check_evaluation_spaces
 from millrace.launch.training import train
-from protocol.arrays import Floats
-from protocol.envs.description import DescribedEnv
-from protocol.errors import UsageError
-from protocol.policy.policy import make_policy
-from protocol.policy.recurrent import zero_state
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.config.layers import resolve
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_setup import check_evaluation_spaces
+from millrace.protocol.arrays import Floats
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.policy.recurrent import zero_state
 from tests.support.users_code.seat_envs import CHAIN_REWARD, MOVES, values_of_the_chain
 from tests.system.stage.run_folders import folder_of, policy_of
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.run_folder import checkpoint
-from learner.run_folder.progress import Progress
-from protocol.arrays import Array, Floats
-from protocol.errors import RunError, UsageError
+from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.progress import Progress
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import RunError, UsageError
 from tests.system.stage.run_folders import folder_of, policy_of
 from tests.system.whole_runs.test_seats import trained
 

@@ -15,12 +15,12 @@ from typing import Any, Literal
 import pytest
 
 import millrace
-from learner.config.layers import resolve
-from learner.policy_player import saved_policy
-from learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.launch.training import train
-from protocol.errors import UsageError
+from millrace.learner.config.layers import resolve
+from millrace.learner.policy_player import saved_policy
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.protocol.errors import UsageError
 from tests.system.stage.local_runs import worker_processes
 from tests.system.stage.processes import START_S, Running, Stage, crowding, free_port
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import millrace
-from protocol.policy.layout import acting_size
+from millrace.protocol.policy.layout import acting_size
 from tests.system.stage.processes import START_S, Stage, free_port, wait_for
 
 SMALL: dict[str, Any] = {"envs": 6, "lanes": 3, "rollout_steps": 8, "worker_timeout_s": 60.0}

@@ -11,23 +11,23 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
-from protocol.arrays import Array, Bools
-from protocol.env_spec import EnvSpec
-from protocol.envs.action_masks import has_mask, without_mask
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import BadRollout, EnvironmentFailed
-from protocol.messages import Evaluate
-from protocol.policy.masks import choices
-from protocol.rollout import Rollout, stack_rollouts
-from protocol.rows.rollout_checks import validate
-from protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.action_masks import has_mask, without_mask
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import BadRollout, EnvironmentFailed
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.policy.masks import choices
+from millrace.protocol.rollout import Rollout, stack_rollouts
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.workers.collect.collector import Collector, OpenEnvCopies
+from millrace.workers.copies.env_copies import VectorCopies
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.split_vector_env import SplitVectorEnv
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
 from tests.support.users_code.mask_envs import SIZES, InInfo, InObservation, Parts
-from workers.collect.collector import Collector, OpenEnvCopies
-from workers.copies.env_copies import VectorCopies
-from workers.copies.env_errors import CopyFailed
-from workers.copies.split_vector_env import SplitVectorEnv
-from workers.evaluate.evaluator import Evaluator
 
 ENVS: dict[str, Any] = {"InInfo": InInfo, "Parts": Parts, "InObservation": InObservation}
 

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from protocol.arrays import Array
-from protocol.errors import EnvironmentFailed, UsageError
-from protocol.specs import RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import EnvironmentFailed, UsageError
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
+from millrace.workers.envs.toy import Countdown
 from tests.support.in_process.collectors import (
     TOY,
     bits,
@@ -26,8 +28,6 @@ from tests.support.in_process.collectors import (
     sync_vector_env_over,
     with_env,
 )
-from workers.copies.env_copies import LoopedCopies, VectorCopies
-from workers.envs.toy import Countdown
 
 
 def failure_of(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> EnvironmentFailed:

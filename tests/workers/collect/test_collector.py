@@ -16,11 +16,15 @@ import pytest
 import torch
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
-from protocol.arrays import Array
-from protocol.policy.distributions import distribution
-from protocol.policy.features import features, normalize
-from protocol.policy.networks import ActorCriticNetwork
-from protocol.specs import Leaf, RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.specs import Leaf, RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.copies.env_copies import copy_seeds
+from millrace.workers.envs.toy import Countdown, Scripted
 from tests.support.in_process.collectors import (
     TOY,
     bits,
@@ -34,10 +38,6 @@ from tests.support.in_process.collectors import (
     run_of,
 )
 from tests.support.numbers.rounding import in_double, in_float64, sampled
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
-from workers.copies.env_copies import copy_seeds
-from workers.envs.toy import Countdown, Scripted
 
 # ------------------------------------------------------------------------------------------------ the same bits
 
@@ -308,7 +308,7 @@ def test_a_lane_released_while_its_copies_are_made_is_closed_after_the_collectio
 
 
 def test_the_pulse_is_called_between_slow_copies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
+    monkeypatch.setattr("millrace.workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
     random_collector(run).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
@@ -336,7 +336,7 @@ def test_steps_are_counted_while_a_rollout_is_under_way(
     env: str, lanes: Sequence[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also between the copies of one lane, whose step may take minutes; resets are no steps."""
-    monkeypatch.setattr("workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
+    monkeypatch.setattr("millrace.workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}{env}-v0", T=9, N=3)
     made = 0
 
@@ -362,5 +362,5 @@ def test_steps_are_counted_while_a_rollout_is_under_way(
 
 
 def test_collecting_imports_no_torch_for_an_mlp() -> None:
-    program = "import sys, workers.collect.collector; sys.exit('torch' in sys.modules or 'learner' in sys.modules)"
+    program = "import sys, millrace.workers.collect.collector; sys.exit('torch' in sys.modules or 'learner' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0

@@ -12,11 +12,18 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from protocol.errors import EnvironmentFailed
-from protocol.messages import Evaluate
-from protocol.rollout import Rollout
-from protocol.rows.rollout_checks import validate
-from protocol.specs import RunSpec
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.specs import RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.copies.env_copies import VectorCopies
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.envpool_copies import EnvpoolCopies
+from millrace.workers.copies.facts import facts_of_copies, facts_of_info
+from millrace.workers.copies.split_vector_env import SplitVectorEnv
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import (
     collect,
     no_pulse,
@@ -25,13 +32,6 @@ from tests.support.in_process.collectors import (
     run_of,
 )
 from tests.support.users_code.fact_envs import Facts
-from workers.collect.collector import Collector
-from workers.copies.env_copies import VectorCopies
-from workers.copies.env_errors import CopyFailed
-from workers.copies.envpool_copies import EnvpoolCopies
-from workers.copies.facts import facts_of_copies, facts_of_info
-from workers.copies.split_vector_env import SplitVectorEnv
-from workers.evaluate.evaluator import Evaluator
 
 NAMES = ("is_success", "distance", "speed")
 FACTS = "tests.support.users_code.fact_envs:Facts-v0"

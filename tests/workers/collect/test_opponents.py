@@ -12,25 +12,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.algorithms.minibatches import log_probs
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import PPOConfig
-from learner.rollouts.opponent_pool import teams_of
-from protocol.arrays import Array, Floats
-from protocol.errors import PolicyFailed, UsageError
-from protocol.messages import Evaluate, Weights
-from protocol.policy.layout import acting_size
-from protocol.policy.policy import make_policy
-from protocol.rollout import Episode, Rollout, stack_rollouts
-from protocol.rows.rollout_checks import validate, wrong_facts
-from protocol.specs import SCORE, PolicySpec, RunSpec
+from millrace.learner.algorithms.minibatches import log_probs
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.rollouts.opponent_pool import teams_of
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.errors import PolicyFailed, UsageError
+from millrace.protocol.messages import Evaluate, Weights
+from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import Episode, Rollout, stack_rollouts
+from millrace.protocol.rows.rollout_checks import validate, wrong_facts
+from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.opponents import KnownOpponents, Match, Opponent, OtherTeams
 from tests.support.in_process.collectors import no_pulse, random_policy
 from tests.support.users_code.seat_envs import AGENTS
 from tests.workers.collect.test_seat_rows import FORMS, seated_run
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
-from workers.evaluate.evaluator import Evaluator
-from workers.opponents import KnownOpponents, Match, Opponent, OtherTeams
 
 A = len(AGENTS)
 SCRIPTED = f"{__name__}:always_two"

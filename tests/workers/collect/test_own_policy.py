@@ -11,18 +11,18 @@ import pytest
 from gymnasium import spaces
 
 from millrace.own_policy import OwnPolicy as Declared
-from protocol.arrays import Array
-from protocol.env_spec import AllowedCode
-from protocol.errors import PolicyFailed
-from protocol.messages import Evaluate
-from protocol.policy.called_policy import CalledPolicy
-from protocol.rollout import Rollout
-from protocol.specs import RunSpec
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import AllowedCode
+from millrace.protocol.errors import PolicyFailed
+from millrace.protocol.messages import Evaluate
+from millrace.protocol.policy.called_policy import CalledPolicy
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.copies.env_copies import LoopedCopies
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import bits, collect, no_pulse, run_around, run_of
 from tests.support.users_code.own_policies import ARRAYS, EXTRAS, Broken, Linear
-from workers.collect.collector import Collector
-from workers.copies.env_copies import LoopedCopies
-from workers.evaluate.evaluator import Evaluator
 
 HERE = "tests.support.users_code.own_policies:"
 WEIGHTS = np.random.default_rng(0).normal(0, 0.3, 10).astype(np.float32)

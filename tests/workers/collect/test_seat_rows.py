@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from pettingzoo.utils.wrappers import BaseWrapper
 
-from learner.algorithms.minibatches import log_probs
-from learner.algorithms.ppo import PPO
-from learner.algorithms.replay.replay_buffer import ReplayBuffer
-from learner.algorithms.returns import EpisodeEnds, complete, discounted_return, gae, vtrace
-from learner.config.hyperparameters import PPOConfig
-from learner.rollouts.evaluation_dealer import episode_seeds
-from protocol.arrays import Array
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed, UsageError
-from protocol.messages import EpisodeRows, Evaluate
-from protocol.policy.policy import make_policy
-from protocol.rollout import Rollout, stack_rollouts
-from protocol.rows.rollout_checks import validate
-from protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.learner.algorithms.minibatches import log_probs
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer
+from millrace.learner.algorithms.returns import EpisodeEnds, complete, discounted_return, gae, vtrace
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.rollouts.evaluation_dealer import episode_seeds
+from millrace.protocol.arrays import Array
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed, UsageError
+from millrace.protocol.messages import EpisodeRows, Evaluate
+from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.rollout import Rollout, stack_rollouts
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.workers.collect.collector import Collector
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import collect, evaluated, no_pulse, random_collector, random_policy
 from tests.support.users_code.seat_envs import AGENTS, Lived, RandomCrowd, RandomGame
-from workers.collect.collector import Collector
-from workers.evaluate.evaluator import Evaluator
 
 FORMS: dict[str, Any] = {"turns": RandomGame, "together": RandomCrowd}
 GAMMA, LAMBDA, RHO, C = 0.9, 0.8, 1.1, 0.9

@@ -13,9 +13,9 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit, TransformObservation
 
-from protocol.errors import EnvironmentFailed
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.workers.copies.env_copies import VectorCopies
 from tests.support.in_process.collectors import collect, evaluated, loop_over, random_collector, random_policy, run_around
-from workers.copies.env_copies import VectorCopies
 
 STEP = "expected (observation, reward, terminated, truncated, info)"
 RESET = "expected (observation, info): end it with `return observation, {}`"
@@ -162,7 +162,7 @@ def test_code_of_the_environment_that_unpacks_something_else_gets_no_such_advice
 ])  # fmt: skip
 def test_evaluations_say_the_same(reset: Any, step: Any, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     run = msgspec.structs.replace(run_around(Form(), T=4))
-    monkeypatch.setattr("protocol.env_spec.EnvSpec.make", lambda spec, render_mode=None: Form(reset, step))
+    monkeypatch.setattr("millrace.protocol.env_spec.EnvSpec.make", lambda spec, render_mode=None: Form(reset, step))
     with pytest.raises(EnvironmentFailed) as caught:
         evaluated(run, random_policy(run.policy), 1, 0)
     assert str(caught.value).startswith(f"while the policy was evaluated: copy 0, {says}")

@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from workers.conversation import heartbeat_thread
-from workers.conversation.heartbeat_thread import HeartbeatThread
+from millrace.workers.conversation import heartbeat_thread
+from millrace.workers.conversation.heartbeat_thread import HeartbeatThread
 
 SOON_S = 10.0
 

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.env_spec import EnvSpec
-from protocol.messages import (
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
     Described,
@@ -39,14 +39,12 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.space_spec import DiscreteSpace, EnvDescription
-from protocol.specs import DescribeSpec, RunSpec, StepSpec
-from protocol.wire.codec import decode_to_learner, encode
-from tests.support.conversation.every_message import to_worker
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
-from workers.conversation.connection_rules import wait_limits_s
-from workers.conversation.held import KEPT_RESULTS
-from workers.conversation.session import (
+from millrace.protocol.space_spec import DiscreteSpace, EnvDescription
+from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.wire.codec import decode_to_learner, encode
+from millrace.workers.conversation.connection_rules import wait_limits_s
+from millrace.workers.conversation.held import KEPT_RESULTS
+from millrace.workers.conversation.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
     NO_LEARNER,
@@ -61,8 +59,10 @@ from workers.conversation.session import (
     WorkerEffect,
     WorkerIdentity,
 )
-from workers.conversation.worker_states import TABLE, WorkerState
-from workers.exit_codes import EXIT_UNSUITABLE
+from millrace.workers.conversation.worker_states import TABLE, WorkerState
+from millrace.workers.exit_codes import EXIT_UNSUITABLE
+from tests.support.conversation.every_message import to_worker
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 
 M = TypeVar("M")
 

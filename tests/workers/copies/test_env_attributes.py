@@ -9,15 +9,15 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from pettingzoo.utils.wrappers import BaseWrapper
 
-from protocol.envs.seats import seated
-from protocol.errors import EnvironmentFailed
-from protocol.wire.plain_values import pack
+from millrace.protocol.envs.seats import seated
+from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.wire.plain_values import pack
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.seated_copies import SeatedCopies
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, run_of
 from tests.support.users_code.fact_envs import Facts
 from tests.support.users_code.seat_envs import AGENTS, RandomGame
-from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
-from workers.copies.env_errors import CopyFailed
-from workers.copies.seated_copies import SeatedCopies
 
 FACTS = "tests.support.users_code.fact_envs:Facts-v0"
 

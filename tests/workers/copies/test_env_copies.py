@@ -13,22 +13,22 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import millrace
-from learner.vector_env.settings import VectorEnvSettings
 from millrace import EnvCopy
-from protocol.env_spec import EnvSpec
-from protocol.errors import UsageError
-from protocol.messages import Reset
-from protocol.specs import DescribeSpec, RunSpec, Vector
-from protocol.wire.plain_values import pack
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.errors import UsageError
+from millrace.protocol.messages import Reset
+from millrace.protocol.specs import DescribeSpec, RunSpec, Vector
+from millrace.protocol.wire.plain_values import pack
+from millrace.workers import copy_slots
+from millrace.workers.collect.collector import open_env_copies
+from millrace.workers.described_copy import describing
+from millrace.workers.envs.reset_ahead import ResetAhead
+from millrace.workers.envs.toy import Countdown
+from millrace.workers.evaluate.evaluator import open_looped_copies
+from millrace.workers.vector_env.stepper import Stepper
 from tests.support.in_process.collectors import no_pulse, run_of
 from tests.support.in_process.described import step_spec
-from workers import copy_slots
-from workers.collect.collector import open_env_copies
-from workers.described_copy import describing
-from workers.envs.reset_ahead import ResetAhead
-from workers.envs.toy import Countdown
-from workers.evaluate.evaluator import open_looped_copies
-from workers.vector_env.stepper import Stepper
 
 MODULE = __name__
 
@@ -93,7 +93,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[int]]:
 
 def run_with(vector: Vector = "loop") -> RunSpec:
     """A run with two copies in a lane."""
-    found = run_of("workers.envs.toy:Countdown-v0", N=2, kwargs={"k": 3})
+    found = run_of("millrace.workers.envs.toy:Countdown-v0", N=2, kwargs={"k": 3})
     return RunSpec(EnvSpec("Asks-v0"), found.policy, rollout_steps=8, copies=2, lanes=8, seed=1, vector=vector)
 
 

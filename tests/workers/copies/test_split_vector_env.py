@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from learner.recording.episodes import EpisodeAssembler
-from protocol.errors import NoWorkers
-from protocol.policy.layout import acting_size, buffer_size
-from protocol.policy.torch_policy import TorchPolicy
-from protocol.specs import RunSpec
+from millrace.learner.recording.episodes import EpisodeAssembler
+from millrace.protocol.errors import NoWorkers
+from millrace.protocol.policy.layout import acting_size, buffer_size
+from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.specs import RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
-from workers.copies.split_vector_env import SplitVectorEnv
 
 LANES = 3
 RUNS = {

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorEnv
 
-from learner.config.config import Config
-from learner.config.hyperparameters import PPOConfig
-from protocol.env_spec import EnvSpec
-from protocol.envs.envpool import envpool_spec
-from protocol.envs.vectorized import make_native
-from protocol.errors import UsageError
-from protocol.specs import RunSpec
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.envpool import envpool_spec
+from millrace.protocol.envs.vectorized import make_native
+from millrace.protocol.errors import UsageError
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
+from millrace.workers.copies.envpool_copies import EnvpoolCopies
+from millrace.workers.envs import atari
 from tests.support.in_process.collectors import bits, collect, no_pulse, random_collector
 from tests.support.in_process.described import run_spec
-from workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
-from workers.copies.envpool_copies import EnvpoolCopies
-from workers.envs import atari
 
 envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install envpool")
 pytestmark = pytest.mark.skipif(

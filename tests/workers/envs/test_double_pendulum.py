@@ -21,9 +21,9 @@ import pytest
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-import workers.envs
-from protocol.arrays import Doubles
-from workers.envs.double_pendulum import (
+import millrace.workers.envs
+from millrace.protocol.arrays import Doubles
+from millrace.workers.envs.double_pendulum import (
     DT_S,
     SPEED_LIMIT,
     SUBSTEPS,
@@ -36,7 +36,7 @@ from workers.envs.double_pendulum import (
     linear_accelerations,
     linear_model,
 )
-from workers.envs.lqr import LQR, discrete_model, lqr_gain
+from millrace.workers.envs.lqr import LQR, discrete_model, lqr_gain
 
 ROOT = Path(__file__).parents[3]
 ID = "millrace/CartDoublePendulum-v0"
@@ -291,7 +291,7 @@ def test_gymnasium_finds_nothing_to_warn_about(linearised: bool) -> None:
 
 
 def test_the_whole_way_by_gymnasiums_name() -> None:
-    env = gymnasium.make(f"workers.envs:{ID}", link_m=0.4, linearised=True)
+    env = gymnasium.make(f"millrace.workers.envs:{ID}", link_m=0.4, linearised=True)
     assert isinstance(env.unwrapped, CartDoublePendulum)
     assert env.unwrapped.physics == dataclasses.replace(Physics(), link_m=0.4)
     assert env.spec is not None
@@ -454,9 +454,9 @@ def test_without_pygame_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
 
 def test_importing_it_is_cheap() -> None:
     asks = (
-        f"import sys, {workers.envs.__name__}; assert 'workers.envs.double_pendulum' not in sys.modules;"
+        f"import sys, {millrace.workers.envs.__name__}; assert 'millrace.workers.envs.double_pendulum' not in sys.modules;"
         f"import gymnasium; env = gymnasium.make('{ID}'); env.reset(seed=1); env.step(env.action_space.sample());"
-        "assert not sys.modules.keys() & {'pygame', 'torch', 'scipy', 'sympy', 'workers.envs.lqr'}"
+        "assert not sys.modules.keys() & {'pygame', 'torch', 'scipy', 'sympy', 'millrace.workers.envs.lqr'}"
     )
     done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

@@ -8,10 +8,12 @@ import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from workers.envs import toy
+from millrace.workers.envs import toy
 
 FAIL_ON_PURPOSE = {f"{kind.__name__}-v0" for kind in (*toy.Faulty.__subclasses__(), toy.OneStep)}  # "truncates after 1 step"
-REGISTERED = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("workers.envs.")]
+REGISTERED = [
+    name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("millrace.workers.envs.")
+]
 
 
 @pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # Scripted counts without end

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from protocol.errors import UsageError
-from protocol.random_streams import Purpose, env_seed
-from protocol.wire.plain_values import pack
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose, env_seed
+from millrace.protocol.wire.plain_values import pack
+from millrace.workers.copies.env_copies import LoopedCopies
+from millrace.workers.envs.reset_ahead import ResetAhead
 from tests.support.in_process.collectors import no_pulse
-from workers.copies.env_copies import LoopedCopies
-from workers.envs.reset_ahead import ResetAhead
 
 DEADLINE_S = 20.0
 

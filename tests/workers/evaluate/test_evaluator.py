@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed, UsageError
-from protocol.messages import EpisodeRows, Evaluate, Evaluated
-from protocol.policy.policy import Policy
-from protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed, UsageError
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
+from millrace.protocol.policy.policy import Policy
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from millrace.workers.evaluate import episode_rows
+from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import no_pulse, random_policy, run_of
-from workers.collect.collector import Collector
-from workers.conversation.held import Assignment
-from workers.evaluate import episode_rows
-from workers.evaluate.evaluator import Evaluator
 
 Array = np.ndarray[Any, Any]
 

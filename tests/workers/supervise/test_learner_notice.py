@@ -9,9 +9,16 @@ import msgspec
 import pytest
 import zmq
 
-from protocol.alive import Alive, WorkerActivity, WorkerExit
-from workers.shared_weights import SharedWeights, SharedWeightsReader
-from workers.supervise.learner_notice import ENDED_AFTER_S, ENDED_FOR_S, EVERY_S, EVERY_S_WHILE_SLOW, SLOW_S, AliveSender
+from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
+from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
+from millrace.workers.supervise.learner_notice import (
+    ENDED_AFTER_S,
+    ENDED_FOR_S,
+    EVERY_S,
+    EVERY_S_WHILE_SLOW,
+    SLOW_S,
+    AliveSender,
+)
 
 SOON_MS = 10_000
 STARTING = WorkerActivity("w0", 1, "starting", 0.0, 0)

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from workers.supervise import short_log, worker_process
-from workers.supervise.short_log import GONE, keep_short
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from millrace.workers.supervise import short_log, worker_process
+from millrace.workers.supervise.short_log import GONE, keep_short
+from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 WITHIN_S = 60.0
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from protocol.alive import Doing, StartFailed, WorkerActivity, WorkerExit
-from workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
-from workers.supervise.ending import Ending
-from workers.supervise.supervisor import (
+from millrace.protocol.alive import Doing, StartFailed, WorkerActivity, WorkerExit
+from millrace.workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
+from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.supervisor import (
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
     ENFORCE_EVERY_S,
@@ -325,7 +325,7 @@ def test_every_request_to_stop_is_passed_on_and_a_worker_that_does_not_leave_is_
         if "wait" in worker.requests:
             worker.end = Ending(-9, "was killed")
 
-    monkeypatch.setattr("workers.supervise.supervisor.time.sleep", sleeps)
+    monkeypatch.setattr("millrace.workers.supervise.supervisor.time.sleep", sleeps)
     assert machine.host.run(lambda: requests, lambda line: None) == 1
     assert worker.requests == ["stop", "stop", "stop", "wait"]
     assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)

@@ -16,13 +16,13 @@ from typing import Any
 
 import pytest
 
-from protocol.alive import CallTimeouts, Doing
-from protocol.keys.key_folder import TOKEN_VARIABLE
-from workers import activity, program
-from workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
-from workers.supervise import worker_process
-from workers.supervise.ending import Ending
-from workers.supervise.worker_process import MOST_LAST_LINES, WorkerCommand, WorkerProcess
+from millrace.protocol.alive import CallTimeouts, Doing
+from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
+from millrace.workers import activity, program
+from millrace.workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
+from millrace.workers.supervise import worker_process
+from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.worker_process import MOST_LAST_LINES, WorkerCommand, WorkerProcess
 
 WITHIN_S = 60.0
 

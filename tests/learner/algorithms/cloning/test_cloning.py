@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import algorithm_class
-from learner.algorithms.cloning.demonstrations import Demonstrations
-from learner.algorithms.ppo import PPO
-from learner.config.hyperparameters import HYPERPARAMETERS
-from protocol.arrays import Array
-from protocol.errors import RunError
-from protocol.policy.distributions import Squashed
-from protocol.policy.torch_distributions import policy_log_prob
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
+from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import RunError
+from millrace.protocol.policy.distributions import Squashed
+from millrace.protocol.policy.torch_distributions import policy_log_prob
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 BOX = Leaf("", "box", (3,), "float32")
 IMAGE = Leaf("i", "box", (8, 8, 1), "uint8", divisor=255)

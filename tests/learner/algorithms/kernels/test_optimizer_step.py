@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
 
-from learner.algorithms.kernels import optimizer_step
-from learner.algorithms.kernels.optimizer_step import take_step
+from millrace.learner.algorithms.kernels import optimizer_step
+from millrace.learner.algorithms.kernels.optimizer_step import take_step
 
 KINDS: dict[str, Callable[[list[Tensor]], Optimizer]] = {
     "adam": lambda flat: Adam(flat, lr=1e-2, eps=1e-5, fused=True),

@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from learner.algorithms.kernels import mlp as layers
-from learner.algorithms.kernels import trained_networks
-from learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
-from protocol.policy import networks
-from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
-from protocol.specs import ActionSpec, PolicySpec
+from millrace.learner.algorithms.kernels import mlp as layers
+from millrace.learner.algorithms.kernels import trained_networks
+from millrace.learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
+from millrace.protocol.policy import networks
+from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
+from millrace.protocol.specs import ActionSpec, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN, IMAGE, recurrent, shared
 from tests.support.numbers.finite_differences import is_the_slope

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.replay import mixed_replay
-from learner.algorithms.replay.mixed_replay import PRIOR_SLOT, MixedReplay
-from learner.algorithms.replay.replay_buffer import memory_bytes
-from protocol.errors import UsageError
+from millrace.learner.algorithms.replay import mixed_replay
+from millrace.learner.algorithms.replay.mixed_replay import PRIOR_SLOT, MixedReplay
+from millrace.learner.algorithms.replay.replay_buffer import memory_bytes
+from millrace.protocol.errors import UsageError
 from tests.learner.algorithms.replay.test_replay import GAMMA, OBS, Lanes, replay
 
 SHARE = 0.25

@@ -16,13 +16,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.replay import replay_buffer as module
-from learner.algorithms.replay.available_memory import GIB
-from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
-from learner.algorithms.replay.sum_tree import SumTree
-from protocol.errors import UsageError
-from protocol.rollout import Batch
-from protocol.specs import Leaf
+from millrace.learner.algorithms.replay import replay_buffer as module
+from millrace.learner.algorithms.replay.available_memory import GIB
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
+from millrace.learner.algorithms.replay.sum_tree import SumTree
+from millrace.protocol.errors import UsageError
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import Leaf
 
 OBS = (Leaf("", "box", (1,), "float64"),)
 GAMMA = 0.9
