@@ -69,7 +69,7 @@ def measure(case: str, mode: str, threads: int) -> tuple[float, float]:
 
     def watch(progress: Progress) -> None:
         waits.append((progress.env_steps, progress.stages["learner_wait"]))
-        workers = [child for child in psutil.Process().children() if "workers" in child.cmdline()]
+        workers = [child for child in psutil.Process().children() if "millrace.workers" in child.cmdline()]
         memory.extend(worker.memory_info().rss / 1e6 for worker in workers)
 
     with tempfile.TemporaryDirectory() as folder:

@@ -1,9 +1,9 @@
 """Start-up time and memory of a worker process: `python -m benchmarks.worker`.
 
-Measures the seconds from exec to the first rollout, and resident memory, of a real `python -m workers` over ipc with a hub
-alone. There are two policies: an MLP, which acts in numpy without torch, and an image policy, which needs torch. A last row
-is a supervisor with the MLP's worker: the seconds to the first rollout through it, and its own memory, in which pages that
-it shares with other processes count in part (PSS).
+Measures the seconds from exec to the first rollout, and resident memory, of a real `python -m millrace.workers` over ipc
+with a hub alone. There are two policies: an MLP, which acts in numpy without torch, and an image policy, which needs torch.
+A last row is a supervisor with the MLP's worker: the seconds to the first rollout through it, and its own memory, in which
+pages that it shares with other processes count in part (PSS).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def start_one(env: EnvSpec, *, supervised: bool = False) -> tuple[float, float]:
         hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()
-        command = [sys.executable, "-m", "workers", link.address]
+        command = [sys.executable, "-m", "millrace.workers", link.address]
         started = (
             subprocess.Popen(command, stderr=subprocess.DEVNULL)
             if supervised

@@ -14,9 +14,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from millrace.import_conflict import check_imports
+from millrace.oldest_versions import check_versions
 
-check_imports()
+check_versions()
 
 import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # before torch, if the program imports millrace first
 from millrace.protocol.errors import (  # noqa: E402

@@ -1,8 +1,8 @@
 """Shows the progress of a run: as a live block on a terminal, as one display in a notebook, as lines elsewhere, or as JSON.
 
 Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. Warnings of the log are
-shown above the block. No text is read as markup or controls the terminal. `millrace.learner.standard_streams` sees to it that a
-stream which is full or closed does not end the run.
+shown above the block. No text is read as markup or controls the terminal. `millrace.learner.standard_streams` sees to it
+that a stream which is full or closed does not end the run.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Weights(Message, frozen=True):
     """[B] float32, observation mean and standard deviation if observations are normalized; then ε for action values, or the
     scale of the noise (deterministic actions); last, for actions in [-1, 1], 1 while they are drawn uniformly, else 0"""
     env_attributes: Array | None = None
-    """[bytes] uint8, `millrace.protocol.wire.plain_values`: attributes by name, which the copies of a lane get before its next
+    """[bytes] uint8, `plain_values`: attributes by name, which the copies of a lane get before its next
     rollout under these weights, new copies before their first reset. They keep them until other weights name them. Copies
     that play evaluations get none
     """
@@ -302,7 +302,7 @@ class Reset(Message, frozen=True):
     seeds: tuple[int | None, ...]
     """one seed for each of `copies`; null: go on with the random numbers that the copy has"""
     options: Array
-    """[bytes] uint8, `millrace.protocol.wire.plain_values`: the options of `Env.reset`, or None; a list has those of each copy"""
+    """[bytes] uint8, `plain_values`: the options of `Env.reset`, or None; a list has those of each copy"""
 
 
 class Step(Message, frozen=True):
@@ -336,7 +336,7 @@ class Call(Message, frozen=True):
     assign: bool
     """true: set the attribute"""
     given: Array
-    """[bytes] uint8, `millrace.protocol.wire.plain_values`: a pair of the arguments, a list or a tuple, and the keyword arguments, a
+    """[bytes] uint8, `plain_values`: a pair of the arguments, a list or a tuple, and the keyword arguments, a
     dict; with `assign`, a list of one value for each of `copies`
     """
 
@@ -358,7 +358,7 @@ class Stepped(Message, frozen=True):
     truncated: Array
     """[N] bool"""
     infos: Array
-    """[bytes] uint8: a list of pairs of copy and info, each pair a list or a tuple, packed by `millrace.protocol.wire.plain_values`;
+    """[bytes] uint8: a list of pairs of copy and info, each pair a list or a tuple, packed by `plain_values`;
     empty infos are left out
     """
 
@@ -371,7 +371,7 @@ class Returned(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     results: Array
-    """[bytes] uint8, `millrace.protocol.wire.plain_values`: a list with one result for each of `copies`, an empty list with `assign`;
+    """[bytes] uint8, `plain_values`: a list with one result for each of `copies`, an empty list with `assign`;
     no bytes if the call raised
     """
     error: Line

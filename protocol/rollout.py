@@ -8,8 +8,8 @@ Hence, for every copy:
 
 If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay buffer) masks with `valid`.
 
-With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and more rows are not valid: those of a seat
-that waits for others, or is not there. A seat's row is the one in which its outcome comes: until then `obs` shows the
+With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and more rows are not valid: those of a
+seat that waits for others, or is not there. A seat's row is the one in which its outcome comes: until then `obs` shows the
 observation in which the seat acted, and `action` and `log_prob` what it did, and the row after it shows what it saw next.
 So the sentence above holds for every valid row, and one rule is added: *a row that is not valid passes through*. What is
 carried from a seat's row to its next one, a return or a recurrent state, is not changed by the rows between. `ended` cuts,

@@ -99,7 +99,7 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     observation: SpaceSpec
     action: SpaceSpec
     metadata: Array
-    """[bytes] uint8, `millrace.protocol.wire.plain_values`: `Env.metadata` as far as it is plain data"""
+    """[bytes] uint8, `plain_values`: `Env.metadata` as far as it is plain data"""
     spec: Text
     """gymnasium's `EnvSpec` as JSON; empty if the environment has none, or one that JSON cannot hold"""
     longest_episode: Natural

@@ -47,9 +47,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "sac": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 {REPLAY}",),
     "td3": (f"train Pendulum-v1 --algo td3 --updates-per-step 0.5 {NORMALIZED} {REPLAY}",),
     "lstm": (f"train millrace.workers.envs.toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
-    "images": (
-        f"train millrace.workers.envs.toy:Spaces-v0 --env-kwargs observation nested action multibinary --algo ppo {ON_POLICY}",
-    ),
+    "images": (f"train millrace.workers.envs.toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
     "per": (f"train CartPole-v1 --algo dqn --priority-alpha 0.6 --n-step 3 --normalize-observations {REPLAY}",),

@@ -12,12 +12,15 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "workers", "learner", "millrace")
+PARTS = ("protocol", "workers", "learner")
+"""the packages of millrace that stand beside its folder, which has links to them"""
+PACKAGES = (*PARTS, "millrace")
 FORBIDDEN = {
     "protocol": {"workers", "learner", "millrace"},
     "workers": {"learner", "millrace"},
@@ -63,7 +66,7 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"conformance", "dashboard", "import_conflict", "launch", "playing", "terminal"},
+    "cli": {"conformance", "dashboard", "launch", "playing", "terminal"},
     "conformance": set[str](),
     "dashboard": {"cli"},
     "integrations": set[str](),
@@ -118,7 +121,22 @@ def tree(source: str) -> ast.Module:
 
 
 def module(source: str) -> str:
-    return source.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    """The dotted name under which a file is imported."""
+    name = source.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    return f"millrace.{name}" if name.partition(".")[0] in PARTS else name
+
+
+def file_of(name: str) -> str:
+    """The path of a module of ours, by its dotted name."""
+    path = name.replace(".", "/") + ".py"
+    return path.removeprefix("millrace/") if path.startswith(tuple(f"millrace/{part}/" for part in PARTS)) else path
+
+
+def package(name: str) -> str:
+    """The package that a dotted name belongs to: one of `PACKAGES`, or its first part."""
+    first, _, rest = name.partition(".")
+    second = rest.partition(".")[0]
+    return second if first == "millrace" and second in PARTS else first
 
 
 @cache
@@ -162,7 +180,7 @@ def imports_in_functions(source: str) -> set[str]:
 @cache
 def is_slow(name: str) -> bool:
     """Whether a module is slow to import or optional, or imports one that is."""
-    source = name.replace(".", "/") + ".py"
+    source = file_of(name)
     if not (ROOT / source).exists():
         return name.partition(".")[0] in SLOW_TO_IMPORT | OPTIONAL
     at_the_top = [node for node in tree(source).body if isinstance(node, ast.Import | ast.ImportFrom)]
@@ -171,8 +189,8 @@ def is_slow(name: str) -> bool:
 
 
 def imported(source: str) -> set[str]:
-    """Top-level names of all that a file imports."""
-    return {name.partition(".")[0] for name in modules_imported(source)}
+    """The packages of all that a file imports."""
+    return {package(name) for name in modules_imported(source)}
 
 
 def files_imported(source: str, files: Mapping[str, str]) -> set[str]:
@@ -234,6 +252,14 @@ def test_imports_between_packages_go_one_way(folder: str) -> None:
         assert not imported(source) & FORBIDDEN[folder], source
 
 
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_of_millrace_cannot_be_imported_under_its_bare_name(part: str) -> None:
+    """The folder of the repository is on the path: each class would exist twice."""
+    with pytest.raises(ImportError, match=f"import millrace.{part} instead of {part}"):
+        import_module(part)
+    assert (ROOT / "millrace" / part).resolve() == ROOT / part
+
+
 def test_the_search_for_circles_finds_one() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
     assert not circles({"a": {"b", "c"}, "b": {"c"}, "c": set()})
@@ -244,18 +270,20 @@ def test_no_files_import_each_other_in_a_circle() -> None:
     assert not circles({source: files_imported(source, files) for source in files.values()})
 
 
-@pytest.mark.parametrize(("package", "place"), [(package, place) for package, rooms in ROOMS.items() for place in rooms])
-def test_a_room_imports_only_what_it_may(package: str, place: str) -> None:
-    allowed = ROOMS[package][place] | {place}
-    files = sources(f"{package}/{place}") or (f"{package}/{place}.py",)
+@pytest.mark.parametrize(("folder", "place"), [(folder, place) for folder, rooms in ROOMS.items() for place in rooms])
+def test_a_room_imports_only_what_it_may(folder: str, place: str) -> None:
+    allowed = ROOMS[folder][place] | {place}
+    above = f"{module(f'{folder}/__init__.py')}."
+    files = sources(f"{folder}/{place}") or (f"{folder}/{place}.py",)
     for source in files:
-        places = {name.split(".")[1] for name in modules_imported(source) if name.startswith(f"{package}.")}
+        imported_names = {name for name in modules_imported(source) if name.startswith(above) and package(name) == folder}
+        places = {name.removeprefix(above).partition(".")[0] for name in imported_names}
         assert places <= allowed, source
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_no_room_is_without_a_rule(package: str) -> None:
-    assert {path.parent.name for path in (ROOT / package).glob("*/__init__.py")} <= set(ROOMS[package])
+@pytest.mark.parametrize("folder", ROOMS)
+def test_no_room_is_without_a_rule(folder: str) -> None:
+    assert {path.parent.name for path in (ROOT / folder).glob("*/__init__.py")} - {*PARTS} <= set(ROOMS[folder])
 
 
 def test_what_a_file_needs_is_imported_at_its_top_unless_it_is_slow_or_optional() -> None:

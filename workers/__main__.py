@@ -1,4 +1,4 @@
-"""The program `python -m workers ADDRESS` or `millrace worker ADDRESS`: a supervisor, whose workers are its children.
+"""The program `python -m millrace.workers ADDRESS` or `millrace worker ADDRESS`: a supervisor of workers.
 
 The supervisor imports neither numpy nor gymnasium. The same program with `--parent` is a worker (`workers/program.py`).
 

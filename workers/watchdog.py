@@ -17,8 +17,8 @@ from pathlib import Path
 
 FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
 LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
-OURS = [f"{Path(__file__).parents[1] / package}/" for package in ("millrace", "protocol", "workers")]
-LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", *OURS)  # how paths begin that are not the user's
+OURS = f"{Path(__file__).parents[1]}/"
+LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # how paths begin that are not the user's
 ENVIRONMENTS = f"{Path(__file__).parent / 'envs'}/"  # ours are as those of a user
 INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-packages
 

@@ -1,4 +1,4 @@
-"""What is wrong with an algorithm: each rule of `millrace.learner.algorithms.Algorithm` is one function here, which yields mistakes.
+"""What is wrong with an algorithm: each rule of `Algorithm` is one function here, which yields mistakes.
 
 A mistake is one line. Every rule gets objects of its own, made with the same seed, and copies of the same batches. So one
 broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.

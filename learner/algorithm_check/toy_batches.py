@@ -1,7 +1,7 @@
 """Batches for the check of an algorithm, made in this process: noise with ends of both kinds, and the identity environment.
 
-Both keep the row format (`millrace.protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use. Pure:
-weights and a generator in, a batch out.
+Both keep the row format (`millrace.protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use.
+Pure: weights and a generator in, a batch out.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The learning algorithms. No sockets, no files.
 
-Each algorithm is one class in one file. Its settings are one record in `millrace.learner.config.hyperparameters`. `ALGORITHMS` and
-`HYPERPARAMETERS` in `millrace.learner.config` list them by name. Importing this module does not import torch; calling
-`algorithm_class` does.
+Each algorithm is one class in one file. Its settings are one record in `millrace.learner.config.hyperparameters`.
+`ALGORITHMS` and `HYPERPARAMETERS` in `millrace.learner.config` list them by name. Importing this module does not import
+torch; calling `algorithm_class` does.
 """
 
 from __future__ import annotations

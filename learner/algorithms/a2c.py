@@ -1,4 +1,4 @@
-"""A2C (Mnih et al. 2016, synchronous). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock.
+"""A2C (Mnih et al. 2016, synchronous). Its settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock.
 
 An update is one gradient step on all valid rows of a batch. The batch must have been collected under the newest weights.
 """

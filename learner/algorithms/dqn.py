@@ -1,4 +1,4 @@
-"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants. Settings: `millrace.learner.config.hyperparameters`.
+"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants. Settings: `config/hyperparameters.py`.
 
 An update adds a batch to the replay buffer and makes a fixed number of gradient steps, so how often a transition is used is
 a setting and does not depend on speed. ε falls with the number of env steps used and is published with the weights.

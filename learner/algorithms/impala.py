@@ -1,4 +1,4 @@
-"""IMPALA's learner (Espeholt et al. 2018). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock.
+"""IMPALA's learner (Espeholt et al. 2018). Settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock.
 
 A batch may have been collected under older weights (`max_lag` above 0). V-trace weights each row by the probability ratio of
 its action under the newest policy and the policy that acted. It is computed in time order, before rows are shuffled.

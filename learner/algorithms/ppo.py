@@ -1,4 +1,4 @@
-"""PPO (Schulman et al. 2017). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock; seeded.
+"""PPO (Schulman et al. 2017). Its settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock; seeded.
 
 An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows. With
 a recurrent core a minibatch is whole columns of the batch, and may have more. The update is `ActorCritic.update`; here are

@@ -1,4 +1,4 @@
-"""REINFORCE (Williams 1992). Its settings: `millrace.learner.config.hyperparameters`. No sockets, no files, no clock.
+"""REINFORCE (Williams 1992). Its settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock.
 
 An update is one gradient step on the rows whose episode ends within the rollout, because the rewards that follow them are
 all known. Other rows are dropped and counted. The return of a truncated episode continues with the baseline's value of its

@@ -1,8 +1,9 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
-Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
-which is the true final observation of a truncated episode. No function adds rewards or values across the end of an episode.
-A row that is not valid gives zero and does not affect other rows, whatever it contains: what is carried passes through it.
+Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
+`obs[t+1]`, which is the true final observation of a truncated episode. No function adds rewards or values across the end of
+an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: what is carried passes
+through it.
 """
 
 from __future__ import annotations

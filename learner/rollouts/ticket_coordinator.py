@@ -47,7 +47,8 @@ STRIKES = 3  # rollouts or messages that could not be used, after which a worker
 class TicketCoordinator(Coordinator[CollectingMember]):
     """Members, their lanes, and what they are asked for.
 
-    A rollout that `receive` is given must have passed `millrace.protocol.rows.rollout_checks.validate`; else call `reject_rollout`.
+    A rollout that `receive` is given must have passed `millrace.protocol.rows.rollout_checks.validate`; else call
+    `reject_rollout`.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """The log as JSON, one event per line: on stderr (`--log-json`), and its warnings and notices in the run folder (log.jsonl).
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
-"left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin" (`millrace.learner.members.events`,
-whose fields stand beside it), "progress", or "said" for any other line of the log.
+"left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin"
+(`millrace.learner.members.events`, whose fields stand beside it), "progress", or "said" for any other line of the log.
 
 Rule: log.jsonl is bounded, and nothing depends on it. Of a file that has grown too long, the newer half is kept. Lines that
 the disk refuses are dropped. It is opened for each line, because somebody may delete it, or its folder, meanwhile.

@@ -15,8 +15,7 @@ from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.errors import UserFacingError, first_line
 from millrace.protocol.flags.program_name import typed_name
 
-OURS = {"learner", "millrace", "protocol", "workers"}
-"""Our packages"""
+OURS, OF_LEARNER = "millrace.", "millrace.learner."  # how names of our modules begin
 
 
 def resume_command(run: Path, *, elsewhere: bool) -> str:
@@ -47,9 +46,9 @@ def users_code(error: BaseException) -> str:
     where = ""
     libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
     for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
-        package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
-        if package in OURS:
-            return where if package == "learner" else ""
+        module = str(frame.f_globals.get("__name__", ""))
+        if f"{module}.".startswith(OURS):
+            return where if module.startswith(OF_LEARNER) else ""
         file = frame.f_code.co_filename
         if not where and Path(file).is_absolute() and not file.startswith(libraries):
             where = f"{Path(file).name}:{line}"

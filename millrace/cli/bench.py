@@ -7,16 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
-from millrace import import_conflict
 from millrace.cli.commands import COMMANDS
 from millrace.protocol.errors import UsageError
 from millrace.protocol.flags.parse import asks_for_help, show_help
 
+HERE = Path(__file__).parents[2]
+"""The folder that holds `millrace`"""
+
 
 def run(argv: list[str]) -> int:
     """Run them. Returns the exit code."""
-    folders = import_conflict.INSTALLED_IN, Path.cwd()
-    clone = next((folder for folder in folders if (folder / "benchmarks" / "program.py").is_file()), None)
+    clone = next((folder for folder in (HERE, Path.cwd()) if (folder / "benchmarks" / "program.py").is_file()), None)
     if clone is None and asks_for_help(argv):
         show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
     if clone is None:

@@ -40,7 +40,7 @@ def describe_space(space: gymnasium.Space[Any], name: str = "space") -> SpaceSpe
 
 
 def make_space(spec: SpaceSpec) -> gymnasium.Space[Any]:
-    """The space of a record that passed `millrace.protocol.space_spec.check_size`. Raises `BadMessage` if there is no such space."""
+    """The space of a record that passed `space_spec.check_size`. Raises `BadMessage` if there is no such space."""
     try:
         return _make(spec)
     except BadMessage:

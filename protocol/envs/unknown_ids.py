@@ -228,7 +228,7 @@ def _with_environments(found: metadata.Distribution) -> InstalledPackage | None:
         return None
     files = [file for file in found.files or () if file.suffix == ".py" and len(file.parts) > 1]
     module = next((file.parts[0] for file in files if file.name == "__init__.py" and len(file.parts) == 2), "")
-    if not module or module in {"workers", "learner", "millrace", "protocol"}:
+    if not module or module == "millrace":
         return None
     return InstalledPackage(module, dict(_ids_of_files([file for file in files if file.parts[0] == module])))
 

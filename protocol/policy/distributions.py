@@ -12,7 +12,8 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
 
 The warm-up number is 1 or 0. While it is 1, the actions of the last two are uniform in [-1, 1].
 
-`millrace.protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares them.
+`millrace.protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares
+them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The networks in torch. The learner trains them, and workers with images act with them.
 
-All parameters are in one flat float32 tensor, in the layout of `millrace.protocol.policy.layout`, and all gradients in a second one.
-The named arrays are views of these two. So the gradient norm is the norm of one tensor, Adam is one kernel, and publishing
-copies the first part of one tensor. Features come from `millrace.protocol.policy.features` (numpy) and are already normalized.
+All parameters are in one flat float32 tensor, in the layout of `millrace.protocol.policy.layout`, and all gradients in a
+second one. The named arrays are views of these two. So the gradient norm is the norm of one tensor, Adam is one kernel, and
+publishing copies the first part of one tensor. Features come from `millrace.protocol.policy.features` (numpy) and are
+already normalized.
 """
 
 from __future__ import annotations

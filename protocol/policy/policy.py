@@ -14,7 +14,8 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype
 class Policy(Protocol):
     """Chooses distribution parameters for observations. Leaves are [L, N, *leaf]; params are [L, N, P] float32.
 
-    `state` [L, N, S] float32 is the state of the recurrent core. A call updates it in place (`millrace.protocol.policy.recurrent`).
+    `state` [L, N, S] float32 is the state of the recurrent core. A call updates it in place
+    (`millrace.protocol.policy.recurrent`).
     """
 
     def load(self, parameters: Floats, buffers: Floats) -> None:

@@ -71,7 +71,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
 
 
 def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:
-    """Raise `BadRollout` if the rows of seats break the law of `millrace.protocol.rollout`. Arrays [T, N·A], `resets` [T+1, N]."""
+    """Raise `BadRollout` if the rows of seats break the row law. Arrays [T, N·A], `resets` [T+1, N]."""
     reset = np.repeat(resets, run.sent_seats, axis=1)  # [T+1, N·A]
     steps = np.arange(len(valid))[:, None]
     row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last

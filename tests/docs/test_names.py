@@ -63,7 +63,7 @@ def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
                     yield f"{path}:{line}: {code}: no such flag: {flag}"
         if FILE.match(code) and code not in MADE_BY_COMMANDS and not ENVIRONMENT.search(code) and not (ROOT / code).exists():
             yield f"{path}:{line}: there is no file {code}"
-        if (module := MODULE.match(code)) and module[1].startswith(("benchmarks.", "tests.", "learner", "workers")):
+        if (module := MODULE.match(code)) and module[1].startswith(("benchmarks.", "tests.", "millrace.")):
             file = ROOT / module[1].replace(".", "/")
             if not (file.with_suffix(".py").is_file() or (file / "__main__.py").is_file()):
                 yield f"{path}:{line}: there is no module {module[1]}"

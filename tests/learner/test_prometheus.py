@@ -256,7 +256,7 @@ def get(url: str) -> str:
 def test_it_is_scraped_while_a_run_goes_on_and_is_gone_with_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learner.prometheus, "EVERY_S", 0.0)
+    monkeypatch.setattr(millrace.learner.prometheus, "EVERY_S", 0.0)
     caplog.set_level(logging.INFO, "millrace.learner")
     scrapes: list[Metrics] = []
     urls: list[str] = []

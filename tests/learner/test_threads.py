@@ -168,7 +168,8 @@ def test_threads_sleep_while_they_wait_if_millrace_is_imported_before_torch(
     imports: str, variable: str, spin: bool, tmp_path: Path
 ) -> None:
     (tmp_path / "torch.py").touch()
-    program = f"import {imports}; import os; from millrace.protocol.machine.waiting_threads import SPIN; print(SPIN, os.environ[{WAIT!r}])"
+    asks = f"from millrace.protocol.machine.waiting_threads import SPIN; print(SPIN, os.environ[{WAIT!r}])"
+    program = f"import {imports}; import os; {asks}"
     environment = {name: value for name, value in os.environ.items() if name != WAIT} | (
         {WAIT: variable} if variable else {}
     )

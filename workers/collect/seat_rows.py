@@ -1,7 +1,7 @@
 """The rows of a lane whose env copies have seats: which are valid, and what a seat did that waits for its outcome.
 
-Rule: a seat's row is the one in which its outcome comes (`millrace.protocol.envs.seats`). Until then each row repeats what was
-written when the seat acted: action, log-probability, and the state of the policy before it. So the row is whole wherever
+Rule: a seat's row is the one in which its outcome comes (`millrace.protocol.envs.seats`). Until then each row repeats what
+was written when the seat acted: action, log-probability, and the state of the policy before it. So the row is whole wherever
 rollouts are cut, and a rollout may hold an action that older weights chose, with its log-probability under those.
 """
 

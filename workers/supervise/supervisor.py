@@ -297,5 +297,5 @@ class Supervisor:
 
 
 def core_flags(cores: Sequence[int], name: str) -> list[str]:
-    """Flags of `python -m workers` that pin worker w0, w1, … to one of these cores, in turn. None if there are no cores."""
+    """Flags of a worker that pin worker w0, w1, … to one of these cores, in turn. None if there are no cores."""
     return ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []

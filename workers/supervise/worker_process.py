@@ -56,7 +56,7 @@ class WorkerCommand:
     """File for the worker's stderr. None: the supervisor's own stderr."""
     token: Token | None = None
     flags: Sequence[str] = ()
-    """Further flags of `python -m workers`."""
+    """Further flags of `python -m millrace.workers`."""
     handed: Sequence[int] = ()
     """File descriptors that these flags name, which the worker inherits."""
 
@@ -75,11 +75,11 @@ class WorkerProcess:
         self._exit_code: int | None = None  # of the worker; what it started may not be gone yet
         self._give_up_at_s = float("inf")
         self._was_reaped = False  # by the system: then its exit code is not known
-        command = [sys.executable, "-P", "-m", "workers", start.address, "--name", start.name]
+        command = [sys.executable, "-P", "-m", "millrace.workers", start.address, "--name", start.name]
         command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd)]
         command += ["--slots", str(self._slots), *start.flags]
         # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
-        path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[2])])
+        path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[3])])
         # A token that this program has not given the worker is not for this learner.
         environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
         environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}

@@ -1,7 +1,8 @@
 """The env copies of one lane of a vector environment with seats: N · A rows, those of a copy side by side.
 
-Rule: rows are, bit for bit, those of a loop over the same copies (`millrace.protocol.envs.seats`). With SameStep, the step in which a
-copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the old ones.
+Rule: rows are, bit for bit, those of a loop over the same copies (`millrace.protocol.envs.seats`). With SameStep, the step
+in which a copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the old
+ones.
 """
 
 from __future__ import annotations

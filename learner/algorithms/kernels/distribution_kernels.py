@@ -1,8 +1,8 @@
 """What a small network makes of an actor's output: log-probabilities and entropies of actions, or actions, in numpy.
 
-Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding. They save
-0.1 ms of a minibatch of 64 rows: autograd needs a dozen nodes. Arrays are [P, B], a column for each of B rows. `forward`
-keeps what `backward` needs.
+Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding.
+They save 0.1 ms of a minibatch of 64 rows: autograd needs a dozen nodes. Arrays are [P, B], a column for each of B rows.
+`forward` keeps what `backward` needs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A vector environment with seats gives, to the bit, what a loop over `millrace.protocol.envs.seats` gives, in any order and mode."""
+"""A vector environment with seats is, to the bit, what a loop over `protocol/envs/seats.py` is, in any order and mode."""
 
 from __future__ import annotations
 

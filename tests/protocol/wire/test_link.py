@@ -356,7 +356,7 @@ def test_a_worker_too_counts_the_frames(tcp: Ends) -> None:
 
 
 def test_a_frame_above_the_limit_is_not_received_and_the_learner_lives(tcp: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol.wire.socket_options, "MAX_FRAME_BYTES", 10_000)
+    monkeypatch.setattr(millrace.protocol.wire.socket_options, "MAX_FRAME_BYTES", 10_000)
     learner = tcp.learner()
     worker = tcp.worker(learner)
     joined(learner, worker)

@@ -217,7 +217,7 @@ def interrupted_in_an_update(
     Returns its folder, and the seconds from the signal to the end, by the same clock.
     """
     differentiate, clock = PPO.differentiate, [1000.0]
-    monkeypatch.setattr(learner.interrupts, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(millrace.learner.interrupts, "monotonic", lambda: clock[0])
     began: list[float] = []
 
     def slow(self: PPO, *given: Any) -> dict[str, float]:
@@ -261,7 +261,7 @@ def test_without_a_grace_time_an_update_takes_what_it_takes(tmp_path: Path, monk
 
 def test_time_that_saving_needs_is_not_given_to_the_update(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(learner.interrupts, "monotonic", lambda: now[0])
+    monkeypatch.setattr(millrace.learner.interrupts, "monotonic", lambda: now[0])
     with Interrupts(20.0) as interrupts:
         assert interrupts.at_most(5.0) == 5
         assert not interrupts.time_is_up(1e9)

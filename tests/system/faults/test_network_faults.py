@@ -239,7 +239,8 @@ def test_training_goes_on_while_peers_send_invalid_data(stage: Stage) -> None:
 def test_a_worker_of_another_protocol_version_is_refused(stage: Stage) -> None:
     learner, workers = play(stage)
     address = learner.hears("waiting for workers").split()[-1]
-    newer = "import sys, millrace.workers.conversation.session as s, millrace.workers.__main__ as m; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"
+    imports = "import sys, millrace.workers.conversation.session as s, millrace.workers.__main__ as m"
+    newer = f"{imports}; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"
     as_worker = ["--name", "newer", "--parent", str(os.getpid())]  # its supervisor would start one of this version
     stranger = stage.start([sys.executable, "-c", newer, address, *as_worker], "newer")
     assert stranger.ends() == 2

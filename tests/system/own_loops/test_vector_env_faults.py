@@ -35,6 +35,7 @@ from tests.system.stage.processes import START_S, Worker, free_port, wait_for
 SHARED_MEMORY = {"shared": True, "messages": False}
 ZEROS = np.zeros(4, np.int64)
 CLOSES_WITHIN_S = 8.0
+HANGS = "millrace.workers.envs.toy:Hangs-v0"
 
 
 @pytest.fixture(params=SHARED_MEMORY)
@@ -204,7 +205,7 @@ def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
 @pytest.mark.parametrize("loss", ["truncate", "raise"])
 def test_a_worker_whose_environment_hangs_is_lost_at_the_deadline(tmp_path: Path, loss: str) -> None:
     once = str(tmp_path / "once")
-    env = make("millrace.workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
+    env = make(HANGS, after=1, once=once, timeout=1.5, on_worker_loss=loss)
     env.reset(seed=1)
     env.step(ZEROS)
     began = time.monotonic()
@@ -220,7 +221,7 @@ def test_a_worker_whose_environment_hangs_is_lost_at_the_deadline(tmp_path: Path
 
 
 def test_close_returns_while_an_environment_hangs() -> None:
-    env = make("millrace.workers.envs.toy:Hangs-v0", after=0)
+    env = make(HANGS, after=0)
     env.reset(seed=1)
     env.step_async(ZEROS)
     close_and_check(env)
@@ -253,7 +254,7 @@ def test_a_reset_is_repeated_when_workers_are_lost() -> None:
 
 
 def test_a_loop_by_recv_does_not_wait_for_a_copy_that_hangs(tmp_path: Path, shared_memory: bool) -> None:
-    env = make("millrace.workers.envs.toy:Hangs-v0", after=1, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
+    env = make(HANGS, after=1, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
                timeout=60.0, shared_memory=shared_memory)  # fmt: skip
     env.reset_async(seed=1)
     rows = dict.fromkeys(range(4), 0)
@@ -269,7 +270,7 @@ def test_a_loop_by_recv_does_not_wait_for_a_copy_that_hangs(tmp_path: Path, shar
 
 
 def test_recv_reports_a_worker_that_is_killed_or_hangs_and_goes_on(tmp_path: Path, shared_memory: bool) -> None:
-    env = make("millrace.workers.envs.toy:Hangs-v0", after=3, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
+    env = make(HANGS, after=3, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
                timeout=10.0, shared_memory=shared_memory)  # fmt: skip
     env.reset_async(seed=1)
     local_workers()[3].kill()  # perhaps during its reset, which is then repeated
@@ -295,7 +296,7 @@ def test_recv_reports_a_worker_that_is_killed_or_hangs_and_goes_on(tmp_path: Pat
 
 
 def test_close_does_not_wait_for_what_was_sent() -> None:
-    env = make("millrace.workers.envs.toy:Hangs-v0", after=0, workers=4, lanes=4)
+    env = make(HANGS, after=0, workers=4, lanes=4)
     env.reset_async(seed=1)
     env.recv(4)
     env.send(ZEROS)
@@ -387,7 +388,7 @@ class Elsewhere:
         self._said = folder / "said"
 
     def start(self, name: str, *flags: str) -> None:
-        command = [sys.executable, "-m", "workers", self.address, "--name", name, *flags]
+        command = [sys.executable, "-m", "millrace.workers", self.address, "--name", name, *flags]
         self.started.append(Worker(command, self._said))
 
     def said(self) -> str:
@@ -488,7 +489,7 @@ def test_a_worker_whose_step_hangs_is_ended_and_another_gets_its_lane(
 ) -> None:
     monkeypatch.setattr(vector, "_call_timeouts", lambda timeout_s: CallTimeouts(60.0, 3.0))
     elsewhere.start("h", "--processes", "2")
-    with make("millrace.workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
+    with make(HANGS, workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
               timeout=60.0) as env:  # fmt: skip
         env.reset(seed=1)
         env.step(ZEROS)

@@ -22,8 +22,9 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 IMPORTED = (
     "millrace.cli.main", "millrace.launch.training", "millrace.launch.learner_inference",
-    "millrace.learner.train", "millrace.learner.run_spec", "millrace.learner.run_state", "millrace.learner.torch_setup", "millrace.learner.algorithms.ppo",
-    "millrace.learner.algorithms.dqn", "millrace.learner.algorithms.a2c", "millrace.learner.algorithms.impala", "millrace.learner.algorithms.reinforce",
+    "millrace.learner.train", "millrace.learner.run_spec", "millrace.learner.run_state", "millrace.learner.torch_setup",
+    "millrace.learner.algorithms.ppo", "millrace.learner.algorithms.dqn", "millrace.learner.algorithms.a2c",
+    "millrace.learner.algorithms.impala", "millrace.learner.algorithms.reinforce",
     "tensorboard.compat.proto.event_pb2", "tensorboard.summary.writer.record_writer", "safetensors.numpy",
 )  # fmt: skip
 P = ParamSpec("P")

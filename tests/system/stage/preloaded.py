@@ -29,8 +29,8 @@ from millrace.workers.supervise.worker_process import NONCE_VARIABLE
 PROGRAM = Path(__file__).with_name("preloaded_parent.py")
 LEARNERS = (["millrace", "train"], ["millrace", "learner"], ["millrace", "evaluate"], ["millrace", "record"])
 """Modules, and their first argument: what the parent with PyTorch forks."""
-WITHOUT_PYTORCH = (["workers"], ["millrace", "worker"], ["millrace", "status"], ["millrace", "keys"])
-WORKER = ["-P", "-m", "workers"]  # as a supervisor starts it
+WITHOUT_PYTORCH = (["millrace.workers"], ["millrace", "worker"], ["millrace", "status"], ["millrace", "keys"])
+WORKER = ["-P", "-m", "millrace.workers"]  # as a supervisor starts it
 PER_COMMAND = {
     "COLUMNS", "HOME", "MILLRACE_KEYS", "MILLRACE_SLOTS", "MILLRACE_TOKEN", "MILLRACE_TOY_SLEEPS_S",
     "MINARI_DATASETS_PATH", "MPLBACKEND", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED",

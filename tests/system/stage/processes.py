@@ -148,7 +148,7 @@ class Running:
 
 
 class Worker(Running):
-    """`python -m workers` with one worker: a supervisor and its child. A fault happens to both, as to a whole host."""
+    """`python -m millrace.workers` with one worker: a supervisor and its child. A fault hits both, as to a whole host."""
 
     def processes(self) -> list[psutil.Process]:
         """The supervisor and its children."""
@@ -307,8 +307,8 @@ class Stage:
         return learner
 
     def worker(self, address: str, name: str, *flags: str, before: Sequence[str] = ()) -> Worker:
-        """Start `python -m workers` for the learner at this address."""
-        command = [*before, *self._recording, sys.executable, "-m", "workers", address, "--name", name, *flags]
+        """Start `python -m millrace.workers` for the learner at this address."""
+        command = [*before, *self._recording, sys.executable, "-m", "millrace.workers", address, "--name", name, *flags]
         worker = Worker(command, self.tmp_path / f"{name}-{next(self._numbers)}.log")
         self.started.append(worker)
         return worker

@@ -224,8 +224,8 @@ def test_only_commands_of_ours_whose_environment_is_the_parents_are_forked(
     learner = [sys.executable, "-m", "millrace", "learner", "CartPole-v1"]
     changed = {name for name in {*os.environ, *ENVIRONMENT} if os.environ.get(name) != ENVIRONMENT.get(name)}
     assert may_be_forked(learner), changed
-    assert may_be_forked([sys.executable, "-m", "workers", "x"])
-    assert may_be_forked([sys.executable, "-P", "-m", "workers", "x"])
+    assert may_be_forked([sys.executable, "-m", "millrace.workers", "x"])
+    assert may_be_forked([sys.executable, "-P", "-m", "millrace.workers", "x"])
     assert may_be_forked([sys.executable, "-m", "millrace", "train"], {**os.environ, "PYTHONPATH": "x", "TMPDIR": "/x"})
     for command in ("worker", "status", "keys"):
         assert may_be_forked([sys.executable, "-m", "millrace", command, "x"])

@@ -371,7 +371,9 @@ def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None
     flags = ["CartPole-v1", "--bind", address, "--min-workers", "2", "--steps", "2000", "--eval-episodes", "2"]
     command = [sys.executable, "-m", "millrace", "learner", *flags, "--run-dir", str(tmp_path / "runs")]
     learner = preloaded.start(command, stderr=subprocess.PIPE)
-    workers = [preloaded.start([sys.executable, "-m", "workers", address], stderr=subprocess.PIPE) for _ in range(2)]
+    workers = [
+        preloaded.start([sys.executable, "-m", "millrace.workers", address], stderr=subprocess.PIPE) for _ in range(2)
+    ]
     _, said = learner.communicate(timeout=60)
     assert learner.returncode == 0, said
     for worker in workers:
@@ -384,7 +386,7 @@ def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None
 
 
 def test_a_worker_without_a_learner_says_that_nobody_answers(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "workers", f"ipc://{tmp_path}/nobody", "--join-timeout-s", "0.5"]
+    command = [sys.executable, "-m", "millrace.workers", f"ipc://{tmp_path}/nobody", "--join-timeout-s", "0.5"]
     worker = preloaded.run(command, timeout=30)
     assert worker.returncode == 1
     assert worker.stderr.count("\n") == 1

@@ -71,7 +71,7 @@ def test_the_commands_of_the_manifest_train(capsys: pytest.CaptureFixture[str], 
         done = preloaded.run([*program, *asks], timeout=60, env={**os.environ, "PYTHONPATH": "."})
         assert done.returncode == 0, done.stderr
     (worker,) = found["Deployment"]["spec"]["template"]["spec"]["containers"]
-    command = [*with_variables(worker, secret), sys.executable, "-m", "workers", *worker["args"]]
+    command = [*with_variables(worker, secret), sys.executable, "-m", "millrace.workers", *worker["args"]]
     workers = [stage.start(command, f"w{number}") for number in range(found["Deployment"]["spec"]["replicas"])]
     assert started.ends(START_S) == 0, started.said()
     for each in workers:

@@ -1,0 +1,76 @@
+"""Finds out, when `millrace` is imported, whether an installed package is too old for it. Nothing is imported for it."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Oldest(NamedTuple):
+    """The oldest version of a package that millrace works with."""
+
+    version: tuple[int, int]
+    file: str
+    """the file of the package that has its version"""
+    asked_by: str
+    """who may have asked for an older one"""
+
+
+OLDEST = {
+    "gymnasium": Oldest((1, 1), "__init__.py", "a package of environments"),
+    "numpy": Oldest((2, 0), "version.py", "another package"),  # before, a uint64 and an int together were a float
+}
+VERSION = re.compile(r"""^(?:__version__|version) *= *["'](\d+\.\d+[\d.]*)""", re.MULTILINE)
+
+
+class PackageTooOld(ImportError):
+    """A package is older than millrace can work with."""
+
+
+def check_versions() -> None:
+    """Check the versions in `OLDEST`. Raises `PackageTooOld`.
+
+    On the command line, no caller could handle the error, so the process ends with one line and exit code 2.
+    """
+    for name, oldest in OLDEST.items():
+        line = _too_old(name, oldest)
+        if not line:
+            continue
+        # With `python -m`, argv[0] is "-m" while it looks for the module.
+        if sys.argv and Path(sys.argv[0]).name in ("-m", "millrace"):
+            sys.stderr.write(f"millrace: {line}\n")
+            sys.exit(2)
+        raise PackageTooOld(line, name=name)
+
+
+def _too_old(name: str, oldest: Oldest) -> str:
+    """A line if the installed package is too old; else nothing, also if there is none.
+
+    Its version is read in its source text: `importlib.metadata` takes a third of the time of `import millrace`.
+    """
+    folder = _folder(name)
+    try:
+        text = "" if folder is None else (folder / oldest.file).read_text("utf-8", "replace")
+    except OSError:
+        text = ""
+    written = VERSION.search(text)
+    if written is None or tuple(map(int, written[1].split(".")[:2])) >= oldest.version:
+        return ""
+    wanted = ".".join(map(str, oldest.version))
+    return (
+        f"{name} {written[1]} is too old, perhaps because {oldest.asked_by} asked for it: pip install '{name}>={wanted}', "
+        "and a version of that package that allows it; or give that package a Python of its own, as under 'An older "
+        "gymnasium' in docs/how-to/third_party_environments.md"
+    )
+
+
+def _folder(name: str) -> Path | None:
+    """The folder of the package that `import NAME` takes, or has taken; None if there is none."""
+    module = sys.modules.get(name)
+    spec = getattr(module, "__spec__", None) if module is not None else importlib.util.find_spec(name)
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    return Path(next(iter(spec.submodule_search_locations)))
