@@ -18,22 +18,27 @@ from pathlib import Path, PurePosixPath
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
-PACKAGES = ("millrace", "learner", "workers", "protocol")
+PARTS = ("learner", "workers", "protocol")
+"""packages of millrace that stand beside its folder in the repository, which has links to them"""
+PACKAGES = ("millrace", *(f"millrace/{part}" for part in PARTS))
 TRAINING = ["CartPole-v1", "--steps", "20000", "--workers", "1", "--eval-episodes", "2", "--run-dir", "runs"]
 
 
 def data_files() -> set[str]:
-    """The files of the packages that are no Python: a distribution must have all of them."""
-    tracked = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    return {path for path in tracked.splitlines() if not path.endswith((".py", ".md"))}
+    """The files of the packages that are no Python, as a distribution must have them."""
+    tracked = subprocess.run(["git", "ls-files", "millrace", *PARTS], cwd=ROOT, capture_output=True, text=True, check=True)
+    paths = {path for path in tracked.stdout.splitlines() if not path.endswith((".py", ".md"))} - {*PACKAGES}
+    return {path if path.startswith("millrace/") else f"millrace/{path}" for path in paths}
 
 
 def mistakes(names: set[str], data: set[str]) -> list[str]:
     """What is wrong with the files of a distribution, by their paths in it."""
     missing = sorted({*data, *(f"{package}/__init__.py" for package in PACKAGES)} - names)
     tests = sorted(name for name in names if PurePosixPath(name).parts[0] in ("tests", "benchmarks", "website", ".ci"))
+    bare = sorted(name for name in names if PurePosixPath(name).parts[0] in PARTS)
     lines = [f"{name} is missing" for name in missing]
-    return lines + [f"{name}: expected no tests, benchmarks or site, got this file" for name in tests[:1]]
+    lines += [f"{name}: expected no tests, benchmarks or site, got this file" for name in tests[:1]]
+    return lines + [f"{name}: expected it below millrace/ alone" for name in bare[:1]]
 
 
 def names_in(distribution: Path) -> set[str]:

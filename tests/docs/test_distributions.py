@@ -11,10 +11,12 @@ from tests.distributions import PACKAGES, ROOT, data_files, mistakes
 
 
 def test_the_packages_have_data_that_must_travel() -> None:
-    assert {*(f"{package}/py.typed" for package in PACKAGES), "learner/config/presets.toml"} <= data_files()
+    assert {*(f"{package}/py.typed" for package in PACKAGES), "millrace/learner/config/presets.toml"} <= data_files()
 
 
-@pytest.mark.parametrize("lost", ["millrace/py.typed", "learner/config/presets.toml", "workers/__init__.py"])
+@pytest.mark.parametrize(
+    "lost", ["millrace/py.typed", "millrace/learner/config/presets.toml", "millrace/workers/__init__.py"]
+)
 def test_a_file_that_is_missing_is_named(lost: str) -> None:
     whole = {*data_files(), *(f"{package}/__init__.py" for package in PACKAGES)}
     assert mistakes(whole, data_files()) == []
@@ -25,6 +27,13 @@ def test_tests_in_a_distribution_are_named() -> None:
     whole = {*data_files(), *(f"{package}/__init__.py" for package in PACKAGES)}
     (line,) = mistakes({*whole, "tests/conftest.py", "tests/versions.py"}, data_files())
     assert line.startswith("tests/conftest.py: expected no tests")
+
+
+def test_a_package_that_is_not_below_millrace_is_named() -> None:
+    whole = {*data_files(), *(f"{package}/__init__.py" for package in PACKAGES)}
+    assert mistakes({*whole, "learner/__init__.py"}, data_files()) == [
+        "learner/__init__.py: expected it below millrace/ alone"
+    ]
 
 
 def version() -> str:
