@@ -90,8 +90,9 @@ from millrace.learner.config.hyperparameters import (
 )
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.features import features
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, trainable
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.rollout import Batch

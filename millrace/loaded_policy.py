@@ -18,7 +18,7 @@ import numpy.typing as npt
 from millrace.arguments import checked
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.errors import UsageError, check_at_least
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice

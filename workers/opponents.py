@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools
-from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.messages import Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.policy import Policy, make_policy

@@ -21,8 +21,9 @@ from msgspec.structs import replace
 
 from millrace.learner.algorithms.returns import EpisodeEnds, discounted_return
 from millrace.protocol.arrays import Array, Doubles, Floats
-from millrace.protocol.policy.features import CLIP, feature_size, features, leaf_of_features, normalize
+from millrace.protocol.policy.features import feature_size, features, leaf_of_features
 from millrace.protocol.policy.layout import buffer_size
+from millrace.protocol.policy.normalize import CLIP, normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 

@@ -14,7 +14,8 @@ import torch
 from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.features import feature_size, features, normalize
+from millrace.protocol.policy.features import feature_size, features
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 

@@ -12,7 +12,7 @@ from millrace.learner.policy_player import PolicyPlayer
 from millrace.learner.recording.episodes import RecordedEpisode
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from millrace.protocol.arrays import Array
-from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.random_streams import Purpose, env_seed
 

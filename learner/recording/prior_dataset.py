@@ -16,7 +16,7 @@ import numpy as np
 from millrace.learner.recording.dataset_files import DatasetFiles
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
-from millrace.protocol.envs.spaces import stored_actions_of
+from millrace.protocol.envs.env_actions import stored_actions_of
 from millrace.protocol.errors import UsageError
 from millrace.protocol.rollout import Batch
 from millrace.protocol.rows.array_checks import wrong_values

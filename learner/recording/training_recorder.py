@@ -12,7 +12,7 @@ from millrace.learner.recording.minari import MinariDataset
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.description import DescribedEnv
-from millrace.protocol.envs.spaces import action_converter_of
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.errors import RunError
 from millrace.protocol.specs import RunSpec
 

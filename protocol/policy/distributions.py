@@ -6,11 +6,8 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
-    EpsilonGreedy P = n + 1     action values, ε; action = uniform at random where noise₀ < ε, else argmax
-    Squashed      P = 2 D + 1   mean, log standard deviation, warm-up; action = tanh(mean + exp(log_std) · normal noise)
-    Deterministic P = D + 2     output, noise scale, warm-up; action = tanh(output) + scale · normal noise, clipped to ±1
 
-The warm-up number is 1 or 0. While it is 1, the actions of the last two are uniform in [-1, 1].
+Those of DQN, SAC and TD3, which explore by numbers that the learner sends, stand in `exploration.py`.
 
 `millrace.protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares
 them.
@@ -24,10 +21,8 @@ from typing import Protocol
 import numpy as np
 
 from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.policy.exploration import LOG_SQRT_2PI, TINY, Deterministic, EpsilonGreedy, Squashed
 from millrace.protocol.specs import PolicySpec
-
-LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-_TINY = np.float32(1e-30)
 
 
 class Distribution(Protocol):
@@ -64,7 +59,7 @@ class Categorical:
     def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
         """Gumbel(0, 1) noise [*shape, P]."""
         exponential = generator.standard_exponential((*shape, self.params_size), dtype=np.float32)
-        return -np.log(np.maximum(exponential, _TINY))
+        return -np.log(np.maximum(exponential, TINY))
 
     def sample(self, params: Floats, noise: Floats) -> Array:
         """A sample, int64 from 0."""
@@ -142,113 +137,6 @@ class Gaussian:
         mean, log_std = params[..., : self._size], params[..., self._size :]
         z = (action.reshape(mean.shape) - mean) * np.exp(-log_std)
         return np.asarray((np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)).sum(-1))
-
-
-class EpsilonGreedy:
-    """The action with the highest value, or with probability ε an action drawn uniformly (Discrete)."""
-
-    def __init__(self, actions: int) -> None:
-        self.params_size = actions + 1
-        self._actions = actions
-
-    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-        """Uniform(0, 1) noise [*shape, 2]: whether to explore, and which action."""
-        return generator.random((*shape, 2), dtype=np.float32)
-
-    def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample, int64 from 0."""
-        uniform = (noise[..., 1] * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
-        return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
-
-    def mode(self, params: Floats) -> Array:
-        """The action with the highest value."""
-        return np.asarray(params[..., :-1].argmax(-1))
-
-    def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """log(ε / n + (1 − ε) [action is the best]) [...], at least −69."""
-        epsilon = params[..., -1]
-        chance = epsilon / np.float32(self._actions) + (1 - epsilon) * (action == self.mode(params))
-        return np.asarray(np.log(np.maximum(chance, _TINY)), np.float32)
-
-
-class _Bounded:
-    """What the two kinds of actions in [-1, 1] share. Noise [*shape, 2 D]: normal numbers, then uniform ones in [-1, 1]."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self._size = math.prod(shape)
-        self._shape = shape
-
-    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-        """Normal(0, 1) and Uniform(-1, 1) noise [*shape, 2 D]."""
-        noise = np.empty((*shape, 2 * self._size), np.float32)
-        noise[..., : self._size] = generator.standard_normal((*shape, self._size), dtype=np.float32)
-        noise[..., self._size :] = 2 * generator.random((*shape, self._size), dtype=np.float32) - 1
-        return noise
-
-    def _or_uniform(self, params: Floats, noise: Floats, action: Floats) -> Array:
-        """The action [..., D] in its shape; a uniform one where the warm-up lasts."""
-        chosen = np.where(params[..., -1:] > 0, noise[..., self._size :], action)
-        return chosen.reshape(*params.shape[:-1], *self._shape)
-
-
-class Squashed(_Bounded):
-    """The hyperbolic tangent of a diagonal normal distribution (bounded Box). Actions are in [-1, 1]."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        super().__init__(shape)
-        self.params_size = 2 * self._size + 1
-
-    def _latent(self, params: Floats, noise: Floats) -> Floats:
-        """[..., D] the action before the tangent."""
-        mean, log_std = params[..., : self._size], params[..., self._size : -1]
-        return np.asarray(mean + np.exp(log_std) * noise[..., : self._size])
-
-    def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample, float32."""
-        return self._or_uniform(params, noise, np.tanh(self._latent(params, noise)))
-
-    def mode(self, params: Floats) -> Array:
-        """The hyperbolic tangent of the mean."""
-        return np.tanh(params[..., : self._size]).reshape(*params.shape[:-1], *self._shape)
-
-    def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """Log-density [...] in [-1, 1]^D: of the normal distribution, less log(1 − tanh²), summed; −D log 2 in the warm-up.
-
-        It is computed from the noise: an action near ±1 does not tell where in the normal distribution it came from.
-        Raises ValueError without noise.
-        """
-        if noise is None:
-            raise ValueError("log_prob of a squashed action: expected the noise that it was sampled with, got none")
-        z, log_std = noise[..., : self._size], params[..., self._size : -1]
-        normal = np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)
-        found = (normal - log_tanh_slope(self._latent(params, noise))).sum(-1)
-        return np.where(params[..., -1] > 0, np.float32(-self._size * math.log(2)), found)
-
-
-class Deterministic(_Bounded):
-    """One action for each observation, with normal noise while it explores (bounded Box). Actions are in [-1, 1]."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        super().__init__(shape)
-        self.params_size = self._size + 2
-
-    def sample(self, params: Floats, noise: Floats) -> Array:
-        """The action with noise, clipped to ±1, float32."""
-        action = np.tanh(params[..., : self._size]) + params[..., -2:-1] * noise[..., : self._size]
-        return self._or_uniform(params, noise, np.clip(action, -1, 1))
-
-    def mode(self, params: Floats) -> Array:
-        """The action without noise."""
-        return np.tanh(params[..., : self._size]).reshape(*params.shape[:-1], *self._shape)
-
-    def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """Zeros [...]: clipped noise has no density."""
-        return np.zeros(params.shape[:-1], np.float32)
-
-
-def log_tanh_slope(x: Floats) -> Floats:
-    """Log(1 − tanh²(x)) = 2 (log 2 − x − softplus(−2x)), which is exact for every x."""
-    return np.asarray(2 * (np.float32(math.log(2)) - x - np.logaddexp(np.float32(0), -2 * x)))
 
 
 def distribution(spec: PolicySpec) -> Distribution:

@@ -11,10 +11,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from millrace.protocol.arrays import Array, Doubles, Floats
+from millrace.protocol.arrays import Array
 from millrace.protocol.specs import Leaf, PolicySpec
-
-CLIP = np.float32(10.0)  # normalized observations are clipped to ±10
 
 
 def feature_size(spec: PolicySpec) -> int:
@@ -69,11 +67,3 @@ def _one_hot_values(leaf: Leaf) -> Array:
 def leaf_of_features(spec: PolicySpec) -> list[Leaf]:
     """The leaf that each of the D features belongs to. Only features of a Box are normalized."""
     return [leaf for leaf in spec.observation if not leaf.is_image for _ in range(_leaf_features(leaf))]
-
-
-def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:
-    """(x − mean) / std, clipped to ±10, float32. It is computed in the dtype of x.
-
-    So a wide observation keeps the digits by which it differs from the mean, however large both are.
-    """
-    return np.asarray(np.clip((x - mean) / std, -CLIP, CLIP)).astype(np.float32, copy=False)

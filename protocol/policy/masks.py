@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.policy.distributions import Distribution, EpsilonGreedy, distribution
+from millrace.protocol.policy.distributions import Distribution, distribution
+from millrace.protocol.policy.exploration import EpsilonGreedy
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 
 MASK = "action_mask"  # the key in `info`, or in a Dict observation

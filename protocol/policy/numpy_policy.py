@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from millrace.protocol.arrays import Array, Floats
-from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.features import features
 from millrace.protocol.policy.layout import (
     LOG_STD_BOUNDS,
     appended_params,
@@ -22,6 +22,7 @@ from millrace.protocol.policy.layout import (
     parameter_layout,
     total_size,
 )
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.recurrent import advance, zero_state
 from millrace.protocol.specs import PolicySpec
 

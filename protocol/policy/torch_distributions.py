@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from millrace.protocol.policy.distributions import LOG_SQRT_2PI
+from millrace.protocol.policy.exploration import LOG_SQRT_2PI
 from millrace.protocol.specs import ActionSpec, PolicySpec
 
 LOG_2 = math.log(2)

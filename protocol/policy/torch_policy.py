@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from millrace.protocol.arrays import Array, Floats
-from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.features import features
 from millrace.protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views
 from millrace.protocol.policy.networks import ActorCriticNetwork, defaults_of_thread, network_of
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.specs import PolicySpec
 from millrace.protocol.wire.weight_dtypes import ActingDtype

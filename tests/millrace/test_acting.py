@@ -19,7 +19,8 @@ from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.spaces import make_action_converter, make_unflatten
+from millrace.protocol.envs.env_actions import make_action_converter
+from millrace.protocol.envs.spaces import make_unflatten
 from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.specs import RunSpec
 from tests.support.in_process.collectors import TOY, random_weights, run_of

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.bounds import Stages
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.envpool import envpool_spec
-from millrace.protocol.envs.spaces import action_converter_of
 from millrace.protocol.envs.vectorized import make_native
 from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.errors import EnvironmentFailed, PolicyFailed

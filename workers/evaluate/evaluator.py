@@ -18,8 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from millrace.protocol.arrays import Array
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.seats import columns_of
-from millrace.protocol.envs.spaces import action_converter_of
 from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.errors import UsageError
 from millrace.protocol.messages import Evaluate, Evaluated, Weights

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools
-from millrace.protocol.policy.distributions import LOG_SQRT_2PI
+from millrace.protocol.policy.exploration import LOG_SQRT_2PI
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS
 from millrace.protocol.policy.masks import FORBIDDEN
 from millrace.protocol.specs import ActionSpec

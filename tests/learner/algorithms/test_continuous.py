@@ -24,10 +24,12 @@ from millrace.learner.algorithms.replay.off_policy import Transitions
 from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.arrays import Floats
-from millrace.protocol.envs.spaces import action_converter_of, action_spec
+from millrace.protocol.envs.env_actions import action_converter_of
+from millrace.protocol.envs.spaces import action_spec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy import networks
-from millrace.protocol.policy.distributions import Deterministic, Squashed, distribution
+from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.exploration import Deterministic, Squashed
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS, named_views
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_distributions import squashed_sample

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from millrace.learner.algorithms.normalization import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
 from millrace.protocol.arrays import Array
-from millrace.protocol.policy.features import normalize
 from millrace.protocol.policy.layout import buffer_size
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 

@@ -23,7 +23,8 @@ from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import DQNConfig, PPOConfig
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
+from millrace.protocol.envs.env_actions import make_action_converter
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.policy import make_policy

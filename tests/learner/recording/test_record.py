@@ -29,7 +29,8 @@ from millrace.learner.recording.training_recorder import TrainingRecorder
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
+from millrace.protocol.envs.env_actions import make_action_converter
+from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.layout import acting_size, buffer_size

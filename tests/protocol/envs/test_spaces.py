@@ -13,7 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from millrace.protocol.arrays import Array
-from millrace.protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
+from millrace.protocol.envs.env_actions import make_action_converter
+from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from millrace.protocol.errors import BadRollout, UsageError
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.rows.rollout_checks import validate, wrong_facts

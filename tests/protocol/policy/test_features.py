@@ -19,8 +19,9 @@ from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import observation_leaves
-from millrace.protocol.policy.features import feature_size, features, normalize
+from millrace.protocol.policy.features import feature_size, features
 from millrace.protocol.policy.layout import acting_size, buffer_size, convolutions
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import stack_rollouts
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.distributions import distribution
-from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.features import features
 from millrace.protocol.policy.layout import buffer_size, convolutions, parameter_layout, total_size
 from millrace.protocol.policy.networks import ActorCriticNetwork, MLPNode
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
 from millrace.protocol.policy.torch_policy import TorchPolicy

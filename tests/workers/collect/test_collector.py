@@ -18,8 +18,9 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.distributions import distribution
-from millrace.protocol.policy.features import features, normalize
+from millrace.protocol.policy.features import features
 from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.specs import Leaf, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment

@@ -16,7 +16,7 @@ from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import RunError
-from millrace.protocol.policy.distributions import Squashed
+from millrace.protocol.policy.exploration import Squashed
 from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
