@@ -57,6 +57,7 @@ class OpenRun:
     """A learner that listens to workers and has not begun to train. `open_run` makes it."""
 
     setup: RunSetup
+    policy: PolicySpec
     algorithm: Algorithm
     hub: Hub
     between: BetweenUpdates
@@ -89,7 +90,7 @@ class OpenRun:
                 self._learn_from_prior(self.prior)
             config = self.setup.config
             cores = CrowdedCores((config.torch_threads or 1) if torch_device(config) == "cpu" else 0)
-            train(self.algorithm, self.hub, self.between, workers, self._check_time, cores)
+            train(self.algorithm, self.policy, self.hub, self.between, workers, self._check_time, cores)
         except RunTakenOver as error:
             self.hub.drain(str(error), timeout_s=DRAIN_S)
             raise
@@ -169,7 +170,7 @@ def open_run(
     tally = Tally(config, spec, state, lambda: callbacks.stop_reason, pool)
     parts = RunParts(config, spec, folder, algorithm, hub, tally)
     between = open_files(parts, callbacks, dataset, setup.known.evaluation_limit)
-    run = OpenRun(setup, algorithm, hub, between, prior)
+    run = OpenRun(setup, spec.policy, algorithm, hub, between, prior)
     hub.report_progress(between.audience.progress())
     if setup.resumed:
         log_notice(log, between.files.continues())

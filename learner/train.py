@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from millrace.learner.algorithms import Algorithm
-from millrace.learner.algorithms.algorithm import numbers
+from millrace.learner.algorithms.algorithm import acting_weights, numbers
 from millrace.learner.between_updates.between_updates import BetweenUpdates
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.rollouts.hub import Hub
@@ -27,12 +27,14 @@ from millrace.learner.run_folder.progress import Row
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import RunError
 from millrace.protocol.rollout import stack_rollouts
+from millrace.protocol.specs import PolicySpec
 
 ADVICE = "try a lower learning_rate, or normalize_observations"
 
 
 def train(
     algorithm: Algorithm,
+    policy: PolicySpec,
     hub: Hub,
     between: BetweenUpdates,
     workers: int,
@@ -41,10 +43,11 @@ def train(
 ) -> str:
     """Train until the tally gives a reason to stop. Returns that reason.
 
-    `workers`: number of workers to wait for before the first rollout. If the run cannot go on (no worker is left, the
-    environment raised too often, the user interrupted the run, a loss is not finite, the user's code raised), the state
-    after the last whole update is saved. Then the error is raised. `check_time` is called between gradient steps: what it
-    raises takes the update back. `cores` watches the updates.
+    `policy`: what acts with the weights of the algorithm. `workers`: number of workers to wait for before the first rollout.
+    `check_time` is called between gradient steps: what it raises takes the update back. `cores` watches the updates.
+
+    If the run cannot go on (no worker is left, the environment raised too often, the user interrupted the run, a loss is not
+    finite, the user's code raised), the state after the last whole update is saved. Then the error is raised.
     """
     tally, files, audience, evaluations = between
     cores = cores or CrowdedCores(0)
@@ -68,7 +71,7 @@ def train(
         hub.wait_for(workers)
         audience.start()
         tell(evaluations.begin_again(audience.env_attributes(), audience.show_now))
-        publish(files.weights())
+        publish(acting_weights(algorithm, policy))
         if tally.evaluation_is_due():  # the run was interrupted before it
             tell(evaluations.evaluate_when_due(audience.show_now))
         while (reason := tally.stop_reason()) is None:
@@ -81,7 +84,7 @@ def train(
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
                 with cores.watching():
                     metrics = numbers(algorithm.update(batch, pulse), type(algorithm).__name__)
-                weights = files.weights()
+                weights = acting_weights(algorithm, policy)
                 if not algorithm.is_finite():
                     raise RunError(f"learner: update {tally.state.version}: the weights are not finite after it; {ADVICE}")
             tally.count(batch)

@@ -186,7 +186,10 @@ def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
             yield f"weights: {name}: expected float32[{size}], got {array.dtype}{list(array.shape)}"
 
 
-def check_weights(weights: Any, policy: PolicySpec, who: str) -> None:
-    """Raise `UsageError` for weights that no worker could act with. `who`: the class of the algorithm."""
+def acting_weights(algorithm: Algorithm, policy: PolicySpec) -> tuple[Floats, Floats]:
+    """The parameters and buffers with which workers act. Raises `UsageError` if no worker could act with them."""
+    weights = algorithm.weights()
     if why := next(wrong_weights(weights, policy), None):
+        who = type(algorithm).__name__
         raise UsageError(f"{who}.{why}; millrace.testing.check_algorithm finds such mistakes before a run")
+    return weights

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from millrace.learner.algorithms.algorithm import check_weights
+from millrace.learner.algorithms.algorithm import acting_weights
 from millrace.learner.between_updates.evaluations import Evaluations
 from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.recording.image_sample import image_samples
@@ -25,7 +25,6 @@ from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress, Row, steps_per_second
 from millrace.learner.run_folder.results import Summary
 from millrace.learner.run_folder.run_format import versions
-from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.found_names import found_by_others
 from millrace.protocol.errors import RunError, first_line
@@ -49,14 +48,9 @@ class RunFiles:
         self.on_saved: Callable[[], None] = lambda: None
         """Called after a checkpoint was written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps, self._state.version)
+        self._schedule = checkpoint.CheckpointSchedule(run.config.checkpoint_every_s, time.monotonic())
         self._saved: tuple[object, ...] | None = None  # what `_position` was in the newest checkpoint
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
-
-    def weights(self) -> tuple[Floats, Floats]:
-        """The parameters and buffers of the algorithm. Raises `UsageError` if no worker could act with them."""
-        weights = self._algorithm.weights()
-        check_weights(weights, self._spec.policy, type(self._algorithm).__name__)
-        return weights
 
     def write_row(self, progress: Progress, metrics: Row) -> None:
         """Write a row of metrics, or add these metrics to the newest row if that is of the same update."""
@@ -77,7 +71,7 @@ class RunFiles:
         self._confirm_lock()
         began_s = time.monotonic()
         self._folder.writes.write("state", self._write_state)
-        self._tally.saved(began_s)
+        self._schedule.saved(began_s)
         took_s, grace_s = time.monotonic() - began_s, self._config.grace_s
         if grace_s and self.longest_save_s <= grace_s < took_s:  # said once
             log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", took_s, grace_s)
@@ -87,7 +81,7 @@ class RunFiles:
 
     def save_if_due(self) -> None:
         """Write a checkpoint and the policy if one is due."""
-        if self._tally.checkpoint_is_due():
+        if self._schedule.is_due(self._state.version, time.monotonic()):
             self.save()
 
     def save_unless_saved(self) -> None:
@@ -166,7 +160,7 @@ class RunFiles:
         """Make the run folder again if it was deleted or renamed. Raises `RunError` if that is not possible."""
         if self._folder.is_gone():
             self._saved = self._saved_env_steps = self._policy_env_steps = None
-            self._tally.saved(-math.inf)  # so that one is due now
+            self._schedule.saved(-math.inf)  # so that one is due now
             log.warning("%s", self._folder.make_again(self._config))
             self._evaluations.write_best()
 
@@ -185,7 +179,7 @@ class RunFiles:
             env_attributes=self._attributes.state(self._state.version),
         ).checkpoint_content(self._algorithm)
         try:
-            self._folder.write_policy(spec, *self.weights())
+            self._folder.write_policy(spec, *acting_weights(self._algorithm, spec.policy))
             self._policy_env_steps = env_steps
         finally:
             path = checkpoint.save(self._folder.path, state, env_steps, self._config.keep_checkpoints)

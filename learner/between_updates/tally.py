@@ -47,7 +47,7 @@ class Tally:
         self._config, self._steps_per_update = config, spec.rollout_steps * config.envs
         self._update_s = 0.0
         self.wall_before_s, self.steps_before = state.wall_s, state.env_steps
-        self._started_s = self._saved_s = time.monotonic()
+        self._started_s = time.monotonic()
 
     def count(self, batch: Batch) -> None:
         """An update was made of this batch."""
@@ -77,7 +77,7 @@ class Tally:
         """Whether the next rollouts may be collected now: no evaluation is due, and the run does not end."""
         return not self.evaluation_is_due() and self.stop_reason() is None
 
-    # ---------------------------------------------------------------- evaluations and checkpoints
+    # ---------------------------------------------------------------- evaluations
 
     def evaluation_is_due(self) -> bool:
         """Whether an evaluation is due. None is, once a callback has ended the run."""
@@ -88,14 +88,6 @@ class Tally:
         """The evaluation that was due is made. The next one is due at the next multiple that is not reached yet."""
         every, state = self._config.eval_every, self.state
         state.next_evaluation += every * (1 + (state.env_steps - state.next_evaluation) // every)
-
-    def checkpoint_is_due(self) -> bool:
-        """Whether a checkpoint is due: by time, or after the first update. Until then a killed run has nothing to resume."""
-        return self.state.version == 1 or time.monotonic() - self._saved_s >= self._config.checkpoint_every_s
-
-    def saved(self, began_s: float) -> None:
-        """A checkpoint was begun at this time, and is written, or refused by the disk. -inf: all are gone, so one is due."""
-        self._saved_s = began_s
 
     # ---------------------------------------------------------------- seconds
 

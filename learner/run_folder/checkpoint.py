@@ -1,4 +1,4 @@
-"""Checkpoints of a run: `checkpoints/<env steps>.pt`. The training loop decides when to write one.
+"""Checkpoints of a run: `checkpoints/<env steps>.pt`. `CheckpointSchedule` says when to write one.
 
 Rule: a checkpoint is there whole or not at all; the newest whole one is used; and reading one executes no code
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
@@ -37,6 +37,22 @@ class Checkpoint(NamedTuple):
     path: Path
     env_steps: int
     state: dict[str, Any]
+
+
+class CheckpointSchedule:
+    """Says when a checkpoint is due: by time, and after the first update. Until then a killed run has nothing to resume."""
+
+    def __init__(self, every_s: float, now: float) -> None:
+        self._every_s = every_s
+        self._began_s = now
+
+    def is_due(self, updates: int, now: float) -> bool:
+        """Whether one is due after this number of `updates`."""
+        return updates == 1 or now - self._began_s >= self._every_s
+
+    def saved(self, began_s: float) -> None:
+        """One was begun at this time, and is written, or refused by the disk. -inf: all are gone, so one is due."""
+        self._began_s = began_s
 
 
 class _Unreadable(Exception):

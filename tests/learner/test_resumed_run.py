@@ -28,6 +28,8 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import CheckpointError
 from millrace.protocol.rollout import Batch, stack_rollouts
 from tests.support.conversation.fake_ends import fake_rollout
+from tests.support.conversation.fake_ends import run_spec as fake_run_spec
+from tests.support.in_process.collectors import random_weights
 from tests.support.in_process.described import run_spec
 
 
@@ -49,15 +51,17 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         batches.append(batch)
         return {}
 
+    policy = fake_run_spec().policy
     algorithm = SimpleNamespace(
-        weights=lambda: (),
+        weights=lambda: random_weights(policy),
         update=update,
         remember=lambda: None,
         is_finite=lambda: True,
     )
     service = MagicMock(gather=lambda show: arrived)
     tally = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
-    train(algorithm, service, BetweenUpdates(tally, MagicMock(), MagicMock(), MagicMock()), 1)  # type: ignore[arg-type]
+    between = BetweenUpdates(tally, MagicMock(), MagicMock(), MagicMock())
+    train(algorithm, policy, service, between, 1)  # type: ignore[arg-type]
     (batch,) = batches
     assert batch.lane.tolist() == [0, 1, 2]
     assert batch.fresh.tolist() == [True, False, True]

@@ -1,16 +1,13 @@
 """What a run decides by its settings and by numbers."""
 
-import time
 from typing import Any
 
 import pytest
 
 from millrace.learner.between_updates.stop_rules import reason_to_stop
-from millrace.learner.between_updates.tally import Tally
 from millrace.learner.config.config import Config
 from millrace.learner.config.evaluation_size import evaluation_size, final_evaluation_size
-from millrace.learner.run_state import RunState
-from tests.support.conversation.fake_ends import run_spec
+from millrace.learner.run_folder.checkpoint import CheckpointSchedule
 
 
 def reason(config: Config, **numbers: Any) -> str | None:
@@ -38,12 +35,11 @@ def test_a_run_ends_when_a_target_is_reached() -> None:
     [(60.0, 59.9, 0, False), (60.0, 60.0, 0, True), (60.0, 0.0, 1000, False), (0.0, 0.0, 2, True), (60.0, 0.0, 1, True)],
 )
 def test_a_checkpoint_is_due_after_the_first_update_and_by_time(
-    every_s: float, since_last_s: float, updates: int, due: bool, monkeypatch: pytest.MonkeyPatch
+    every_s: float, since_last_s: float, updates: int, due: bool
 ) -> None:
-    monkeypatch.setattr(time, "monotonic", lambda: 0.0)
-    tally = Tally(Config(checkpoint_every_s=every_s), run_spec(), RunState(version=updates))
-    tally.saved(-since_last_s)
-    assert tally.checkpoint_is_due() is due
+    schedule = CheckpointSchedule(every_s, now=0.0)
+    schedule.saved(100.0)
+    assert schedule.is_due(updates, 100.0 + since_last_s) is due
 
 
 @pytest.mark.parametrize(
