@@ -1,8 +1,9 @@
-"""The commands of `millrace`: their groups, and the function of this folder that runs each.
+"""The commands of `millrace`: their groups, and the function that runs each. Extras have theirs in the same table.
 
 Rule: a command's module is imported when the command runs, so that `--help` answers at once, and a machine that has only a
 worker's packages can run the commands that need no others.
 """
+# ruff: noqa: E501
 
 from __future__ import annotations
 
@@ -14,45 +15,45 @@ class Command(NamedTuple):
     """A command of `millrace`."""
 
     runs: str
-    """module of this folder, and its function, which takes the arguments and returns the exit code"""
+    """`module:function`; the function takes the arguments and returns the exit code"""
     arguments: str
     about: str
 
 
-GROUPS = {
+# fmt: off
+GROUPS = {  # one line a command
     "Train": {
-        "train": Command("train:train", "ENV [flags]", "train on this machine: a learner and its worker processes"),
-        "presets": Command("presets:run", "", "list settings that are known to work"),
+        "train": Command("millrace.cli.train:train", "ENV [flags]", "train on this machine: a learner and its worker processes"),
+        "presets": Command("millrace.cli.presets:run", "", "list settings that are known to work"),
     },
     "Train with workers on other machines": {
-        "learner": Command(
-            "train:learner", "ENV --bind ADDRESS [flags]", "start a learner alone; workers join it from elsewhere"
-        ),
-        "worker": Command("worker:run", "ADDRESS [--token FILE] [flags]", "start workers that join a learner"),
-        "keys": Command("keys:run", "new|show|allow|revoke [NAME]", "say who may join the learners of this machine"),
-        "status": Command("status:run", "ADDRESS|RUN [--watch]", "show a run's workers, their speed, and what was dropped"),
-        "launch": Command("launch:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
+        "learner": Command("millrace.cli.train:learner", "ENV --bind ADDRESS [flags]", "start a learner alone; workers join it from elsewhere"),
+        "worker": Command("millrace.cli.worker:run", "ADDRESS [--token FILE] [flags]", "start workers that join a learner"),
+        "keys": Command("millrace.cli.keys:run", "new|show|allow|revoke [NAME]", "say who may join the learners of this machine"),
+        "status": Command("millrace.cli.status:run", "ADDRESS|RUN [--watch]", "show a run's workers, their speed, and what was dropped"),
+        "launch": Command("millrace.cli.launch:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
     },
     "Look at runs": {
-        "list": Command("look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
-        "dashboard": Command("dashboard:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
-        "evaluate": Command("play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
-        "record": Command("play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
-        "plot": Command("look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as SVG or PNG"),
-        "report": Command("look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
+        "list": Command("millrace.cli.look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
+        "dashboard": Command("millrace.cli.dashboard:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
+        "evaluate": Command("millrace.cli.play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
+        "record": Command("millrace.cli.play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
+        "plot": Command("millrace.cli.look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as SVG or PNG"),
+        "report": Command("millrace.cli.look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
     },
     "Write a client in another language": {
-        "conform": Command("conform:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),
+        "conform": Command("millrace.cli.conform:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),
     },
     "Measure millrace itself": {
-        "bench": Command("bench:run", "[NAME [flags]]", "run the benchmarks (in a clone of the repository)"),
+        "bench": Command("millrace.cli.bench:run", "[NAME [flags]]", "run the benchmarks (in a clone of the repository)"),
     },
 }
+# fmt: on
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 def run_command(name: str, argv: list[str]) -> int:
     """Run a command with these arguments. Returns the exit code."""
     module, function = COMMANDS[name].runs.split(":")
-    code: int = getattr(import_module(f"millrace.cli.{module}"), function)(argv)
+    code: int = getattr(import_module(module), function)(argv)
     return code
