@@ -66,24 +66,24 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"conformance", "dashboard", "launch", "playing", "terminal"},
-    "conformance": set[str](),
+    "cli": {"dashboard", "launch", "playing", "terminal"},
     "dashboard": {"cli"},
     "integrations": set[str](),
     "launch": {"arguments", "cli", "own_policy", "policies", "terminal"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
-MAY_PRINT = ("millrace/cli/", "millrace/terminal.py")
+MAY_PRINT = ("millrace/cli/", "millrace/extras/conformance/command.py", "millrace/terminal.py")
 MAY_UNPICKLE = {"protocol/env_spec.py"}
 ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
 """functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""
 TORCH_IN_PROTOCOL = "protocol/policy/"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
-CHECKS_A_CLIENT = "millrace/conformance/conform.py"
+CONFORMANCE = "millrace/extras/conformance/"
+CHECKS_A_CLIENT = CONFORMANCE + "conform.py"
 RANDOM_STREAMS = "protocol/random_streams.py"
 HAS_RANDOM_NUMBERS_OF_ITS_OWN = (  # from constants, not from a run's seed
     "learner/algorithm_check/",
-    "millrace/conformance/",
+    CONFORMANCE,
     "workers/envs/toy.py",
 )
 SLOW_TO_IMPORT = {"torch", "PIL", "resvg_py", "tensorboard"}
@@ -283,7 +283,9 @@ def test_a_room_imports_only_what_it_may(folder: str, place: str) -> None:
 
 @pytest.mark.parametrize("folder", ROOMS)
 def test_no_room_is_without_a_rule(folder: str) -> None:
-    assert {path.parent.name for path in (ROOT / folder).glob("*/__init__.py")} - {*PARTS} <= set(ROOMS[folder])
+    """But the extras, whose rule is in `test_border.py`."""
+    packages = {path.parent.name for path in (ROOT / folder).glob("*/__init__.py")} - {*PARTS}
+    assert packages <= {*ROOMS[folder], "extras"}
 
 
 def test_what_a_file_needs_is_imported_at_its_top_unless_it_is_slow_or_optional() -> None:
@@ -292,9 +294,9 @@ def test_what_a_file_needs_is_imported_at_its_top_unless_it_is_slow_or_optional(
 
 
 def test_the_checks_of_a_client_are_pure() -> None:
-    """One file connects them to a socket, a process and the clock."""
-    for source in sources("millrace/conformance"):
-        if source != CHECKS_A_CLIENT:
+    """One file connects them to a socket, a process and the clock; only the command imports that file."""
+    for source in sources(CONFORMANCE):
+        if source not in (CHECKS_A_CLIENT, CONFORMANCE + "command.py"):
             assert not imported(source) & {"learner", "zmq", "socket", "subprocess", "threading", "time"}, source
             assert CHECKS_A_CLIENT not in files_imported(source, {module(CHECKS_A_CLIENT): CHECKS_A_CLIENT}), source
 

@@ -42,7 +42,7 @@ GROUPS = {  # one line a command
         "report": Command("millrace.cli.look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
     },
     "Write a client in another language": {
-        "conform": Command("millrace.cli.conform:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),
+        "conform": Command("millrace.extras.conformance.command:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),
     },
     "Measure millrace itself": {
         "bench": Command("millrace.cli.bench:run", "[NAME [flags]]", "run the benchmarks (in a clone of the repository)"),

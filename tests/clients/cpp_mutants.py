@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from millrace.conformance import rules
-from millrace.conformance.rules import Rule
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.rules import Rule
 
 
 class Mutant(NamedTuple):

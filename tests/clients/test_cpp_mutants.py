@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from millrace.conformance.conform import ClientCommand, conform
-from millrace.conformance.learner import Settings
-from millrace.conformance.profiles import PROFILES
-from millrace.conformance.report import explanation
+from millrace.extras.conformance.conform import ClientCommand, conform
+from millrace.extras.conformance.learner import Settings
+from millrace.extras.conformance.profiles import PROFILES
+from millrace.extras.conformance.report import explanation
 from millrace.protocol.env_spec import EnvSpec
 from tests.clients.conftest import CPP
 from tests.clients.cpp_mutants import MUTANTS, Mutant

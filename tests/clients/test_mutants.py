@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import pytest
 
-from millrace.conformance import rules
-from millrace.conformance.conform import ClientCommand, conform
-from millrace.conformance.examiner import CheckResult
-from millrace.conformance.learner import Settings
-from millrace.conformance.profiles import PROFILES
-from millrace.conformance.report import explanation
-from millrace.conformance.rules import Rule
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.conform import ClientCommand, conform
+from millrace.extras.conformance.examiner import CheckResult
+from millrace.extras.conformance.learner import Settings
+from millrace.extras.conformance.profiles import PROFILES
+from millrace.extras.conformance.report import explanation
+from millrace.extras.conformance.rules import Rule
 from millrace.protocol.env_spec import EnvSpec
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(120)]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.conformance.profiles import PROFILES
+from millrace.extras.conformance.profiles import PROFILES
 from tests.clients.client_page import Step, steps
 from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port
 

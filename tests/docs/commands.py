@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from benchmarks.program import BENCHMARKS
-from millrace.cli import conform, flags, keys, presets, status
+from millrace.cli import flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
 from millrace.cli.launch import LAUNCHERS
+from millrace.extras.conformance.command import ConformFlags
 from millrace.learner.config.command_line import RunFlags
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import UsageError
@@ -39,7 +40,7 @@ RECORDS: dict[str, type[Any]] = {
     "plot": flags.PlotFlags,
     "report": flags.ReportFlags,
     "status": status.StatusFlags,
-    "conform": conform.ConformFlags,
+    "conform": ConformFlags,
     "presets": presets.PresetsFlags,
     "worker": WorkerFlags,
 }

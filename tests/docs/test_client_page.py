@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from millrace.conformance.profiles import PROFILES
+from millrace.extras.conformance.profiles import PROFILES
 from tests.clients.client_page import shown_files, steps
 from tests.system.stage.processes import ROOT
 

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from millrace.conformance import rules
-from millrace.conformance.lane_rows import LaneRows
-from millrace.conformance.played_rows import PlayedRows
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, brief
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.lane_rows import LaneRows
+from millrace.extras.conformance.played_rows import PlayedRows
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import Broken, brief
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import (
     Answer,

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from millrace.conformance import rules
-from millrace.conformance.script import Broken
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.script import Broken
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.messages import Weights
 from millrace.protocol.policy.distributions import distribution

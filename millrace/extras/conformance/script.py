@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from millrace.conformance.rules import Rule
+from millrace.extras.conformance.rules import Rule
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import Inquire, ToLearner
 from millrace.protocol.wire.codec import Buffer

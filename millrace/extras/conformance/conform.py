@@ -21,9 +21,9 @@ from pathlib import Path
 
 import zmq
 
-from millrace.conformance.examiner import Check, CheckResult, Examiner
-from millrace.conformance.learner import Settings
-from millrace.conformance.script import (
+from millrace.extras.conformance.examiner import Check, CheckResult, Examiner
+from millrace.extras.conformance.learner import Settings
+from millrace.extras.conformance.script import (
     AskToStop,
     CutConnection,
     EndClient,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from millrace.conformance import collect_checks, join_checks, step_checks
-from millrace.conformance.examiner import Check
+from millrace.extras.conformance import collect_checks, join_checks, step_checks
+from millrace.extras.conformance.examiner import Check
 
 JOINING = [
     Check("says Hello first, under its own name", join_checks.says_hello),

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from millrace.conformance import rules
-from millrace.conformance.learner import Learner, Settings
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, ClientEvent, EndClient, LearnerEffect, Script, Skipped, Wait
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.learner import Learner, Settings
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import Broken, ClientEvent, EndClient, LearnerEffect, Script, Skipped, Wait
 
 CHECK_S = 40.0  # longest time that one check may take
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-from millrace.conformance.examiner import CheckResult
-from millrace.conformance.rules import DOCUMENT
+from millrace.extras.conformance.examiner import CheckResult
+from millrace.extras.conformance.rules import DOCUMENT
 
 WIDTH = 110
 NUMBER = re.compile(r"\d{3,}")  # shapes and exit codes have fewer digits

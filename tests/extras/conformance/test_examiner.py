@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from millrace.conformance import collect_checks, rules
-from millrace.conformance.examiner import CHECK_S, Check, Examiner
-from millrace.conformance.join_checks import describe_spec, leaves_when_refused_later, says_hello
-from millrace.conformance.learner import Learner, Settings
-from millrace.conformance.profiles import PROFILES
-from millrace.conformance.report import as_data, explanation, line_of, summary
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import (
+from millrace.extras.conformance import collect_checks, rules
+from millrace.extras.conformance.examiner import CHECK_S, Check, Examiner
+from millrace.extras.conformance.join_checks import describe_spec, leaves_when_refused_later, says_hello
+from millrace.extras.conformance.learner import Learner, Settings
+from millrace.extras.conformance.profiles import PROFILES
+from millrace.extras.conformance.report import as_data, explanation, line_of, summary
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import (
     Broken,
     EndClient,
     Ended,
@@ -32,7 +32,7 @@ from millrace.conformance.script import (
     StartClient,
     Wait,
 )
-from millrace.conformance.watch import WatchedSession, check_stepped
+from millrace.extras.conformance.watch import WatchedSession, check_stepped
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.keys.keys import Key, Token

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from millrace.conformance import rules
-from millrace.conformance.lane_rows import LOG_PROB_TOLERANCE, can_be_recomputed, is_return, params_of
-from millrace.conformance.script import Broken, brief
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.lane_rows import LOG_PROB_TOLERANCE, can_be_recomputed, is_return, params_of
+from millrace.extras.conformance.script import Broken, brief
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, Weights
 from millrace.protocol.policy.distributions import distribution

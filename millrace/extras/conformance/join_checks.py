@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from millrace.conformance import rules
-from millrace.conformance.learner import Learner
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import AskToStop, Broken, CutConnection, Listen, Script, Skipped, Wait, brief
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.learner import Learner
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import AskToStop, Broken, CutConnection, Listen, Script, Skipped, Wait, brief
 from millrace.protocol.bounds import MAX_LINE
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, UsageError

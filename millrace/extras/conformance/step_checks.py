@@ -12,8 +12,8 @@ import msgpack
 import numpy as np
 from msgspec.structs import replace
 
-from millrace.conformance import rules
-from millrace.conformance.join_checks import (
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.join_checks import (
     POLE_GAINS,
     described,
     heartbeats,
@@ -21,10 +21,10 @@ from millrace.conformance.join_checks import (
     over_a_new_connection,
     time_limit,
 )
-from millrace.conformance.learner import Learner
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
-from millrace.conformance.watch import resets_too_early
+from millrace.extras.conformance.learner import Learner
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
+from millrace.extras.conformance.watch import resets_too_early
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import MAX_LINE
 from millrace.protocol.envs.description import DescribedEnv

@@ -14,8 +14,8 @@ import msgpack
 import numpy as np
 from msgspec.structs import replace
 
-from millrace.conformance import rules
-from millrace.conformance.join_checks import (
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.join_checks import (
     POLE_GAINS,
     described,
     heartbeats,
@@ -23,11 +23,11 @@ from millrace.conformance.join_checks import (
     over_a_new_connection,
     time_limit,
 )
-from millrace.conformance.lane_rows import resets_of
-from millrace.conformance.learner import QUIET_S, Learner
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
-from millrace.conformance.watch import resets_too_early
+from millrace.extras.conformance.lane_rows import resets_of
+from millrace.extras.conformance.learner import QUIET_S, Learner
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
+from millrace.extras.conformance.watch import resets_too_early
 from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.description import agents_in_words
 from millrace.protocol.envs.spaces import action_spec, observation_leaves

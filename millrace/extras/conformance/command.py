@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from millrace.conformance.conform import ClientCommand, conform
-from millrace.conformance.examiner import Check, CheckResult
-from millrace.conformance.learner import Settings
-from millrace.conformance.profiles import PROFILES
-from millrace.conformance.report import as_data, explanation, line_of, summary
+from millrace.extras.conformance.conform import ClientCommand, conform
+from millrace.extras.conformance.examiner import Check, CheckResult
+from millrace.extras.conformance.learner import Settings
+from millrace.extras.conformance.profiles import PROFILES
+from millrace.extras.conformance.report import as_data, explanation, line_of, summary
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.flags.fields import Flag, Positive

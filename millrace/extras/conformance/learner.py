@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, TypeVar
 
-from millrace.conformance import rules
-from millrace.conformance.rules import Rule
-from millrace.conformance.script import (
+from millrace.extras.conformance import rules
+from millrace.extras.conformance.rules import Rule
+from millrace.extras.conformance.script import (
     Broken,
     ClientEvent,
     CutConnection,
@@ -28,7 +28,7 @@ from millrace.conformance.script import (
     Wait,
     brief,
 )
-from millrace.conformance.watch import WatchedSession
+from millrace.extras.conformance.watch import WatchedSession
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import BadMessage
