@@ -72,7 +72,12 @@ MILLRACE = {  # the same for each folder of the public package
     "launch": {"arguments", "cli", "own_policy", "policies", "terminal"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
-MAY_PRINT = ("millrace/cli/", "millrace/extras/conformance/command.py", "millrace/terminal.py")
+MAY_PRINT = (
+    "millrace/cli/",
+    "millrace/extras/conformance/command.py",
+    "millrace/extras/launchers/command.py",
+    "millrace/terminal.py",
+)
 MAY_UNPICKLE = {"protocol/env_spec.py"}
 ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
 """functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""

@@ -34,14 +34,6 @@ STILL = {
 }
 FOLDER = "millrace/extras/"
 ELSEWHERE = {  # files of an extra that do not yet stand in its folder
-    "launchers": (
-        "millrace/launch/kubernetes.py",
-        "millrace/launch/slurm.py",
-        "millrace/launch/ray.py",
-        "millrace/launch/ray_worker.py",
-        "millrace/launch/launcher_flags.py",
-        "millrace/cli/launch.py",
-    ),
     "monitoring": (
         "learner/report/",
         "learner/metric_names.py",

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from millrace.cli.commands import COMMANDS, GROUPS
 from millrace.cli.keys import SUBCOMMANDS
-from millrace.cli.launch import LAUNCHERS
 from millrace.cli.main import main
+from millrace.extras.launchers.command import LAUNCHERS
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 
 HEAD = """# Commands

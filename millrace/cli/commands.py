@@ -31,7 +31,7 @@ GROUPS = {  # one line a command
         "worker": Command("millrace.cli.worker:run", "ADDRESS [--token FILE] [flags]", "start workers that join a learner"),
         "keys": Command("millrace.cli.keys:run", "new|show|allow|revoke [NAME]", "say who may join the learners of this machine"),
         "status": Command("millrace.cli.status:run", "ADDRESS|RUN [--watch]", "show a run's workers, their speed, and what was dropped"),
-        "launch": Command("millrace.cli.launch:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
+        "launch": Command("millrace.extras.launchers.command:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
     },
     "Look at runs": {
         "list": Command("millrace.cli.look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),

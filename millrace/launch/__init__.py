@@ -1,1 +1,1 @@
-"""Launchers: each starts a learner and workers on one machine or on a cluster. Learner and workers do not import them."""
+"""What starts a learner, with workers on this machine or elsewhere. Learner and workers do not import it."""

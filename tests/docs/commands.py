@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from benchmarks.program import BENCHMARKS
 from millrace.cli import flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
-from millrace.cli.launch import LAUNCHERS
 from millrace.extras.conformance.command import ConformFlags
+from millrace.extras.launchers.command import LAUNCHERS
 from millrace.learner.config.command_line import RunFlags
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import UsageError

@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from typing import TypeVar
 
-from millrace.cli.flags import LaunchFlags
+from millrace.extras.launchers.flags import LaunchFlags
 from millrace.learner.config.command_line import read_config
 from millrace.protocol.errors import UsageError
 from millrace.protocol.flags.parse import cut_at_dashes, parse_flags

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import ray
 
-from millrace.cli.flags import RayFlags
-from millrace.launch.launcher_flags import learner_flags
-from millrace.launch.ray_worker import WorkerHost
+from millrace.extras.launchers.command_line import learner_flags
+from millrace.extras.launchers.flags import RayFlags
+from millrace.extras.launchers.ray_worker import WorkerHost
 from millrace.launch.training import train
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.command_line import read_config

@@ -10,8 +10,8 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from millrace.cli.flags import SlurmFlags
-from millrace.launch.launcher_flags import learner_flags
+from millrace.extras.launchers.command_line import learner_flags
+from millrace.extras.launchers.flags import SlurmFlags
 from millrace.protocol.errors import UsageError
 from millrace.protocol.home_folder import expanded
 

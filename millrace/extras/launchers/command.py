@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from millrace.cli.flags import KubernetesFlags, LaunchFlags, RayFlags, SlurmFlags
 from millrace.cli.shown_run import show_run
 from millrace.cli.subcommands import chosen_subcommand
-from millrace.launch.kubernetes import manifest
-from millrace.launch.launcher_flags import SET_BY_LAUNCHER, read_flags
-from millrace.launch.slurm import script
+from millrace.extras.launchers.command_line import SET_BY_LAUNCHER, read_flags
+from millrace.extras.launchers.flags import KubernetesFlags, LaunchFlags, RayFlags, SlurmFlags
+from millrace.extras.launchers.kubernetes import manifest
+from millrace.extras.launchers.slurm import script
 from millrace.protocol.errors import UsageError
 
 LAUNCHERS: dict[str, type[LaunchFlags]] = {"kubernetes": KubernetesFlags, "slurm": SlurmFlags, "ray": RayFlags}
@@ -33,7 +33,7 @@ def run(argv: list[str]) -> int:
 def _ray(argv: list[str]) -> int:
     flags, learner = read_flags(RayFlags, argv, "ray", ("bind", "advertise", "insecure", "launched-workers"))
     try:
-        from millrace.launch.ray import launch  # only here: Ray is an extra
+        from millrace.extras.launchers.ray import launch  # only here: Ray need not be installed
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise

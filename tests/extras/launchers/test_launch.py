@@ -39,8 +39,8 @@ def test_what_ray_refuses_is_one_line_that_names_it(
     fake = SimpleNamespace(init=lambda **options: None, remote=refuse, nodes=lambda: [node], shutdown=lambda: None)
     fake.get_runtime_context = lambda: context
     monkeypatch.setitem(sys.modules, "ray", fake)
-    monkeypatch.setitem(sys.modules, "millrace.launch.ray", fake)
-    del sys.modules["millrace.launch.ray"]  # imported here with this Ray, and forgotten afterwards
+    monkeypatch.setitem(sys.modules, "millrace.extras.launchers.ray", fake)
+    del sys.modules["millrace.extras.launchers.ray"]  # imported here with this Ray, and forgotten afterwards
     assert main(["launch", "ray", "CartPole-v1", "--", "--keys", str(tmp_path / "keys"), "--run-dir", str(tmp_path)]) == 1
     line = capsys.readouterr().err.splitlines()[-1]
     assert line == "millrace: ray: ValueError: The name workers-0 is already taken. Please use a different name."

@@ -12,8 +12,8 @@ import json
 from collections.abc import Sequence
 from datetime import datetime
 
-from millrace.cli.flags import KubernetesFlags
-from millrace.launch.launcher_flags import METRICS_PORT, learner_flags
+from millrace.extras.launchers.command_line import METRICS_PORT, learner_flags
+from millrace.extras.launchers.flags import KubernetesFlags
 from millrace.protocol.errors import UsageError
 from millrace.protocol.home_folder import expanded
 from millrace.protocol.keys.key_folder import FIRST_CLIENT, KeyFolder

@@ -1,0 +1,1 @@
+"""Start a learner and workers on a cluster: `millrace launch`."""
