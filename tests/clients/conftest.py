@@ -76,14 +76,6 @@ def js(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return copy
 
 
-@pytest.fixture(scope="session")
-def ruby() -> None:
-    """Skips, saying so, without Ruby or its libraries."""
-    command = ["ruby", "-e", 'require "ffi-rzmq"; require "msgpack"']
-    if shutil.which("ruby") is None or subprocess.run(command, capture_output=True, timeout=60).returncode:
-        pytest.skip("ruby or a library of it is missing: make packages")
-
-
 @pytest.fixture
 def clients(request: pytest.FixtureRequest, stage: Stage) -> Clients:
     """The programs of the clients, built when they are first asked for."""

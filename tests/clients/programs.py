@@ -13,7 +13,8 @@ import zmq
 
 from millrace.protocol.messages import Hello, ToLearner
 from millrace.protocol.wire.codec import decode_to_learner
-from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port
+from tests.clients.client_page import client, written
+from tests.system.stage.processes import START_S, Learner, Running, Stage, free_port
 
 M = TypeVar("M", bound=ToLearner)
 IN_LEARNER = ("--inference", "learner")
@@ -98,14 +99,13 @@ class Clients:
         self._request, self._stage = request, stage
 
     def __getitem__(self, program: str) -> Client:
-        """`cpp cartpole`, `js corridor` and so on. Skips the test if it cannot be built."""
+        """`cpp cartpole`, `js corridor` and so on, or `page`, which a page writes. Skips the test if it cannot be built."""
         language, _, file = program.partition(" ")
         if language == "cpp":
             build: Path = self._request.getfixturevalue("cpp")
             return Client(self._stage, [str(build / file)])
-        if language == "ruby":
-            self._request.getfixturevalue("ruby")
-            return Client(self._stage, ["ruby", str(ROOT / "clients" / "ruby" / "examples" / f"{file}.rb")], name_flag=())
+        if language == "page":
+            return Client(self._stage, [sys.executable, str(written(self._stage.tmp_path, client()))], name_flag=())
         folder: Path = self._request.getfixturevalue("js")
         (script,) = folder.glob(f"*/{file}.js")
         return Client(self._stage, ["node", str(script)])

@@ -268,12 +268,8 @@ def stepped(env: str) -> StepSpec:
         ("cpp control_50hz", of_agents("CartPole-v1"), NO_AGENTS),
         ("js cartpole", of_agents("CartPole-v1"), NO_SEATS),
         ("js cartpole", stepped("CartPole-v1"), NO_SEATS),
-        ("ruby grid_world", of_agents("GridWorld-v0"), "expected --inference learner, GridWorld-v0; got RunSpec"),
-        (
-            "ruby grid_world",
-            stepped("GridWorld-v0"),
-            'GridWorld-v0; got StepSpec, [{:id=>"GridWorld-v0"}], ["black", "white"]',
-        ),
+        ("page", of_agents("GridWorld-v0"), "expected --inference learner, GridWorld-v0; got RunSpec"),
+        ("page", stepped("GridWorld-v0"), "GridWorld-v0; got StepSpec, [{'id': 'GridWorld-v0'}], ['black', 'white']"),
     ],
 )
 def test_what_the_environment_of_a_client_does_not_have_is_declined_in_a_line(

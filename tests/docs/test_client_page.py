@@ -1,27 +1,27 @@
-"""The page that writes a client shows the client's files, and names checks that there are."""
+"""The page that writes a client: its checks exist, and its client is as short as it says and needs nothing of millrace."""
 
 from __future__ import annotations
 
+import ast
+import sys
+
 from millrace.extras.conformance.profiles import PROFILES
-from tests.clients.client_page import shown_files, steps
-from tests.system.stage.processes import ROOT
+from tests.clients.client_page import PAGE, client, steps
 
-RUBY = ROOT / "clients" / "ruby"
-MOST_LINES = 150
-
-
-def test_its_blocks_are_the_files() -> None:
-    environment, client = shown_files()
-    assert environment == (RUBY / "examples" / "grid_world.rb").read_text(encoding="utf-8")
-    assert client == (RUBY / "millrace.rb").read_text(encoding="utf-8")
+MOST_LINES = 300
 
 
 def test_the_client_is_as_short_as_it_says() -> None:
-    _, client = shown_files()
-    lines = client.count("\n")
+    lines = client().count("\n")
     assert lines < MOST_LINES
-    for page in ("docs/how-to/write_a_client.md", "clients/ruby/README.md"):
-        assert f"{lines} lines" in (ROOT / page).read_text(encoding="utf-8"), page
+    assert f"It has {lines} lines" in PAGE.read_text(encoding="utf-8")
+
+
+def test_the_client_imports_a_zeromq_library_and_a_msgpack_library_and_nothing_of_millrace() -> None:
+    imports = [node for node in ast.parse(client()).body if isinstance(node, ast.Import)]
+    names = {alias.name for node in imports for alias in node.names}
+    assert names - sys.stdlib_module_names == {"msgpack", "zmq"}
+    assert "import" not in client().partition("\nclass ")[2]
 
 
 def test_the_checks_that_it_names_exist() -> None:
