@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from millrace.protocol.envs.which_copy import EnvCopy
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
+    from millrace.workers.copies.reset_ahead import ResetAhead
     from millrace.workers.copy_slots import env_copy
-    from millrace.workers.envs.reset_ahead import ResetAhead
 
 __all__ = [
     "CNN",
@@ -109,7 +109,7 @@ _IMPORTED_WHEN_USED = {
     "Progress": "millrace.learner.run_folder.progress",
     "RecordedDataset": "millrace.learner.recording.record",
     "Recurrent": "millrace.policies",
-    "ResetAhead": "millrace.workers.envs.reset_ahead",
+    "ResetAhead": "millrace.workers.copies.reset_ahead",
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",

@@ -34,9 +34,9 @@ from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from millrace.workers.copies.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from millrace.workers.copies.mask_reader import MaskReader, unused_mask
+from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.row_writers import missing_leaf, read_leaves
 from millrace.workers.copy_slots import close_copy
-from millrace.workers.envs.reset_ahead import ResetAhead
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]

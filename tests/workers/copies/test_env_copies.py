@@ -22,8 +22,8 @@ from millrace.protocol.specs import DescribeSpec, RunSpec, Vector
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers import copy_slots
 from millrace.workers.collect.collector import open_env_copies
+from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.described_copy import describing
-from millrace.workers.envs.reset_ahead import ResetAhead
 from millrace.workers.envs.toy import Countdown
 from millrace.workers.evaluate.evaluator import open_looped_copies
 from millrace.workers.vector_env.stepper import Stepper

@@ -14,7 +14,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.copies.env_copies import LoopedCopies
-from millrace.workers.envs.reset_ahead import ResetAhead
+from millrace.workers.copies.reset_ahead import ResetAhead
 from tests.support.in_process.collectors import no_pulse
 
 DEADLINE_S = 20.0
