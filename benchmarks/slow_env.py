@@ -6,6 +6,8 @@ with episodes of 1,000 steps in place of 200.
 `benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms in the mean (lognormal, sigma 1), a reset 200 ms, and an episode has
 50 to 150 steps. The durations follow from the reset seed. A copy that never waits makes 100 steps in 0.7 s.
 
+`benchmarks.slow_env:Constant-v0`: a step takes `seconds`, a reset no time, and an episode has `steps` steps.
+
 With the environment variable `SLOW_ENV_TIMELINE` each copy appends every step and reset to a file in that folder: three
 float64 numbers: start and end by the monotonic clock, and 1 for a reset.
 """
@@ -62,6 +64,28 @@ class Lognormal(gymnasium.Env[Any, Any]):
             self._timeline.write(struct.pack("3d", began_s, time.monotonic(), is_reset))
 
 
+class Constant(gymnasium.Env[Any, Any]):
+    """An environment whose steps all take the same time."""
+
+    def __init__(self, seconds: float = 0.01, steps: int = 100) -> None:
+        self.observation_space = Box(0.0, 1.0, (1,), np.float32)
+        self.action_space = Discrete(2)
+        self._seconds, self._steps, self._left = seconds, steps, steps
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._left = self._steps
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        time.sleep(self._seconds)
+        self._left -= 1
+        return self._observation(), 1.0, self._left == 0, False, {}
+
+    def _observation(self) -> Any:
+        return np.array([self._left / self._steps], np.float32)
+
+
 class SlowPendulum(PendulumEnv):
     """Pendulum-v1 whose steps take longer."""
 
@@ -76,6 +100,7 @@ class SlowPendulum(PendulumEnv):
 
 
 register("Lognormal-v0", "benchmarks.slow_env:Lognormal")
+register("Constant-v0", "benchmarks.slow_env:Constant")
 SLOW_PENDULUM = "benchmarks.slow_env:SlowPendulum"
 register("TenMilliseconds-v0", SLOW_PENDULUM, max_episode_steps=200, kwargs={"step_s": 0.01})
 register("FiftyMilliseconds-v0", SLOW_PENDULUM, max_episode_steps=1000, kwargs={"step_s": 0.05})

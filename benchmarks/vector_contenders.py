@@ -111,7 +111,6 @@ def _tianshou(task: Task, makers: list[Callable[[], gymnasium.Env[Any, Any]]]) -
 
 def _torchrl(task: Task) -> Contender:
     envs = import_module("torchrl.envs")
-    import_module("millrace.workers.envs.toy")
     each = task.copies // task.workers
 
     def serial() -> Any:

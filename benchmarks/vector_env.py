@@ -27,9 +27,9 @@ ALL = ("gymnasium Sync", ASYNC, "SB3 DummyVecEnv", *PEERS, *OURS, LIMIT)
 FEW = ("gymnasium Sync", ASYNC, *PEERS, "millrace")
 TASKS: tuple[tuple[Task, tuple[str, ...]], ...] = (
     *((Task("CartPole-v1", "CartPole-v1", copies, 2), ALL) for copies in (8, 16, 64)),
-    (Task("sleeps 1 ms a step", "millrace.workers.envs.toy:Slow-v0", 8, 8, {"seconds": 0.001, "k": 100}), FEW),
-    (Task("84 × 84 × 4 uint8", "millrace.workers.envs.toy:Frames-v0", 8, 2), FEW),
-    (Task("84 × 84 × 4 uint8", "millrace.workers.envs.toy:Frames-v0", 8, 8), FEW),
+    (Task("sleeps 1 ms a step", "benchmarks.slow_env:Constant-v0", 8, 8, {"seconds": 0.001}), FEW),
+    (Task("84 × 84 × 4 uint8", "benchmarks.random_frames:RandomFrames-v0", 8, 2), FEW),
+    (Task("84 × 84 × 4 uint8", "benchmarks.random_frames:RandomFrames-v0", 8, 8), FEW),
 )
 Rows = list[dict[str, object]]
 

@@ -37,7 +37,7 @@ from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProce
 
 CASES = {
     "MLP, CartPole-v1": EnvSpec("CartPole-v1"),
-    "image, 12 x 12 x 3": EnvSpec("millrace.workers.envs.toy:Spaces-v0", {"observation": "image"}),
+    "image, 12 x 12 x 3": EnvSpec("benchmarks.random_frames:RandomFrames-v0", {"side": 12, "channels": 3}),
 }
 
 

@@ -1,9 +1,10 @@
 """`python -m tests.same_bits --base COMMIT`: small runs in this tree and in that commit, compared bit for bit.
 
 Rule: both sides run the same command lines (`RUNS`) on this machine, with the same packages: this tree with 1 and with 3
-workers, and a worktree of the commit, which is made for it and removed, with 3. What both sides name is compared: arrays of
-policies, columns of metrics without those that tell of time, evaluations, arrays of recorded datasets, and the state of the
-algorithm in the newest checkpoint. A name that only one side has is printed and is no difference.
+workers, and a worktree of the commit, which is made for it and removed, with 3. Both use the toy environments of this tree,
+which import nothing of millrace. What both sides name is compared: arrays of policies, columns of metrics without those that
+tell of time, evaluations, arrays of recorded datasets, and the state of the algorithm in the newest checkpoint. A name that
+only one side has is printed and is no difference.
 
 Exit code 1: something differs that `--expect-different` does not name, or a side refused such a run.
 """
@@ -32,6 +33,7 @@ from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 
 ROOT = Path(__file__).parents[1]
+TOYS = ROOT / "tests" / "support" / "envs"
 COMMON = "--preset none --seed 3 --lanes 4 --envs 8 --device cpu --torch-threads 1 --worker-timeout-s 60 --run-dir runs"
 ON_POLICY = "--rollout-steps 32 --steps 1500 --eval-every 700 --eval-episodes 4"
 REPLAY = "--rollout-steps 8 --learning-starts 200 --batch-size 32 --net 32 --steps 900 --eval-every 400 --eval-episodes 4"
@@ -41,13 +43,13 @@ RECORDED = "same/training-v0"
 RUNS: dict[str, tuple[str, ...]] = {
     "ppo": (f"train CartPole-v1 --algo ppo {ON_POLICY}",),
     "a2c": (f"train Pendulum-v1 --algo a2c {NORMALIZED} {ON_POLICY}",),
-    "reinforce": (f"train millrace.workers.envs.toy:Identity-v0 --algo reinforce {ON_POLICY}",),
+    "reinforce": (f"train toy:Identity-v0 --algo reinforce {ON_POLICY}",),
     "impala": (f"train CartPole-v1 --algo impala {ON_POLICY}",),
     "dqn": (f"train CartPole-v1 --algo dqn {REPLAY}",),
     "sac": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 {REPLAY}",),
     "td3": (f"train Pendulum-v1 --algo td3 --updates-per-step 0.5 {NORMALIZED} {REPLAY}",),
-    "lstm": (f"train millrace.workers.envs.toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
-    "images": (f"train millrace.workers.envs.toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
+    "lstm": (f"train toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
+    "images": (f"train toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
     "per": (f"train CartPole-v1 --algo dqn --priority-alpha 0.6 --n-step 3 --normalize-observations {REPLAY}",),
@@ -146,7 +148,8 @@ def worktree(commit: str, folder: Path) -> Iterator[Path]:
 
 def python(side: Side, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run this interpreter in a folder, with the code of this side's tree."""
-    environment = {**os.environ, "PYTHONPATH": str(side.tree), "MINARI_DATASETS_PATH": str(folder / "datasets")}
+    path = os.pathsep.join([str(side.tree), str(TOYS)])
+    environment = {**os.environ, "PYTHONPATH": path, "MINARI_DATASETS_PATH": str(folder / "datasets")}
     command = [sys.executable, "-P", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False)
 

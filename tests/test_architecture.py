@@ -89,8 +89,8 @@ RANDOM_STREAMS = "protocol/random_streams.py"
 HAS_RANDOM_NUMBERS_OF_ITS_OWN = (  # from constants, not from a run's seed
     "learner/algorithm_check/",
     CONFORMANCE,
-    "workers/envs/toy.py",
 )
+MAY_SLEEP = ("tests/system/", "tests/support/envs/toy.py")  # the second in `step`: environments that are slow or hang
 SLOW_TO_IMPORT = {"torch", "PIL", "resvg_py", "tensorboard"}
 OPTIONAL = {  # packages of an extra or of notebooks
     *("IPython", "ale_py", "envpool", "h5py", "minari", "moviepy", "ray", "stable_baselines3", "zstandard"),
@@ -110,7 +110,6 @@ IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `mil
 }
 NAME_OF_A_TYPE = r"_?[A-Z][A-Za-z]*[a-z][A-Za-z]*"
 SAME_IN_EVERY_PACKAGE = {"Pulse"}  # a function that is called again and again in a long computation
-NAME_OF_AN_ENVIRONMENT = "Identity"
 MOST_PARAMETERS = 8  # of a function; self and cls do not count
 MAY_TAKE_MORE = {"millrace/launch/vector.py:make_vec"}  # gymnasium's users expect keyword arguments
 
@@ -372,7 +371,7 @@ def test_command_lines_are_made_in_one_way() -> None:
 
 def test_tests_do_not_sleep() -> None:
     for source in sources("tests"):
-        if not source.startswith("tests/system/") and "sleep" in (ROOT / source).read_text():
+        if not source.startswith(MAY_SLEEP) and "sleep" in (ROOT / source).read_text():
             assert not calls(source, "sleep")
 
 
@@ -385,7 +384,7 @@ def test_a_name_of_a_class_or_a_type_stands_for_one_thing() -> None:
                     pass  # it stands for something else in each function
                 case ast.ClassDef(name=name) | ast.Assign(targets=[ast.Name(id=name)]) if re.fullmatch(NAME_OF_A_TYPE, name):
                     places[name.lstrip("_")].append(source)
-    assert {name for name, where in places.items() if len(where) > 1} == SAME_IN_EVERY_PACKAGE | {NAME_OF_AN_ENVIRONMENT}
+    assert {name for name, where in places.items() if len(where) > 1} == SAME_IN_EVERY_PACKAGE
 
 
 def test_no_folder_is_a_drawer_for_everything() -> None:

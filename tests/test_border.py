@@ -50,8 +50,6 @@ ELSEWHERE = {  # files of an extra that do not yet stand in its folder
         "workers/envs/atari.py",
         "workers/envs/double_pendulum.py",
         "workers/envs/double_pendulum_screen.py",
-        "workers/envs/lqr.py",
-        "workers/envs/toy.py",
         "workers/copies/envpool_copies.py",
     ),
 }

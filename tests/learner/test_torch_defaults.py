@@ -81,12 +81,12 @@ def test_a_run_has_the_same_bits(name: str, tmp_path: Path, plain: dict[str, byt
 def camera(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose policy acts with torch."""
     folder = tmp_path_factory.mktemp("camera")
-    return millrace.train("millrace.workers.envs.toy:Frames-v0", run_dir=str(folder), **{**SMALL, "steps": 32}).path
+    return millrace.train("tests.support.envs.toy:Frames-v0", run_dir=str(folder), **{**SMALL, "steps": 32}).path
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_a_loaded_policy_acts_the_same(name: str, camera: Path) -> None:
-    env = gymnasium.make("millrace.workers.envs.toy:Frames-v0")
+    env = gymnasium.make("tests.support.envs.toy:Frames-v0")
     seen, _ = env.reset(seed=1)
     env.close()
     expected = [millrace.load(camera, deterministic=False, seed=seed)(seen) for seed in range(5)]

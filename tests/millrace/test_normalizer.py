@@ -87,9 +87,7 @@ def test_they_serve_a_policy_that_does_not_normalize() -> None:
 
 
 def test_of_several_arrays_the_features_are_side_by_side() -> None:
-    with millrace.RolloutService(
-        "millrace.workers.envs.toy:Spaces-v0", env_kwargs={"observation": "dict"}, **SMALL
-    ) as service:
+    with millrace.RolloutService("tests.support.envs.toy:Spaces-v0", env_kwargs={"observation": "dict"}, **SMALL) as service:
         service.publish(service.policy.initial())
         batch = service.gather()
         service.normalizer.update(batch)

@@ -119,7 +119,7 @@ def test_an_error_in_it_arrives_with_its_traceback() -> None:
 
 
 def test_an_environment_that_raises_beside_it_is_not_called_a_policy() -> None:
-    environment = "millrace.workers.envs.toy:Raises-v0"
+    environment = "tests.support.envs.toy:Raises-v0"
     with millrace.RolloutService(environment, QUIET_TOY, workers=1, max_env_failures=0, **SMALL) as service:
         service.publish({"w": np.zeros(1)})
         with pytest.raises(millrace.EnvironmentFailed, match="its environment raised"):

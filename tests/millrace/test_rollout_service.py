@@ -153,14 +153,14 @@ def test_published_arrays_may_change_afterwards() -> None:
 
 
 def test_a_status_request_gets_the_figures_of_the_batches() -> None:
-    with service("millrace.workers.envs.toy:Countdown-v0", max_lag=1) as made:
+    with service("tests.support.envs.toy:Countdown-v0", max_lag=1) as made:
         made.publish(made.policy.initial())
         made.gather()
         made.gather()
         text = as_table(made._hub.status(time.monotonic()))
     assert made.env_steps == 2 * 28
     speed = r"[\d,]+ steps/s"
-    line = rf"workers\.envs\.toy:Countdown-v0: 56 env steps, {speed}, return 5\.0, update 0, lag 0\.0\n"
+    line = rf"tests\.support\.envs\.toy:Countdown-v0: 56 env steps, {speed}, return 5\.0, update 0, lag 0\.0\n"
     assert re.match(line, text), text
 
 

@@ -132,7 +132,7 @@ def test_infos_are_those_of_each_copy() -> None:
 
 
 def test_attributes_and_methods_by_index() -> None:
-    env = make_vec_env("millrace.workers.envs.toy:Informs-v0", 3, monitor=False, transport="inproc")
+    env = make_vec_env("tests.support.envs.toy:Informs-v0", 3, monitor=False, transport="inproc")
     assert isinstance(env, Sb3VecEnv)
     env.set_attr("level", 7, indices=[2, 0])
     assert env.get_attr("level") == [7, 1, 7]

@@ -17,7 +17,7 @@ from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import OpenEnvCopies
 from millrace.workers.copies.env_copies import VectorCopies
-from millrace.workers.envs.toy import Scripted
+from tests.support.envs.toy import Scripted
 from tests.support.in_process.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
 
 SCRIPTED = run_of(f"{TOY}Scripted-v0")

@@ -26,7 +26,7 @@ from millrace.workers.activity import (
 from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import EnvLoop
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 
 
 class Watched(Countdown):

@@ -1,4 +1,4 @@
-"""Environments that come with millrace. Importing this package registers them; the toys are registered by `toy.py`."""
+"""Environments that come with millrace. Importing this package registers them."""
 
 import gymnasium
 

@@ -14,7 +14,7 @@ from millrace.learner.config.layers import resolve
 from millrace.protocol.envs.description import describe_env, read_description
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.specs import PolicySpec
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 
 
 def policy_for(shape: tuple[int, ...], dtype: str, net: tuple[int, ...] = (64, 64)) -> PolicySpec:

@@ -53,7 +53,7 @@ from millrace.protocol.errors import UsageError, UserFacingError
 from tests.support.in_process.described import described
 from tests.support.in_process.saved_policies import load_policy
 
-ENV = "millrace.workers.envs.toy:Identity-v0"
+ENV = "tests.support.envs.toy:Identity-v0"
 SETTINGS: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 1, "net": (4,),
     "steps": 200, "eval_episodes": 2, "eval_every": 60, "checkpoint_every_s": 0.0,

@@ -17,11 +17,11 @@ from gymnasium.vector.utils import batch_space
 import millrace
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.protocol.errors import EnvironmentFailed, UsageError
-from millrace.workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
+from tests.support.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 from tests.support.in_process.described import with_spaces
 from tests.support.numbers.bit_equality import bit_equal
 
-SPACES = "millrace.workers.envs.toy:Spaces-v0"
+SPACES = "tests.support.envs.toy:Spaces-v0"
 
 
 def inproc(env: Any, num_envs: int | None = 3, **keywords: Any) -> ZmqVectorEnv:
@@ -223,7 +223,7 @@ def test_a_reset_mask_leaves_the_other_copies_unchanged() -> None:
 @pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.value)
 def test_the_end_of_an_episode_in_each_autoreset_mode(mode: AutoresetMode) -> None:
     zeros = np.zeros(2, np.int64)
-    with inproc("millrace.workers.envs.toy:Countdown-v0", 2, k=2, autoreset_mode=mode) as env:
+    with inproc("tests.support.envs.toy:Countdown-v0", 2, k=2, autoreset_mode=mode) as env:
         env.reset(seed=1)
         env.step(zeros)
         observation, reward, terminated, _, infos = env.step(zeros)

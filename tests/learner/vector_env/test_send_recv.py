@@ -30,8 +30,8 @@ from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
 from tests.support.numbers.bit_equality import bit_equal
 
-INFORMS = "millrace.workers.envs.toy:Informs-v0"
-COUNTDOWN = "millrace.workers.envs.toy:Countdown-v0"
+INFORMS = "tests.support.envs.toy:Informs-v0"
+COUNTDOWN = "tests.support.envs.toy:Countdown-v0"
 BOTH_WAYS = pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
 
 
@@ -514,7 +514,7 @@ def test_time_in_which_the_caller_did_other_things_counts_little() -> None:
 
 
 def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> None:
-    with made("millrace.workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
+    with made("tests.support.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
         env.reset_async(seed=1)
         env.recv(3)
         send(env, [0, 1, 2])
@@ -531,7 +531,7 @@ def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> 
 
 
 def test_an_error_that_a_step_in_lock_step_has_raised_is_not_told_again_by_the_next() -> None:
-    with made("millrace.workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
+    with made("tests.support.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
         env.reset(seed=1), env.step(zeros([0, 1, 2]))
         with pytest.raises(EnvironmentFailed, match="lane 1, copy 0, step 1: its environment raised ValueError"):
             env.step(zeros([0, 1, 2]))

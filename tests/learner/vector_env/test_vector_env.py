@@ -39,8 +39,8 @@ CASES: dict[str, dict[str, Any]] = {
     "CartPole-v1": {},
     "Pendulum-v1": {"max_episode_steps": 30},
     TAXI: {"max_episode_steps": 20},
-    "millrace.workers.envs.toy:Informs-v0": {},
-    "millrace.workers.envs.toy:Spaces-v0": {"observation": "nested", "action": "table"},
+    "tests.support.envs.toy:Informs-v0": {},
+    "tests.support.envs.toy:Spaces-v0": {"observation": "nested", "action": "table"},
 }
 
 
@@ -85,7 +85,7 @@ def test_results_through_shared_memory_equal_those_of_sync_vector_env(env: str, 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
 @pytest.mark.parametrize("transport", ["ipc", pytest.param("tcp", marks=pytest.mark.soak), "inproc"])
 def test_results_by_messages_equal_those_of_sync_vector_env(transport: str, mode: AutoresetMode) -> None:
-    with both("millrace.workers.envs.toy:Informs-v0", 5, mode, transport) as (ours, theirs):
+    with both("tests.support.envs.toy:Informs-v0", 5, mode, transport) as (ours, theirs):
         play(ours, theirs, 150, mode)
 
 
@@ -123,7 +123,7 @@ def test_a_space_that_a_factory_seeds_has_the_samples_of_sync_vector_env() -> No
 
 
 def test_calls_and_attributes() -> None:
-    with both("millrace.workers.envs.toy:Informs-v0", 5, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
+    with both("tests.support.envs.toy:Informs-v0", 5, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
         assert ours.get_attr("level") == theirs.get_attr("level") == (1,) * 5
         for env in (ours, theirs):
             env.reset(seed=1)
@@ -154,9 +154,9 @@ def test_workers_render_frames() -> None:
 
 def test_a_callable_and_a_list_of_environments() -> None:
     def countdown(k: int) -> Any:
-        return lambda: gymnasium.make("millrace.workers.envs.toy:Countdown-v0", k=k)
+        return lambda: gymnasium.make("tests.support.envs.toy:Countdown-v0", k=k)
 
-    with millrace.make_vec([countdown(2), countdown(3), "millrace.workers.envs.toy:Countdown-v0"], workers=2) as env:
+    with millrace.make_vec([countdown(2), countdown(3), "tests.support.envs.toy:Countdown-v0"], workers=2) as env:
         assert env.num_envs == 3
         env.reset()
         ended = [env.step(np.zeros(3, np.int64))[2].tolist() for _ in range(3)]
@@ -214,7 +214,7 @@ def test_gymnasium_vector_wrappers_work_on_it() -> None:
 def test_an_info_that_is_no_plain_data_arrives_as_its_repr_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:
     with (
         caplog.at_level(logging.WARNING, "millrace.learner"),
-        millrace.make_vec("millrace.workers.envs.toy:Informs-v0", 2, workers=1, odd=True) as env,
+        millrace.make_vec("tests.support.envs.toy:Informs-v0", 2, workers=1, odd=True) as env,
     ):
         env.reset(seed=1)
         action = env.action_space.sample()
@@ -227,10 +227,7 @@ def test_an_info_that_is_no_plain_data_arrives_as_its_repr_with_one_warning(capl
 
 
 def test_infos_too_long_for_shared_memory_are_sent_as_a_message() -> None:
-    with both("millrace.workers.envs.toy:Informs-v0", 2, AutoresetMode.NEXT_STEP, "shared", wordy=1_000_000) as (
-        ours,
-        theirs,
-    ):
+    with both("tests.support.envs.toy:Informs-v0", 2, AutoresetMode.NEXT_STEP, "shared", wordy=1_000_000) as (ours, theirs):
         play(ours, theirs, 5, AutoresetMode.NEXT_STEP)
         assert len(ours.step(ours.action_space.sample())[4]["word"][0]) > 1_000_000
 
@@ -271,7 +268,7 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
         ({"timeout": float("nan")}, "^timeout: expected a number of seconds above 0, got nan$"),
         ({"env": "NoSuchEnv-v7"}, "is not registered"),
         ({"env": "FrozenLake-v1", "desc": ["SF", "FG"]}, "FrozenLake-v1: argument desc: expected .*, got list .'SF', 'FG'."),
-        ({"env": "millrace.workers.envs.toy:Spaces-v0", "observation": "text"}, "is not supported"),
+        ({"env": "tests.support.envs.toy:Spaces-v0", "observation": "text"}, "is not supported"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(wrong: dict[str, Any], message: str) -> None:
@@ -355,7 +352,7 @@ def test_any_sequence_of_calls_gives_the_results_of_sync_vector_env() -> None:
     """Through shared memory and by messages, in each autoreset mode; results are compared after every call."""
     with ExitStack() as stack:
         pairs = {
-            (mode, transport): stack.enter_context(both("millrace.workers.envs.toy:Informs-v0", 3, mode, transport))
+            (mode, transport): stack.enter_context(both("tests.support.envs.toy:Informs-v0", 3, mode, transport))
             for mode in MODES
             for transport in ("shared", "inproc")
         }

@@ -37,7 +37,7 @@ WRAPPERS: dict[str, tuple[str, Callable[[Env], Env]]] = {
     "TransformObservation": ("CartPole-v1", shift_observation),
     "DictInfoToList": ("CartPole-v1", list_infos),
     "DtypeObservation": ("CartPole-v1", lambda env: wrappers.DtypeObservation(env, np.float64)),
-    "FlattenObservation": ("millrace.workers.envs.toy:Frames-v0", wrappers.FlattenObservation),
+    "FlattenObservation": ("tests.support.envs.toy:Frames-v0", wrappers.FlattenObservation),
     "ClipAction": ("Pendulum-v1", wrappers.ClipAction),
     "RescaleAction": (
         "Pendulum-v1",

@@ -517,7 +517,7 @@ def test_evaluate_says_mean_and_deviation(tmp_path: Path, capsys: Captured) -> N
 
 
 def test_evaluate_gives_up_after_the_number_of_failures_that_its_flag_says(tmp_path: Path, capsys: Captured) -> None:
-    run = a_run_that_acts(tmp_path, "millrace.workers.envs.toy:Raises-v0")
+    run = a_run_that_acts(tmp_path, "tests.support.envs.toy:Raises-v0")
     options = ("--transport", "inproc", "--workers", "1", "--max-env-failures", "0")
     assert main(["evaluate", str(run), *options]) == 1
     assert "; failure 1 in a row; max_env_failures allows 0 in a row" in capsys.readouterr().err

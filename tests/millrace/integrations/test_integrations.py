@@ -15,7 +15,7 @@ from millrace.integrations.run_rows import RowFilter
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.requests import Requests
 
-ENV = "millrace.workers.envs.toy:Identity-v0"
+ENV = "tests.support.envs.toy:Identity-v0"
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 1, "net": (8,),
     "steps": 200, "eval_episodes": 2, "eval_every": 100, "progress": False,

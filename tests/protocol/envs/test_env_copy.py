@@ -12,7 +12,7 @@ import pytest
 from millrace.protocol.env_spec import AllowedCode, EnvSpec
 from millrace.protocol.envs.which_copy import EnvCopy, being_made, filled, takes_copy
 from millrace.protocol.errors import UsageError
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 
 MODULE = __name__
 COPY = EnvCopy(number=7, lane=3, copy=1, evaluation=False, slot=12)

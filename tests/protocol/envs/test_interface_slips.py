@@ -13,7 +13,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import describe_env
 from millrace.protocol.envs.seats import MAX_AGENT_NAME
 from millrace.protocol.errors import UsageError
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 from tests.support.users_code.seat_envs import RandomCrowd
 
 MODULE = __name__

@@ -22,7 +22,7 @@ from millrace.protocol.envs.found_names import found_by_others, moved, name_of
 from millrace.protocol.envs.unknown_ids import ids_of_gymnasium
 from millrace.protocol.envs.wrappers import read_wrapper, wrapper_name
 from millrace.protocol.errors import UsageError
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 
 MODULE = __name__
 
@@ -264,7 +264,7 @@ def test_an_id_that_an_imported_module_registers_is_remembered_with_it(
     registry: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "arcade_of_mine.py").write_text(
-        "import gymnasium\nfrom millrace.workers.envs.toy import Countdown\nclass Game(Countdown): pass\n"
+        "import gymnasium\nfrom tests.support.envs.toy import Countdown\nclass Game(Countdown): pass\n"
         'gymnasium.register(id="Game-v0", entry_point="arcade_of_mine:Game")\n'
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -402,7 +402,7 @@ def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     for spec, what in ((named, "a wrapper"), (pickled, "an environment factory"), (function, "an environment factory")):
         assert [bool(spec.rejection_reason(code)) for code in codes] == [True, True, False]
         assert spec.called_code == what
-    by_id = EnvSpec("millrace.workers.envs.toy:Countdown-v0")
+    by_id = EnvSpec("tests.support.envs.toy:Countdown-v0")
     assert [bool(by_id.rejection_reason(code)) for code in codes] == [True, False, False]
     assert by_id.called_code == ""
     for spec in (function, pickled):

@@ -32,7 +32,7 @@ from millrace.protocol.space_spec import (
 )
 from millrace.protocol.wire.codec import decode_to_learner, encode
 from millrace.protocol.wire.plain_values import pack
-from millrace.workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
+from tests.support.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
 from tests.support.in_process.described import with_spaces
 from tests.support.numbers.bit_equality import bit_equal
 

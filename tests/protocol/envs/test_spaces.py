@@ -19,7 +19,7 @@ from millrace.protocol.errors import BadRollout, UsageError
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.rows.rollout_checks import validate, wrong_facts
 from millrace.protocol.specs import RunSpec
-from millrace.workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
+from tests.support.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 
 ROOT = Path(__file__).parents[3]

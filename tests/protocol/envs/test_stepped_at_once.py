@@ -25,7 +25,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, VectorCopies, copy_seeds
 from millrace.workers.copies.envpool_copies import EnvpoolCopies
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from tests.support.in_process.described import run_spec
 

@@ -213,7 +213,7 @@ def test_a_plugin_that_fails_costs_no_more_than_its_ids(site: Site) -> None:
 
 def test_no_plugin_is_imported_for_an_id_that_is_known(site: Site) -> None:
     site.install("fake_broken", "raise OSError('no display')", "[gymnasium.envs]\n__root__ = fake_broken:register_all\n")
-    for env in ("CartPole-v1", "millrace.workers.envs.toy:Countdown-v0", "millrace/CartDoublePendulum-v0"):
+    for env in ("CartPole-v1", "tests.support.envs.toy:Countdown-v0", "millrace/CartDoublePendulum-v0"):
         EnvSpec.of(env).make().close()
     assert "fake_broken" not in sys.modules
 

@@ -25,8 +25,8 @@ from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import stack_rollouts
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
-from millrace.workers.envs.toy import Countdown
 from tests.docs.pages import blocks, written
+from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around
 from tests.support.in_process.saved_policies import policy_run
 

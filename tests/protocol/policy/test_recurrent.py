@@ -32,8 +32,8 @@ from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
-from millrace.workers.envs.toy import Scripted
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.envs.toy import Scripted
 from tests.support.in_process.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
 from tests.support.numbers.rounding import ELEMENTWISE, UNIT, assert_within, in_double, in_float64, sampled

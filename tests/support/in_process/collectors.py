@@ -28,7 +28,7 @@ from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
 from millrace.workers.evaluate.evaluator import Evaluator
 
-TOY = "millrace.workers.envs.toy:"
+TOY = "tests.support.envs.toy:"
 VERSION, SESSION = 7, 3
 
 

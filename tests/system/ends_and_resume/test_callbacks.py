@@ -19,7 +19,7 @@ from millrace.learner.run_folder.run_folder import Interrupted
 from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
 
-ENV = "millrace.workers.envs.toy:Identity-v0"
+ENV = "tests.support.envs.toy:Identity-v0"
 ROWS = 16  # of a lane in a rollout
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": ROWS, "n_epochs": 2, "batch_size": 16,

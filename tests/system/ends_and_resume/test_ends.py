@@ -26,7 +26,7 @@ from millrace.learner.run_folder.last_line import resume_command
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.errors import RunError, UsageError
-from millrace.workers.envs.toy import Identity
+from tests.support.envs.toy import Identity
 from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
 
@@ -43,9 +43,7 @@ class UsersError(Exception):
 
 def run(tmp_path: Path, watch: Watch = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
     return train(
-        resolve("millrace.workers.envs.toy:Identity-v0", run_dir=str(tmp_path / "runs"), **{**SMALL, **settings}),
-        resume,
-        watch,
+        resolve("tests.support.envs.toy:Identity-v0", run_dir=str(tmp_path / "runs"), **{**SMALL, **settings}), resume, watch
     )
 
 

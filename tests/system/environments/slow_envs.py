@@ -19,7 +19,7 @@ import gymnasium
 from gymnasium.envs.classic_control import CartPoleEnv, PendulumEnv
 
 from millrace.protocol.arrays import Floats
-from millrace.workers.envs.toy import Countdown, Info
+from tests.support.envs.toy import Countdown, Info
 
 IN_WORKER = "--parent" in sys.argv
 

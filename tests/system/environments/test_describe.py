@@ -23,8 +23,8 @@ from millrace.protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, 
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.worker_link import WorkerLink
-from millrace.workers.envs.toy import Countdown
 from tests.learner.config.test_resume_rules import content
+from tests.support.envs.toy import Countdown
 from tests.system.stage import preloaded
 from tests.system.stage.processes import ROOT, START_S, Stage, crowding, free_port, wait_for
 from tests.system.stage.runs import finish

@@ -80,7 +80,7 @@ def test_a_call_that_holds_the_interpreter_lock_for_longer_than_the_worker_timeo
 def test_a_step_that_hangs_ends_by_the_step_timeout_and_is_named(stage: Stage, kind: str, tmp_path: Path) -> None:
     once = tmp_path / "hung"
     settings = {"env-kwargs": f"once {once} after 20", "step-timeout-s": 3}
-    env = "millrace.workers.envs.toy:Hangs-v0"
+    env = "tests.support.envs.toy:Hangs-v0"
     if kind == "local":
         command = [sys.executable, "-m", "millrace", "train", env, "--run-dir", str(stage.runs), *flags(settings)]
         learner = Learner(command, stage.tmp_path / "train.log", stage.runs)

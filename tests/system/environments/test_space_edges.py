@@ -15,7 +15,7 @@ import pytest
 import millrace
 from millrace.protocol import env_spec
 from millrace.protocol.errors import EnvironmentFailed, UsageError
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 
 SMALL: dict[str, Any] = {
     "steps": 64, "lanes": 1, "envs": 2, "workers": 1, "rollout_steps": 8, "batch_size": 16, "n_epochs": 1, "net": (4,),

@@ -198,7 +198,7 @@ def test_a_slow_learner_loses_no_worker(stage: Stage) -> None:
 def test_training_goes_on_after_an_environment_raised(stage: Stage) -> None:
     once = stage.tmp_path / "raised"
     settings = {"env-kwargs": f"once {once} after 300"}
-    learner, workers = play(stage, settings, env="millrace.workers.envs.toy:Raises-v0")
+    learner, workers = play(stage, settings, env="tests.support.envs.toy:Raises-v0")
     learner.hears("ValueError: the toy is broken, as it was asked to be")
     began_s = time.monotonic()
     assert "toy.py" in learner.said(), "the traceback is not the worker's"
@@ -214,7 +214,7 @@ def test_training_goes_on_after_an_environment_hung(stage: Stage) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     began = stage.tmp_path / "hung"
     settings = {"min-workers": 2, "env-kwargs": f"once {began} after 300", "step-timeout-s": 1.5}
-    learner = stage.learner(address, settings, env="millrace.workers.envs.toy:Hangs-v0")
+    learner = stage.learner(address, settings, env="tests.support.envs.toy:Hangs-v0")
     workers = [stage.worker(address, f"w{number}") for number in range(2)]
     learner.until(lambda row: row["ledger/lost"] > 0, START_S, "an update with tickets dealt again")
     within("env.step hung, step timeout 1.5 s", time.time() - began.stat().st_mtime, 1.5 + 1)

@@ -61,7 +61,7 @@ def test_an_environment_that_hangs_beside_it_is_not_called_a_policy() -> None:
     policy = millrace.OwnPolicy(Hangs, {"w": (1,)}, kwargs={"where": "nowhere"})
     with (
         pytest.raises(millrace.EnvironmentFailed, match=r"a step of its environment took longer than 1\.5 s"),
-        millrace.RolloutService("millrace.workers.envs.toy:Hangs-v0", policy, step_timeout_s=1.5, **SMALL) as service,
+        millrace.RolloutService("tests.support.envs.toy:Hangs-v0", policy, step_timeout_s=1.5, **SMALL) as service,
     ):
         service.publish({"w": np.zeros(1)})
         service.gather()

@@ -110,7 +110,7 @@ def test_two_runs_in_which_the_same_ticket_kills_its_worker_give_the_same_weight
         }
         with closing(Stage(tmp_path / name)) as stage:
             address = f"tcp://127.0.0.1:{free_port()}"
-            learner = stage.learner(address, settings, env="millrace.workers.envs.toy:Dies-v0")
+            learner = stage.learner(address, settings, env="tests.support.envs.toy:Dies-v0")
             for number in range(2):
                 stage.worker(address, f"w{number}")
             return result(learner)

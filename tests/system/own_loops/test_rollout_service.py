@@ -80,7 +80,7 @@ def test_ctrl_c_ends_a_wait_and_the_workers(tmp_path: Path) -> None:
     began_s = 0.0
     with (
         pytest.raises(KeyboardInterrupt),
-        millrace.RolloutService("millrace.workers.envs.toy:Slow-v0", workers=1, env_kwargs=kwargs, **SMALL) as service,
+        millrace.RolloutService("tests.support.envs.toy:Slow-v0", workers=1, env_kwargs=kwargs, **SMALL) as service,
     ):
         service.publish(np.zeros(service.policy.size, np.float32))
         began_s = time.monotonic()

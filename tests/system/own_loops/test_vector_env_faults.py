@@ -35,7 +35,7 @@ from tests.system.stage.processes import START_S, Worker, free_port, wait_for
 SHARED_MEMORY = {"shared": True, "messages": False}
 ZEROS = np.zeros(4, np.int64)
 CLOSES_WITHIN_S = 8.0
-HANGS = "millrace.workers.envs.toy:Hangs-v0"
+HANGS = "tests.support.envs.toy:Hangs-v0"
 
 
 @pytest.fixture(params=SHARED_MEMORY)
@@ -89,7 +89,7 @@ def test_a_worker_killed_between_steps_comes_back_truncated(shared_memory: bool)
 
 
 def test_a_loss_is_reported_beside_infos_too_long_for_shared_memory() -> None:
-    env = make("millrace.workers.envs.toy:Informs-v0", wordy=1_000_000)
+    env = make("tests.support.envs.toy:Informs-v0", wordy=1_000_000)
     env.reset(seed=1)
     action = env.action_space.sample()
     assert "worker_lost" not in env.step(action)[4]
@@ -121,7 +121,7 @@ def test_a_lost_worker_is_truncated_in_the_other_autoreset_modes(mode: Autoreset
 
 
 def test_a_worker_that_dies_during_a_step_is_noticed_at_once(tmp_path: Path, shared_memory: bool) -> None:
-    env = make("millrace.workers.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared_memory)
+    env = make("tests.support.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared_memory)
     env.reset(seed=1)
     began = time.monotonic()
     truncated = [env.step(ZEROS)[3] for _ in range(4)]
@@ -135,7 +135,7 @@ def test_a_worker_that_dies_during_a_step_is_noticed_at_once(tmp_path: Path, sha
 def test_an_environment_that_ends_its_workers_again_and_again_ends_the_vector_environment(
     allowed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    env = make("millrace.workers.envs.toy:Dies-v0", after=2, k=50, workers=1, max_env_failures=allowed)
+    env = make("tests.support.envs.toy:Dies-v0", after=2, k=50, workers=1, max_env_failures=allowed)
     env.reset(seed=1)
     why = rf"^worker w0 \(.*\): its process .* SIGKILL.*; max_env_failures allows {allowed}"
     with pytest.raises(EnvironmentFailed, match=why):
@@ -147,7 +147,7 @@ def test_an_environment_that_ends_its_workers_again_and_again_ends_the_vector_en
 
 def test_a_lane_that_answered_before_its_worker_died_is_reported_in_the_next_step(tmp_path: Path) -> None:
     once = str(tmp_path / "once")
-    env = make("millrace.workers.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
+    env = make("tests.support.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
     env.reset(seed=1)  # copy 2 has seed 3: its lane, the second, dies after the first lane has stepped
     results = [env.step(ZEROS) for _ in range(6)]
     assert [step[3].tolist() for step in results[:3]] == [[False] * 4, [False] * 4, [False, False, True, True]]
@@ -174,7 +174,7 @@ def test_a_loss_is_raised_with_on_worker_loss_raise(shared_memory: bool) -> None
 
 
 def test_an_error_of_an_environment_has_the_traceback_of_the_worker() -> None:
-    env = make("millrace.workers.envs.toy:Raises-v0", after=2)
+    env = make("tests.support.envs.toy:Raises-v0", after=2)
     env.reset(seed=1)
     with pytest.raises(EnvironmentFailed, match=r"lane \d, copy 0, step 2: its environment raised ValueError") as raised:
         for _ in range(4):
@@ -455,7 +455,7 @@ def test_a_slow_step_or_a_slow_caller_does_not_lose_a_worker(elsewhere: Elsewher
     """Both take longer than the time after which a silent worker counts as lost."""
     monkeypatch.setattr(settings, "VectorEnvSettings", partial(settings.VectorEnvSettings, worker_timeout_s=2.0))
     elsewhere.start("a")
-    with millrace.make_vec("millrace.workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
+    with millrace.make_vec("tests.support.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
         env.reset(seed=1)
         assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
         time.sleep(3.0)
@@ -478,9 +478,9 @@ def test_keys_are_made_for_an_address_that_other_machines_can_reach(elsewhere: E
 def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -> None:
     elsewhere.start("a", "--no-code")
     with pytest.raises(
-        UserFacingError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"
+        UserFacingError, match=r"tests\.support\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"
     ):
-        make("millrace.workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
+        make("tests.support.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
     assert elsewhere.started[0].process.wait(10) == 2
 
 

@@ -14,7 +14,7 @@ from millrace.launch.training import train
 from millrace.learner.config.layers import resolve
 from tests.system.stage import preloaded
 
-TOY = "millrace.workers.envs.toy:"
+TOY = "tests.support.envs.toy:"
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # for a run that need not learn much
 
 

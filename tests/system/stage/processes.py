@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[3]
 T = TypeVar("T")
 LOOK_EVERY_S = 0.02
 START_S = 90.0  # importing torch takes seconds, and longer on a busy machine
-TOY = "millrace.workers.envs.toy:Slow-v0"
+TOY = "tests.support.envs.toy:Slow-v0"
 WORKER_TIMEOUT_S = 1.5
 SMALL: dict[str, object] = {
     "env-kwargs": "seconds 0.001",

@@ -75,7 +75,7 @@ def test_the_replay_ratio_holds_while_collecting_and_learning_overlap(tmp_path: 
 
 def test_dqn_learns_from_images(tmp_path: Path) -> None:
     kwargs = {"observation": "nested", "action": "offset"}
-    folder = run(tmp_path, env="millrace.workers.envs.toy:Spaces-v0", env_kwargs=kwargs, steps=800, gradient_steps=2)
+    folder = run(tmp_path, env="tests.support.envs.toy:Spaces-v0", env_kwargs=kwargs, steps=800, gradient_steps=2)
     assert ratios(folder)
 
 

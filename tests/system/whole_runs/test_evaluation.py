@@ -81,8 +81,7 @@ def test_wrong_arguments_of_evaluations_are_refused_before_training(
 ) -> None:
     with pytest.raises(UserFacingError, match=says) as caught:
         millrace.train(
-            "millrace.workers.envs.toy:Spaces-v0", inference=inference, steps=10_000, workers=1,
-            run_dir=str(tmp_path / "runs"),
+            "tests.support.envs.toy:Spaces-v0", inference=inference, steps=10_000, workers=1, run_dir=str(tmp_path / "runs"),
             progress=False, eval_env_kwargs=kwargs,
         )  # fmt: skip
     assert "\n" not in str(caught.value)

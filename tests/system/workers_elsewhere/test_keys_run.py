@@ -118,13 +118,13 @@ def test_status_of_a_run_on_this_machine_needs_nothing_but_its_folder(stage: Sta
 
 def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(stage: Stage) -> None:
     settings = {"env-kwargs": "", "insecure": " ", "advertise": "127.0.0.1"}
-    learner = stage.learner("tcp://0.0.0.0:*", settings, env="millrace.workers.envs.toy:Spaces-v0")
+    learner = stage.learner("tcp://0.0.0.0:*", settings, env="tests.support.envs.toy:Spaces-v0")
     address = join_address(learner)
     assert "is open to everybody who can reach it" in learner.said()
     worker = stage.worker(address, "w", "--no-code")
     assert worker.ends() == 2
     assert "imports a module, which this worker does not do" in worker.said()
-    learner.hears("worker w was refused: environment millrace.workers.envs.toy:Spaces-v0 imports a module")
+    learner.hears("worker w was refused: environment tests.support.envs.toy:Spaces-v0 imports a module")
 
 
 def test_a_run_on_this_machine_over_encrypted_tcp_learns_the_same(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_packed_frame_stacks_train_the_same_policy_as_unpacked_ones(tmp_path: Pa
     """Frames are packed over an encrypted connection, not between local processes. The weights are the same bits."""
 
     def stacks() -> gymnasium.Env[Any, Any]:
-        frames = gymnasium.make("millrace.workers.envs.toy:Frames-v0")
+        frames = gymnasium.make("tests.support.envs.toy:Frames-v0")
         small = TransformObservation(frames, lambda frame: frame[:40, :40, 0], spaces.Box(0, 255, (40, 40), np.uint8))
         return FrameStackObservation(small, 4)
 

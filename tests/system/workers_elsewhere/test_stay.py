@@ -9,7 +9,7 @@ import psutil
 
 from tests.system.stage.processes import START_S, TOY, Stage, Worker, wait_for
 
-IDENTITY = "millrace.workers.envs.toy:Identity-v0"
+IDENTITY = "tests.support.envs.toy:Identity-v0"
 
 
 def waits(worker: Worker, runs: int) -> psutil.Process:

@@ -16,7 +16,7 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.errors import EnvironmentFailed, UsageError
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
-from millrace.workers.envs.toy import Countdown
+from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import (
     TOY,
     bits,

@@ -25,7 +25,7 @@ from millrace.protocol.specs import Leaf, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import copy_seeds
-from millrace.workers.envs.toy import Countdown, Scripted
+from tests.support.envs.toy import Countdown, Scripted
 from tests.support.in_process.collectors import (
     TOY,
     bits,

@@ -24,9 +24,9 @@ from millrace.workers import copy_slots
 from millrace.workers.collect.collector import open_env_copies
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.described_copy import describing
-from millrace.workers.envs.toy import Countdown
 from millrace.workers.evaluate.evaluator import open_looped_copies
 from millrace.workers.vector_env.stepper import Stepper
+from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import no_pulse, run_of
 from tests.support.in_process.described import step_spec
 
@@ -93,7 +93,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[int]]:
 
 def run_with(vector: Vector = "loop") -> RunSpec:
     """A run with two copies in a lane."""
-    found = run_of("millrace.workers.envs.toy:Countdown-v0", N=2, kwargs={"k": 3})
+    found = run_of("tests.support.envs.toy:Countdown-v0", N=2, kwargs={"k": 3})
     return RunSpec(EnvSpec("Asks-v0"), found.policy, rollout_steps=8, copies=2, lanes=8, seed=1, vector=vector)
 
 

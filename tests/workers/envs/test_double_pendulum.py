@@ -36,7 +36,7 @@ from millrace.workers.envs.double_pendulum import (
     linear_accelerations,
     linear_model,
 )
-from millrace.workers.envs.lqr import LQR, discrete_model, lqr_gain
+from tests.support.envs.lqr import LQR, discrete_model, lqr_gain
 
 ROOT = Path(__file__).parents[3]
 ID = "millrace/CartDoublePendulum-v0"
@@ -456,7 +456,7 @@ def test_importing_it_is_cheap() -> None:
     asks = (
         f"import sys, {millrace.workers.envs.__name__}; assert 'millrace.workers.envs.double_pendulum' not in sys.modules;"
         f"import gymnasium; env = gymnasium.make('{ID}'); env.reset(seed=1); env.step(env.action_space.sample());"
-        "assert not sys.modules.keys() & {'pygame', 'torch', 'scipy', 'sympy', 'millrace.workers.envs.lqr'}"
+        "assert not sys.modules.keys() & {'pygame', 'torch', 'scipy', 'sympy', 'tests.support.envs.lqr'}"
     )
     done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

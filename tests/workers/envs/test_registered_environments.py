@@ -8,12 +8,11 @@ import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from millrace.workers.envs import toy
+from tests.support.envs import toy
 
 FAIL_ON_PURPOSE = {f"{kind.__name__}-v0" for kind in (*toy.Faulty.__subclasses__(), toy.OneStep)}  # "truncates after 1 step"
-REGISTERED = [
-    name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("millrace.workers.envs.")
-]
+OURS = ("millrace.workers.envs.", "tests.support.envs.")
+REGISTERED = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith(OURS)]
 
 
 @pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # Scripted counts without end

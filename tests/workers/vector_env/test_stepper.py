@@ -20,8 +20,8 @@ from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import Call, Reset, Returned, Step, Stepped
 from millrace.protocol.wire.plain_values import pack, unpack
 from millrace.workers.copies.env_loop import EnvLoop
-from millrace.workers.envs.toy import Countdown
 from millrace.workers.vector_env.stepper import Stepper
+from tests.support.envs.toy import Countdown
 from tests.support.in_process.described import step_spec
 from tests.support.numbers.bit_equality import bit_equal
 
@@ -36,7 +36,7 @@ def call(stepper: Stepper, name: str, arguments: Any, *, assign: bool = False) -
 @pytest.mark.parametrize("name", ["_k", "__class__", "_max_episode_steps"])
 @pytest.mark.parametrize("assign", [False, True])
 def test_private_attributes_are_not_given_to_a_learner_that_is_not_trusted(name: str, assign: bool) -> None:
-    step = step_spec(VectorEnvSettings("millrace.workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
+    step = step_spec(VectorEnvSettings("tests.support.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
     stepper = Stepper(step, allow_private_names=False)
     answer = call(stepper, name, [4, 4] if assign else ((), {}), assign=assign)
     assert answer.error.startswith(
@@ -56,14 +56,14 @@ def test_private_attributes_are_not_given_to_a_learner_that_is_not_trusted(name:
     ],
 )
 def test_nor_by_a_method_that_takes_their_name(method: str, arguments: Any) -> None:
-    step = step_spec(VectorEnvSettings("millrace.workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
+    step = step_spec(VectorEnvSettings("tests.support.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
     stepper = Stepper(step, allow_private_names=False)
     assert call(stepper, method, arguments).error.startswith("UsageError: '_k' begins with an underscore")
     stepper.lanes.close_all()
 
 
 def test_private_attributes_are_given_to_a_learner_that_may_run_code() -> None:
-    stepper = Stepper(step_spec(VectorEnvSettings("millrace.workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})))
+    stepper = Stepper(step_spec(VectorEnvSettings("tests.support.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})))
     assert call(stepper, "_k", [4, 5], assign=True).error == ""
     answer = call(stepper, "_k", ((), {}))
     assert (answer.error, unpack(answer.results.data)) == ("", [4, 5])

@@ -1,6 +1,6 @@
-"""Toy environments for tests and benchmarks: with known returns, with every supported space, slow ones and faulty ones.
+"""Toy environments for tests: with known returns, with every supported space, slow ones and faulty ones.
 
-Importing this file registers each class under its name: `gymnasium.make("millrace.workers.envs.toy:Countdown-v0", k=3)`.
+Importing this file registers each class under its name: `gymnasium.make("tests.support.envs.toy:Countdown-v0", k=3)`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from millrace.protocol.arrays import Floats
-
+Floats = npt.NDArray[np.float32]
 Info = dict[str, Any]
 
 

@@ -1,0 +1,1 @@
+"""Environments whose returns or faults are known, and the best controller of one that comes with millrace."""
