@@ -52,7 +52,7 @@ from millrace.workers.conversation.held import Assignment
 PROCESSES = 2
 STEPS = 128  # T
 CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
-PONG = EnvSpec("millrace.workers.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
+PONG = EnvSpec("millrace.extras.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
 NARROW = ("ours, 1 lane, bfloat16", "native, 1 lane, bfloat16")

@@ -21,7 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-import millrace.workers.envs  # noqa: F401  # registers millrace/Atari-v0
+import millrace.extras.envs  # noqa: F401  # registers millrace/Atari-v0
 
 
 class PrintUpdates(BaseCallback):

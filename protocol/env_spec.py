@@ -47,7 +47,7 @@ from millrace.protocol.errors import UsageError, first_line, safe_repr
 
 # By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
 # gymnasium imports the module.
-REGISTERING_MODULES = {"millrace": "millrace.workers.envs", "ALE": "ale_py"}
+REGISTERING_MODULES = {"millrace": "millrace.extras.envs", "ALE": "ale_py"}
 MAX_CALLABLE_BYTES = 1 << 26
 Scalar = bool | int | float | str
 EnvLike = str | GymnasiumSpec | Callable[..., object]

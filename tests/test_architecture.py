@@ -57,7 +57,6 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "conversation": {"exit_codes"},
     "supervise": {"activity", "exit_codes", "shared_weights", "slots", "watchdog"},
     "copy_slots": {"activity", "slots"},
-    "envs": set[str](),
     "copies": {"activity", "copy_slots"},
     "acting": {"activity"},
     "opponents": {"acting", "activity"},

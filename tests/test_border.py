@@ -46,12 +46,7 @@ ELSEWHERE = {  # files of an extra that do not yet stand in its folder
         "millrace/cli/look.py",
     ),
     "datasets": ("learner/recording/", "learner/algorithms/cloning/"),
-    "envs": (
-        "workers/envs/atari.py",
-        "workers/envs/double_pendulum.py",
-        "workers/envs/double_pendulum_screen.py",
-        "workers/copies/envpool_copies.py",
-    ),
+    "envs": ("workers/copies/envpool_copies.py",),
 }
 
 

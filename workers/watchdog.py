@@ -19,7 +19,6 @@ FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
 LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
 OURS = f"{Path(__file__).parents[1]}/"
 LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # how paths begin that are not the user's
-ENVIRONMENTS = f"{Path(__file__).parent / 'envs'}/"  # ours are as those of a user
 INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-packages
 
 
@@ -65,7 +64,7 @@ def deepest_frame(stacks: str) -> str:
     # In each stack the newest call comes first. The last stack is that of the main thread.
     each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)
     frames = re.findall(r'File "(.*)", line (\d+) in (\S+)', each[-1])
-    of_user = [each for each in frames if each[0].startswith(ENVIRONMENTS) or not _is_of_library(each[0])]
+    of_user = [each for each in frames if not _is_of_library(each[0])]
     for file, line, function in of_user or frames:
         return f"{file}:{line}, in {function}"
     return ""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from millrace.extras.envs.double_pendulum import DT_S, SUBSTEPS, CartDoublePendulum, Physics, linear_model
 from millrace.protocol.arrays import Doubles, Floats
-from millrace.workers.envs.double_pendulum import DT_S, SUBSTEPS, CartDoublePendulum, Physics, linear_model
 
 
 def discrete_model(physics: Physics, dt_s: float = DT_S, substeps: int = SUBSTEPS) -> tuple[Doubles, Doubles]:

@@ -21,9 +21,8 @@ import pytest
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-import millrace.workers.envs
-from millrace.protocol.arrays import Doubles
-from millrace.workers.envs.double_pendulum import (
+import millrace.extras.envs
+from millrace.extras.envs.double_pendulum import (
     DT_S,
     SPEED_LIMIT,
     SUBSTEPS,
@@ -36,6 +35,7 @@ from millrace.workers.envs.double_pendulum import (
     linear_accelerations,
     linear_model,
 )
+from millrace.protocol.arrays import Doubles
 from tests.support.envs.lqr import LQR, discrete_model, lqr_gain
 
 ROOT = Path(__file__).parents[3]
@@ -291,7 +291,7 @@ def test_gymnasium_finds_nothing_to_warn_about(linearised: bool) -> None:
 
 
 def test_the_whole_way_by_gymnasiums_name() -> None:
-    env = gymnasium.make(f"millrace.workers.envs:{ID}", link_m=0.4, linearised=True)
+    env = gymnasium.make(f"millrace.extras.envs:{ID}", link_m=0.4, linearised=True)
     assert isinstance(env.unwrapped, CartDoublePendulum)
     assert env.unwrapped.physics == dataclasses.replace(Physics(), link_m=0.4)
     assert env.spec is not None
@@ -454,7 +454,7 @@ def test_without_pygame_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
 
 def test_importing_it_is_cheap() -> None:
     asks = (
-        f"import sys, {millrace.workers.envs.__name__}; assert 'millrace.workers.envs.double_pendulum' not in sys.modules;"
+        f"import sys, {millrace.extras.envs.__name__}; assert 'millrace.extras.envs.double_pendulum' not in sys.modules;"
         f"import gymnasium; env = gymnasium.make('{ID}'); env.reset(seed=1); env.step(env.action_space.sample());"
         "assert not sys.modules.keys() & {'pygame', 'torch', 'scipy', 'sympy', 'tests.support.envs.lqr'}"
     )

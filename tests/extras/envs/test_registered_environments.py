@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from tests.support.envs import toy
 
 FAIL_ON_PURPOSE = {f"{kind.__name__}-v0" for kind in (*toy.Faulty.__subclasses__(), toy.OneStep)}  # "truncates after 1 step"
-OURS = ("millrace.workers.envs.", "tests.support.envs.")
+OURS = ("millrace.extras.envs.", "tests.support.envs.")
 REGISTERED = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith(OURS)]
 
 

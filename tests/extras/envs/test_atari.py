@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorEnv
 
+from millrace.extras.envs import atari
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.protocol.env_spec import EnvSpec
@@ -20,7 +21,6 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
 from millrace.workers.copies.envpool_copies import EnvpoolCopies
-from millrace.workers.envs import atari
 from tests.support.in_process.collectors import bits, collect, no_pulse, random_collector
 from tests.support.in_process.described import run_spec
 

@@ -21,8 +21,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
+from millrace.extras.envs.double_pendulum_screen import Screen
 from millrace.protocol.arrays import Doubles, Floats
-from millrace.workers.envs.double_pendulum_screen import Screen
 
 PendulumState = tuple[
     float, float, float, float, float, float

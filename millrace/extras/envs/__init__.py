@@ -4,11 +4,11 @@ import gymnasium
 
 gymnasium.register(
     id="millrace/CartDoublePendulum-v0",
-    entry_point="millrace.workers.envs.double_pendulum:CartDoublePendulum",
+    entry_point="millrace.extras.envs.double_pendulum:CartDoublePendulum",
     max_episode_steps=500,
 )
 gymnasium.register(
     id="millrace/Atari-v0",
-    entry_point="millrace.workers.envs.atari:make_game",
-    vector_entry_point="millrace.workers.envs.atari:make_games",
+    entry_point="millrace.extras.envs.atari:make_game",
+    vector_entry_point="millrace.extras.envs.atari:make_games",
 )
