@@ -36,10 +36,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import bars, write
+from millrace.extras.envs.envpool import envpool_spec
+from millrace.extras.envs.vectorized import make_native
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.envpool import envpool_spec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
-from millrace.protocol.envs.vectorized import make_native
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.layout import acting_size, buffer_size

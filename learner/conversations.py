@@ -19,27 +19,17 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.kinds_of_copies import copies_kind
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.specs import (
-    SCORE,
-    DescribeSpec,
-    ExtraArray,
-    PolicySpec,
-    RunSpec,
-    Vector,
-    facts_of_all_seats,
-    seat_returns,
-)
+from millrace.protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats, seat_returns
 from millrace.protocol.wire.codec import check_can_be_sent
 from millrace.protocol.wire.compression import has_zstd
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
 
 
-def describe_spec(
-    config: RolloutConfig, env: EnvSpec, vector: Vector = "loop", render_mode: str | None = None
-) -> DescribeSpec:
+def describe_spec(config: RolloutConfig, env: EnvSpec, vector: str = "loop", render_mode: str | None = None) -> DescribeSpec:
     """What `Welcome` carries while the learner does not know its environment."""
     return DescribeSpec(env, vector, render_mode, config.call_timeouts(), config.heartbeat_s())
 
@@ -61,9 +51,9 @@ def rollout_spec(
     `spaces`: those of the environment. `teams`, `scripted`: of a run with opponents.
     """
     masked, seats = spaces.masked, spaces.seats
-    if masked and config.vector == "envpool":
+    if masked and config.vector != "loop" and not copies_kind(config.vector).has_masks:
         raise UsageError(
-            "vector envpool: its environments report no action masks; use --vector loop, or --action-masks none"
+            f"vector {config.vector}: its environments report no action masks; use --vector loop, or --action-masks none"
         )
     if seats and config.vector != "loop":
         raise UsageError(f"vector {config.vector}: {env.id} has several agents, whose copies are looped; use --vector loop")

@@ -39,9 +39,10 @@ class RolloutKeywords(TypedDict, total=False):
     """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
     turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
     """
-    vector: Literal["loop", "native", "envpool"]
+    vector: str
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop.
+    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop. Packages can add
+    kinds.
     """
     acting_dtype: Literal["float32", "bfloat16"]
     """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights

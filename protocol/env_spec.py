@@ -251,7 +251,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return env
 
     def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
-        """Make `copies` copies in the environment's own vectorized form; `millrace.protocol.envs.vectorized` checks it."""
+        """Make `copies` copies in the environment's own vectorized form, whatever its autoreset mode."""
         own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, self.kwargs_of_copy()
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 

@@ -187,15 +187,12 @@ class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
     dtype: str
 
 
-Vector = Literal["loop", "native", "envpool"]
-
-
 class DescribeSpec(msgspec.Struct, frozen=True, tag=True):
     """A learner that does not know its environment yet. The worker makes one copy, describes it and closes it."""
 
     env: EnvSpec
-    vector: Vector = "loop"
-    """the form that must have the same spaces as one env copy, which the worker checks"""
+    vector: str = "loop"
+    """the kind of env copies that must have the same spaces as a single copy, which the worker checks"""
     render_mode: str | None = None
     """passed to the copy"""
     call_timeouts: CallTimeouts = CallTimeouts()
@@ -220,9 +217,9 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """N, env copies in a lane"""
     lanes: int
     seed: int
-    vector: Vector = "loop"
-    """how the copies of a lane are stepped: one after another (`loop`), or together, by the environment's own vectorized
-    form (`native`) or by envpool's
+    vector: str = "loop"
+    """how the copies of a lane are stepped: one after another (`loop`), together by the environment's own vectorized form
+    (`native`) or by envpool's (`envpool`), or in a way that a package on the worker's machine adds
     """
     zstd: bool = False
     """whether workers may also compress the larger arrays of their rollouts with Zstandard"""

@@ -79,7 +79,7 @@ MAY_PRINT = (
 )
 MAY_UNPICKLE = {"protocol/env_spec.py"}
 ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
-"""functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""
+"""functions that run code of the environment: of gymnasium, of `EnvSpec` and of the extra `envs`"""
 TORCH_IN_PROTOCOL = "protocol/policy/"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
 CONFORMANCE = "millrace/extras/conformance/"
@@ -96,7 +96,7 @@ OPTIONAL = {  # packages of an extra or of notebooks
 }
 IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `millrace.learner.rollouts.hub` on one machine
     "cloudpickle": "5 ms, for callables only",
-    "importlib.metadata": "the version, which few ask for",
+    "importlib.metadata": "the version, and kinds of env copies that others install, for which few ask",
     "millrace.learner.imports_ahead": "only if it was imported before",
     "millrace.learner.prometheus": "26 ms, for --metrics-bind only",
     "millrace.learner.recording.video": "27 ms, for --video only",

@@ -30,7 +30,6 @@ STILL = {
     ("millrace/runs.py", "datasets"),
     ("millrace/runs.py", "monitoring"),
     ("millrace/terminal.py", "monitoring"),
-    ("workers/collect/collector.py", "envs"),
 }
 FOLDER = "millrace/extras/"
 ELSEWHERE = {  # files of an extra that do not yet stand in its folder
@@ -46,7 +45,6 @@ ELSEWHERE = {  # files of an extra that do not yet stand in its folder
         "millrace/cli/look.py",
     ),
     "datasets": ("learner/recording/", "learner/algorithms/cloning/"),
-    "envs": ("workers/copies/envpool_copies.py",),
 }
 
 

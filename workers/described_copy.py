@@ -13,11 +13,11 @@ from contextlib import contextmanager
 import gymnasium
 
 from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.advice.atari_ids import instead_of_vector
 from millrace.protocol.envs.description import describe_env
-from millrace.protocol.envs.envpool import envpool_spec
+from millrace.protocol.envs.kinds_of_copies import copies_kind
 from millrace.protocol.envs.seats import SeatedEnv
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
-from millrace.protocol.envs.vectorized import make_native, vector_alternative
 from millrace.protocol.envs.which_copy import FIRST_COPY
 from millrace.protocol.errors import EnvironmentFailed, UsageError, first_line
 from millrace.protocol.space_spec import EnvDescription
@@ -39,7 +39,7 @@ def describing(spec: DescribeSpec) -> Iterator[EnvDescription]:
         env = make_copy(FIRST_COPY, lambda: spec.env.make(spec.render_mode))
     try:
         with _failures_of(spec.env), page.during(DESCRIBING):
-            _check_vectorized(spec, env)
+            _check_kind(spec, env)
             description = describe_env(env)
         yield description
     finally:
@@ -59,24 +59,17 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
         raise EnvironmentFailed(line, traceback.format_exc()) from error
 
 
-def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
-    """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy."""
-    match spec.vector:
-        case _ if isinstance(env, SeatedEnv):
-            return  # the learner refuses all but a loop
-        case "loop":
-            return
-        case "native":
-            whose, made = "its vectorized form", make_copy(FIRST_COPY, lambda: make_native(spec.env, 1))
-            observed, acted = made.single_observation_space, made.single_action_space
-            close_copy(made)
-        case "envpool":
-            whose, pool = "envpool's", envpool_spec(spec.env)
-            observed, acted = pool.observation_space, pool.action_space
+def _check_kind(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
+    """Raise `UsageError` unless the env copies that the learner asks for have the spaces of this single copy."""
+    if isinstance(env, SeatedEnv):
+        return  # the learner refuses all but a loop
+    spaces_of = copies_kind(spec.vector).spaces
+    if spaces_of is None:
+        return
+    observed, acted = spaces_of(spec.env)
     expected = observation_leaves(env.observation_space), action_spec(env.action_space)
     if (observation_leaves(observed), action_spec(acted)) != expected:
-        line = (
-            f"environment {spec.env.id}: {whose} has other spaces than itself, {observed} and {acted}; "
-            f"{vector_alternative(spec.env)}"
+        raise UsageError(
+            f"environment {spec.env.id}: vector {spec.vector}: its copies have other spaces than itself, {observed} and "
+            f"{acted}; {instead_of_vector(spec.env.id)}"
         )
-        raise UsageError(line)

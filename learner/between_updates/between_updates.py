@@ -13,6 +13,7 @@ from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.recording.training_recorder import TrainingRecorder
 from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.learner.run_folder.requests import Requests
+from millrace.protocol.envs.kinds_of_copies import copies_kind
 
 
 class BetweenUpdates(NamedTuple):
@@ -31,8 +32,14 @@ def open_files(
 
     `time_limit`: env steps after which an episode of an evaluation is truncated, if any.
     """
-    refusal = "envpool's env copies have no attributes" if run.spec.vector == "envpool" else ""
-    requests = Requests(EnvAttributes(run.tally.state.env_attributes, refusal))
+    requests = Requests(EnvAttributes(run.tally.state.env_attributes, _why_no_attributes(run.spec.vector)))
     evaluations = Evaluations(run, time_limit)
     files = RunFiles(run, evaluations, requests.attributes)
     return BetweenUpdates(run.tally, files, Audience(run, callbacks, files, requests, dataset), evaluations)
+
+
+def _why_no_attributes(vector: str) -> str:
+    """Why attributes of the env copies can't be set; empty if they can."""
+    if vector == "loop" or copies_kind(vector).has_attributes:
+        return ""
+    return f"the env copies of vector {vector} have no attributes"

@@ -15,10 +15,10 @@ from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.bounds import Count, Natural
 from millrace.protocol.env_spec import Scalar
+from millrace.protocol.envs.kinds_of_copies import KINDS
 from millrace.protocol.envs.seats import STATE
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.flags.fields import Flag, NotNegative, Positive
-from millrace.protocol.specs import Vector
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 HEARTBEAT_S = 1.0
@@ -66,9 +66,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
     turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
     """
-    vector: Free[Vector] = "loop"
+    vector: Annotated[Free[str], Flag(f"{{{','.join(KINDS)}}}|NAME")] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop.
+    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop. Packages can add
+    kinds.
     """
     acting_dtype: Free[ActingDtype] = "float32"
     """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights that

@@ -18,6 +18,7 @@ from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
 from millrace.protocol.address import advertised_address, check_address
 from millrace.protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from millrace.protocol.env_spec import check_arguments
+from millrace.protocol.envs.kinds_of_copies import check_kind
 from millrace.protocol.envs.wrappers import wrapper_name
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.flags.fields import fields_of
@@ -167,6 +168,7 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
             f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
         )
     try:
+        check_kind(config.vector)
         for wrapper in config.wrappers:
             wrapper_name(wrapper)
         check_address(config.bind)

@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.errors import UsageError
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import OpenEnvCopies
-from millrace.workers.copies.env_copies import VectorCopies
 from tests.support.envs.toy import Scripted
 from tests.support.in_process.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
 

@@ -10,6 +10,7 @@ import gymnasium
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.activity import (
@@ -23,7 +24,7 @@ from millrace.workers.activity import (
     activity,
     share_activity,
 )
-from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
+from millrace.workers.copies.env_copies import LoopedCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import EnvLoop
 from tests.support.envs.toy import Countdown

@@ -18,8 +18,7 @@ import numpy.typing as npt
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.bounds import Stages
 from millrace.protocol.envs.env_actions import action_converter_of
-from millrace.protocol.envs.envpool import envpool_spec
-from millrace.protocol.envs.vectorized import make_native
+from millrace.protocol.envs.kinds_of_copies import copies_kind
 from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.errors import EnvironmentFailed, PolicyFailed
 from millrace.protocol.messages import Weights
@@ -29,18 +28,15 @@ from millrace.protocol.policy.policy import Policy
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import RolloutActions, acting_of
-from millrace.workers.activity import ENV_CALLS, MAKING, activity
+from millrace.workers.activity import ENV_CALLS, activity
 from millrace.workers.collect.collected_lane import CollectedLane
 from millrace.workers.conversation.held import Assignment
-from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from millrace.workers.copies.env_copies import EnvCopies
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.envpool_copies import EnvpoolCopies
 from millrace.workers.copies.open_lanes import OpenLanes
 from millrace.workers.copies.row_writers import write_numbers
-from millrace.workers.copies.seated_copies import SeatedCopies
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
-from millrace.workers.copy_slots import make_copy
 from millrace.workers.opponents import KnownOpponents, Opponents
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
@@ -51,19 +47,8 @@ StepAll = Callable[[Sequence[int], Array, Pulse], None]
 
 def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
     """The env copies of a lane in this process, of the kind that the run asks for."""
-    first, makes, keys = EnvCopy(lane * run.copies, lane), [run.env.make] * run.copies, run.policy.critic_keys
-    match run.vector:
-        case "native":
-            with activity().during(MAKING):
-                env = make_copy(first, lambda: make_native(run.env, run.copies))
-                return VectorCopies(env, run.facts, masked=run.masked, critic_keys=keys)
-        case "envpool":
-            with activity().during(MAKING):  # the module that registers the environment is imported
-                return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
-        case "loop" if run.seats:
-            return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first)
-        case "loop":
-            return LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
+    copies: EnvCopies = copies_kind(run.vector).open(run, EnvCopy(lane * run.copies, lane), pulse)
+    return copies
 
 
 def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:

@@ -260,4 +260,4 @@ def _envpool(**kwargs: Any) -> tuple[str, dict[str, Any]]:
     return f"{settings.game}-v5", options | sizes
 
 
-make_game.envpool = _envpool  # type: ignore[attr-defined]  # for protocol/envs/envpool.py
+make_game.envpool = _envpool  # type: ignore[attr-defined]  # for `millrace.extras.envs.envpool`

@@ -11,3 +11,9 @@ def preprocessed(env_id: str) -> str:
     """What to write in place of ALE's id of a game, for the usual wrappers (DeepMind's); empty for any other id."""
     match = _ALE.fullmatch(env_id)
     return f"millrace/Atari-v0 --env-kwargs game {match[1] or match[2]}" if match else ""
+
+
+def instead_of_vector(env_id: str) -> str:
+    """What to do about an id whose copies can't be stepped in the way that the run asks for."""
+    ours = preprocessed(env_id)
+    return f"take {ours}, or use --vector loop" if ours else "use --vector loop"

@@ -12,15 +12,16 @@ import pytest
 from gymnasium.vector import VectorEnv
 
 from millrace.extras.envs import atari
+from millrace.extras.envs.envpool import envpool_spec
+from millrace.extras.envs.envpool_copies import EnvpoolCopies
+from millrace.extras.envs.vector_copies import VectorCopies
+from millrace.extras.envs.vectorized import make_native
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.envpool import envpool_spec
-from millrace.protocol.envs.vectorized import make_native
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
-from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
-from millrace.workers.copies.envpool_copies import EnvpoolCopies
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, copy_seeds
 from tests.support.in_process.collectors import bits, collect, no_pulse, random_collector
 from tests.support.in_process.described import run_spec
 
@@ -247,7 +248,8 @@ def test_the_step_after_an_end_only_resets(kind: str) -> None:
 def test_an_id_of_the_emulators_own_is_refused_where_one_copy_shows_something_else() -> None:
     env = EnvSpec("ALE/Pong-v5")
     with pytest.raises(
-        UsageError, match=r"has other spaces .*; take millrace/Atari-v0 --env-kwargs game Pong, or use"
+        UsageError,
+        match=r"vector native: its copies have other spaces .*; take millrace/Atari-v0 --env-kwargs game Pong, or use",
     ) as caught:
         run_spec(Config(env=env.id, vector="native"), env)
     assert "\n" not in str(caught.value)

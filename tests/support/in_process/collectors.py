@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 import msgspec
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.launch.training import train
 from millrace.learner.config.layers import resolve
 from millrace.learner.rollouts.evaluation_dealer import episode_seeds
@@ -25,7 +26,7 @@ from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
 from millrace.workers.conversation.held import Assignment
-from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
+from millrace.workers.copies.env_copies import LoopedCopies
 from millrace.workers.evaluate.evaluator import Evaluator
 
 TOY = "tests.support.envs.toy:"
@@ -116,7 +117,7 @@ def bits(rollout: Rollout) -> dict[str, object]:
     return found
 
 
-def trained(folder: Path, vector: Literal["native", "envpool"], workers: int) -> bytes:
+def trained(folder: Path, vector: str, workers: int) -> bytes:
     """The policy file of a short run on CartPole-v1 with this kind of env copies."""
     config = resolve(
         "CartPole-v1", vector=vector, steps=1_500, workers=workers, transport="inproc", eval_episodes=1,

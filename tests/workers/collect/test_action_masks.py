@@ -11,6 +11,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.action_masks import has_mask, without_mask
@@ -22,7 +23,6 @@ from millrace.protocol.rollout import Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector, OpenEnvCopies
-from millrace.workers.copies.env_copies import VectorCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import EnvironmentFailed, UsageError
 from millrace.protocol.specs import RunSpec
-from millrace.workers.copies.env_copies import LoopedCopies, VectorCopies
+from millrace.workers.copies.env_copies import LoopedCopies
 from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import (
     TOY,

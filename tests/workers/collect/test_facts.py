@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from millrace.extras.envs.envpool_copies import EnvpoolCopies
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import Evaluate
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.copies.env_copies import VectorCopies
 from millrace.workers.copies.env_errors import CopyFailed
-from millrace.workers.copies.envpool_copies import EnvpoolCopies
 from millrace.workers.copies.facts import facts_of_copies, facts_of_info
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator

@@ -13,8 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit, TransformObservation
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.workers.copies.env_copies import VectorCopies
 from tests.support.in_process.collectors import collect, evaluated, loop_over, random_collector, random_policy, run_around
 
 STEP = "expected (observation, reward, terminated, truncated, info)"

@@ -9,10 +9,11 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from pettingzoo.utils.wrappers import BaseWrapper
 
+from millrace.extras.envs.vector_copies import VectorCopies
 from millrace.protocol.envs.seats import seated
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.wire.plain_values import pack
-from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.seated_copies import SeatedCopies
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, run_of

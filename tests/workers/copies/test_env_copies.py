@@ -18,7 +18,7 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.messages import Reset
-from millrace.protocol.specs import DescribeSpec, RunSpec, Vector
+from millrace.protocol.specs import DescribeSpec, RunSpec
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers import copy_slots
 from millrace.workers.collect.collector import open_env_copies
@@ -91,7 +91,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[int]]:
     copy_slots._of_process.cache_clear()
 
 
-def run_with(vector: Vector = "loop") -> RunSpec:
+def run_with(vector: str = "loop") -> RunSpec:
     """A run with two copies in a lane."""
     found = run_of("tests.support.envs.toy:Countdown-v0", N=2, kwargs={"k": 3})
     return RunSpec(EnvSpec("Asks-v0"), found.policy, rollout_steps=8, copies=2, lanes=8, seed=1, vector=vector)
@@ -159,7 +159,7 @@ def test_copies_that_play_evaluations_are_numbered_among_themselves(taken: set[i
 
 
 @pytest.mark.parametrize("vector", ["loop", "native"])
-def test_the_copy_that_is_described_is_number_0(vector: Vector, taken: set[int]) -> None:
+def test_the_copy_that_is_described_is_number_0(vector: str, taken: set[int]) -> None:
     with describing(DescribeSpec(EnvSpec("Asks-v0"), vector)):
         assert Asks.made == [EnvCopy(slot=0), EnvCopy(slot=1)][: 1 if vector == "loop" else 2]
     assert not taken

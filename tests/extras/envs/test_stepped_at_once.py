@@ -16,15 +16,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from millrace.extras.envs.envpool import envpool_spec
+from millrace.extras.envs.envpool_copies import EnvpoolCopies
+from millrace.extras.envs.vector_copies import VectorCopies
+from millrace.extras.envs.vectorized import make_native
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.envpool import envpool_spec
-from millrace.protocol.envs.vectorized import make_native
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
-from millrace.workers.copies.env_copies import LoopedCopies, StepResult, VectorCopies, copy_seeds
-from millrace.workers.copies.envpool_copies import EnvpoolCopies
+from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seeds
 from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from tests.support.in_process.described import run_spec
@@ -212,7 +213,7 @@ SUTTON = EnvSpec("CartPole-v1", {"sutton_barto_reward": True, "max_episode_steps
         (
             "native",
             EnvSpec("test/Other-v0"),
-            r"its vectorized form has other spaces than itself, Box.*\(2,\).*; use --vector loop",
+            r"vector native: its copies have other spaces than itself, Box.*\(2,\).*; use --vector loop",
         ),
         ("envpool", EnvSpec(f"{TOY}Countdown-v0"), "envpool has none of this name; use --vector loop"),
         ("envpool", EnvSpec("Acrobot-v1"), "envpool has none of this name"),  # it means somebody else's
@@ -245,5 +246,3 @@ def test_where_the_policy_acts_beside_the_learner_copies_are_stepped_one_by_one(
     for vector in ("native", "envpool"):
         with pytest.raises(UsageError, match=f"inference learner: vector: expected loop, got {vector}"):
             resolve("CartPole-v1", vector=vector, inference="learner")
-    with pytest.raises(UsageError, match="vector: expected one of loop, native, envpool, got 'sync'"):
-        resolve("CartPole-v1", vector="sync")

@@ -11,7 +11,6 @@ from typing import Any
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.advice.atari_ids import preprocessed
 from millrace.protocol.errors import UsageError
 
 
@@ -45,9 +44,3 @@ def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
             f"vector environment {env}: metadata['autoreset_mode']: expected {AutoresetMode.NEXT_STEP}, got {mode}; "
             "make it with autoreset_mode=AutoresetMode.NEXT_STEP"
         )
-
-
-def vector_alternative(env: EnvSpec) -> str:
-    """Advice for an id whose vectorized form cannot be used, as text for an error message."""
-    ours = preprocessed(env.id)
-    return f"take {ours}, or use --vector loop" if ours else "use --vector loop"

@@ -2,7 +2,7 @@
 
 Rule: an id means the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and gymnasium's
 time limit applies. This file maps ids to envpool tasks and makes the env copies; the row format is kept by
-`workers/copies/envpool_copies.py`.
+`envpool_copies.py`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import VectorEnv
 
+from millrace.extras.envs.vectorized import check_unwrapped_id
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.vectorized import check_unwrapped_id, vector_alternative
+from millrace.protocol.envs.advice.atari_ids import instead_of_vector
 from millrace.protocol.errors import UsageError
 
 MAX_EPISODE_STEPS = 2**31 - 1  # envpool counts steps in an int32
@@ -35,7 +36,7 @@ class EnvpoolSpec(NamedTuple):
     options: dict[str, Any]
     """keyword arguments of `envpool.make`"""
     limit: int
-    """steps after which `millrace.workers.copies.envpool_copies` truncates an episode; envpool itself does not"""
+    """steps after which `EnvpoolCopies` truncates an episode; envpool itself does not"""
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     """Observation and action space of one copy."""
@@ -71,7 +72,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
     try:
         task, options = _task_and_options(env, known)
         if task not in envpool.list_all_envs():
-            raise UsageError(f"environment {env.id}: envpool has none of this name; {vector_alternative(env)}")
+            raise UsageError(f"environment {env.id}: envpool has none of this name; {instead_of_vector(env.id)}")
         with _ignore_warnings():
             made = envpool.make_spec(task, **options)
             observation, action = made.gymnasium_observation_space, made.gymnasium_action_space

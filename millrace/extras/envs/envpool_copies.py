@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from millrace.extras.envs.envpool import EnvpoolSpec
 from millrace.protocol.arrays import Array
-from millrace.protocol.envs.envpool import EnvpoolSpec
 from millrace.protocol.envs.spaces import make_flatten
 from millrace.workers.activity import RESETTING, STEPPING, activity
 from millrace.workers.copies.env_copies import Leaves, StepResult

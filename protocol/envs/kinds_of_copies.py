@@ -1,0 +1,74 @@
+"""The kinds of env copies: how the N copies of a lane are stepped (`--vector`).
+
+Rule: a kind is named as `module:name`, and imported when a run asks for it. Ours stand in `KINDS`. Other packages install
+theirs as entry points of the group `millrace.copies`, which are read only for a name that isn't ours. A learner imports a
+kind, too, but for `loop`, which can do all: the module of a kind may import a simulator in functions only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.envs.which_copy import EnvCopy
+from millrace.protocol.errors import UsageError, did_you_mean
+from millrace.protocol.own_module import import_own
+from millrace.protocol.specs import RunSpec
+
+KINDS = {
+    "loop": "millrace.workers.copies.loop:LOOP",
+    "native": "millrace.extras.envs.kinds:NATIVE",
+    "envpool": "millrace.extras.envs.kinds:ENVPOOL",
+}
+GROUP = "millrace.copies"
+
+
+class CopiesKind(NamedTuple):
+    """A way to step the env copies of a lane."""
+
+    open: Callable[[RunSpec, EnvCopy, Callable[[], None]], Any]
+    """Makes the copies of a lane, as `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy` says which copy the first one is;
+    the last argument is called between two calls of the environment, and may raise. Raises `UsageError` if the environment
+    has no such copies.
+    """
+    spaces: Callable[[EnvSpec], tuple[gymnasium.Space[Any], gymnasium.Space[Any]]] | None = None
+    """Observation and action space of one copy: a worker refuses them if the environment itself has others. None: they are
+    those of the environment. Raises `UsageError`, as `open` does.
+    """
+    has_masks: bool = True
+    """Whether its copies report masks of the allowed actions, where the environment does."""
+    has_attributes: bool = True
+    """Whether attributes of its copies can be set."""
+
+
+def copies_kind(name: str) -> CopiesKind:
+    """Import a kind. Raises `UsageError` if it is neither ours nor installed, or can't be imported."""
+    what = f"vector {name}"
+    module, _, qualname = _place(name).partition(":")
+    found = attribute(import_own(module, what), qualname)
+    if not isinstance(found, CopiesKind):
+        raise UsageError(f"{what}: expected {module}:{qualname} to be a CopiesKind, got {type(found).__name__}")
+    return found
+
+
+def check_kind(name: str) -> None:
+    """Raise `UsageError` if a kind is neither ours nor installed. Imports nothing."""
+    _place(name)
+
+
+def _place(name: str) -> str:
+    """Where the kind is, as `module:name`. Raises `UsageError`."""
+    if name in KINDS:
+        return KINDS[name]
+    from importlib import metadata
+
+    installed = {each.name: each.value for each in metadata.entry_points(group=GROUP)}
+    if name in installed:
+        return installed[name]
+    known = [*KINDS, *sorted(installed)]
+    hint = did_you_mean(name, known) or "; is the package that has it installed here?"
+    raise UsageError(f"vector {name}: expected one of {', '.join(known)}{hint}")

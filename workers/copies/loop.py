@@ -1,0 +1,22 @@
+"""The kind of env copies that a run has if it asks for no other: a loop over single copies, with one agent or several."""
+
+from __future__ import annotations
+
+from millrace.protocol.envs.kinds_of_copies import CopiesKind
+from millrace.protocol.envs.which_copy import EnvCopy
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import LoopedCopies
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.seated_copies import SeatedCopies
+
+
+def open_loop(run: RunSpec, first: EnvCopy, pulse: Pulse) -> LoopedCopies:
+    """Make the copies of a lane."""
+    makes = [run.env.make] * run.copies
+    keys = run.policy.critic_keys
+    if run.seats:
+        return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first)
+    return LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
+
+
+LOOP = CopiesKind(open_loop)
