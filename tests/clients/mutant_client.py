@@ -18,7 +18,8 @@ import msgpack
 import msgspec
 import numpy as np
 
-from millrace.protocol.arrays import Floats
+from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.env_spec import AllowedCode
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
     Collect,
@@ -56,6 +57,7 @@ from millrace.workers.worker import Worker, WorkerOptions, identity
 
 replace = msgspec.structs.replace
 FLAT = np.zeros(0, np.uint8)
+NO_OPTIONS = np.frombuffer(pack(None), np.uint8)
 
 
 class Mutant(WorkerLink):
@@ -65,9 +67,14 @@ class Mutant(WorkerLink):
         super().__init__(address, f"mutant-{os.getpid()}")
         self.mutant = mutant
         self.session = self.first_session = self.beats = self.attempt = self.newest = 0
-        self.said_hello = self.described = False
+        self.said_hello = self.described = self.begins_again = False
         self.versions = set[int]()  # of the weights that came
         self.arrived = 0  # permits
+        self.copies = 0  # of a lane that is stepped
+        self.incarnation = 0  # the highest one
+        self.asked: dict[int, int] = {}  # the learner's ticket, by the one that the worker was given
+        self.tickets = set[int]()  # of orders and permits that came
+        self.answered = set[int]()  # tickets
         self.late_drain: Drain | None = None
         self.kept: list[ToLearner] = []
         self.drains, self.lost_session = False, 0
@@ -96,6 +103,21 @@ class Mutant(WorkerLink):
             case "forgotten heartbeat", Heartbeat():
                 self.beats += 1
                 return [message] if self.beats <= 3 else []
+            case "steps counted by session", Heartbeat():
+                self.first_session = self.first_session or message.session
+                return [replace(message, steps=message.steps if message.session == self.first_session else 0)]
+            case "lists every ticket that came", Heartbeat():
+                return [replace(message, tickets=tuple(sorted(self.tickets)))]
+            case "leaves without Goodbye", Goodbye():
+                return []
+            case "wrong ticket", Stepped():
+                return [replace(message, ticket=message.ticket - 1)]
+            case "wrong incarnation", Stepped():
+                return [replace(message, incarnation=0)]
+            case "executes every order", Stepped():
+                return [replace(message, ticket=self.asked[message.ticket])]
+            case "rows in another order", Stepped():
+                return [replace(message, obs=tuple(leaf[::-1].copy() for leaf in message.obs))]
             case "wrong dtype", Stepped():
                 return [replace(message, reward=message.reward.astype(np.float32))]
             case "lane not owned", Stepped() | Rollout():
@@ -112,6 +134,21 @@ class Mutant(WorkerLink):
                 return [replace(message, episodes=tuple(replace(each, reward=each.reward + 1) for each in message.episodes))]
             case "wrong log-probabilities", Rollout():
                 return [replace(message, log_prob=message.log_prob * np.float32(0.9))]
+            case "wrong episode length", Rollout():
+                return [replace(message, episodes=tuple(replace(each, length=each.length + 1) for each in message.episodes))]
+            case "forgets the last observation of a rollout", Rollout() if message.sequence:
+                return [replace(message, obs=tuple(_with_first_row(leaf, 0) for leaf in message.obs))]
+            case "forgets who ended in the last row", Rollout():
+                return [replace(message, valid=_with_first_row(message.valid, True))]
+            case "forgets who is reset first", Rollout(resets=np.ndarray() as resets):
+                return [replace(message, resets=_with_first_row(resets, False))]
+            case "resets a copy in the step that ends its episode", Rollout():
+                ends = (message.terminated | message.truncated)[:-1]
+                return [replace(message, obs=tuple(_with_first_of_the_next(leaf, ends) for leaf in message.obs))]
+            case "sends no rollout again", Rollout():
+                was_sent = message.ticket in self.answered
+                self.answered.add(message.ticket)
+                return [] if was_sent else [message]
             case "every row valid", Rollout():
                 return [replace(message, valid=np.ones_like(message.valid))]
             case "wrong sequence", Rollout():
@@ -151,6 +188,12 @@ class Mutant(WorkerLink):
                 return [replace(message, reward=message.reward.astype(np.float32))]
             case "rows without an end", EpisodeRows():
                 return [replace(message, truncated=np.zeros_like(message.truncated))]
+            case "an episode more", Evaluated():
+                return [replace(message, episodes=(*message.episodes, message.episodes[-1]))]
+            case "evaluates again", Evaluated() if message.ticket in self.answered:
+                return [replace(message, episodes=tuple(replace(each, reward=each.reward - 1) for each in message.episodes))]
+            case "evaluates again", Evaluated():
+                self.answered.add(message.ticket)
             case "cuts nothing", Evaluated():
                 return [replace(message, cut=(False,) * len(message.cut))]
             case "replies counted wrongly", Heartbeat():
@@ -175,6 +218,42 @@ class Mutant(WorkerLink):
                 obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in run.observation)
                 flags = np.zeros(N, bool)
                 self.say(Stepped(session, 1, 0, 0, obs, np.zeros(N), flags, flags, FLAT))
+            case "begins again at a repeated Welcome", Welcome() if message.session == self.session:
+                self.begins_again = True
+                return []
+            case "begins again at a repeated Welcome", Step() if self.begins_again:
+                self.begins_again = False
+                copies = len(message.actions[0])
+                order = (message.session, message.ticket, message.lane, message.incarnation)
+                return [Reset(*order, tuple(range(copies)), (1,) * copies, NO_OPTIONS)]
+            case "lists every ticket that came", Reset() | Step():
+                self.tickets.add(message.ticket)
+            case "lists every ticket that came", Collect():
+                self.tickets |= {permit.ticket for permit in message.permits}
+            case "takes a run of any agents", Welcome(_, _, RunSpec() as run):
+                return [replace(message, run=replace(run, seats=(), takes_turns=False))]
+            case "takes a run of any agents", Weights():
+                return []
+            case "resets all copies", Welcome(_, _, StepSpec() as run):
+                self.copies = run.lanes[0]
+            case "resets all copies", Reset():
+                seeds = (message.seeds * self.copies)[: self.copies]
+                return [replace(message, copies=tuple(range(self.copies)), seeds=seeds)]
+            case "one seed for all copies of a lane", Reset():
+                return [replace(message, seeds=message.seeds[:1] * len(message.seeds))]
+            case "one action for all copies", Step():
+                return [replace(message, actions=tuple(np.repeat(leaf[:1], len(leaf), 0) for leaf in message.actions))]
+            case "obeys a lower incarnation", Reset() | Step():
+                self.incarnation = max(self.incarnation, message.incarnation)
+                return [replace(message, incarnation=self.incarnation)]
+            case "obeys a lower incarnation", Collect():
+                self.incarnation = max(self.incarnation, *(permit.incarnation for permit in message.permits))
+                permits = [replace(permit, incarnation=self.incarnation) for permit in message.permits]
+                return [replace(message, permits=tuple(permits))]
+            case "does not wait for weights", Collect(version=version) if self.versions and version not in self.versions:
+                return [replace(message, version=max(self.versions))]
+            case "evaluates without end", Evaluate():
+                return [replace(message, most_steps=10_000)]
             case "any Welcome", Welcome():
                 return [replace(message, attempt=self.attempt)]
             case "one autoreset mode", Welcome(_, _, StepSpec() as run):
@@ -196,7 +275,7 @@ class Mutant(WorkerLink):
             case "evaluates by other seeds", Evaluate(seeds=seeds):
                 return [replace(message, seeds=tuple(range(7, 7 + len(seeds))))]
             case "resets without options", Reset():
-                return [replace(message, options=np.frombuffer(pack(None), np.uint8))]
+                return [replace(message, options=NO_OPTIONS)]
             case "answers no order again", Reset() | Step():
                 was_said, self.newest = message.ticket == self.newest, message.ticket
                 return [] if was_said else [message]
@@ -242,8 +321,9 @@ class Mutant(WorkerLink):
                 begin, self.arrived = self.arrived, self.arrived + len(message.permits)
                 permits = [replace(each, sequence=n) for n, each in enumerate(message.permits, begin)]
                 return [replace(message, permits=tuple(permits))]
-            case "executes a repeated order again", _ if hasattr(message, "ticket") and hasattr(message, "incarnation"):
-                self.newest = max(self.newest + 1, message.ticket * 1000)
+            case "executes every order", Reset() | Step():
+                self.newest += 1
+                self.asked[self.newest] = message.ticket
                 return [replace(message, ticket=self.newest)]
             case "any session", _ if hasattr(message, "session") and not isinstance(message, Welcome):
                 return [replace(message, session=self.session)]
@@ -254,6 +334,22 @@ class Mutant(WorkerLink):
     def say(self, message: ToLearner) -> None:
         """Send a message that nobody asked for."""
         super().send(encode(message))
+
+
+def _with_first_row(rows: Array, value: float) -> Array:
+    """The rows [T, …], with this value in all of the first one."""
+    return np.concatenate([np.full_like(rows[:1], value), rows[1:]])
+
+
+def _with_first_of_the_next(obs: Array, ends: Array) -> Array:
+    """The observations [T+1, N, …], with the first one of an episode also in place of the last one before.
+
+    `ends` [T-1, N]: the rows that end an episode, but for the last row.
+    """
+    changed = obs.copy()
+    t, n = np.nonzero(ends)
+    changed[t + 1, n] = obs[t + 2, n]
+    return changed
 
 
 def _one_for_all(self: Categorical, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
@@ -274,11 +370,13 @@ def main(mutant: str, address: str) -> int:
     signals: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: signals.append(number))
     link = Mutant(mutant, address)
-    who = identity(f"mutant-{os.getpid()}")
+    nonce = 7 if mutant == "one process_nonce for every process" else None
+    who = identity(f"mutant-{os.getpid()}", nonce)
     link.attempt = who.process_nonce + 1 if mutant == "any Welcome" else 0
     session = Session(who, time.monotonic(), join_timeout_s=30.0)
-    left = Worker(link, session, WorkerOptions(stop_requests=lambda: len(signals))).run()
-    return left.exit_code
+    options = WorkerOptions(code=AllowedCode.CALLABLES, stop_requests=lambda: len(signals))
+    left = Worker(link, session, options).run()
+    return 1 if mutant == "drained is an error" else left.exit_code
 
 
 if __name__ == "__main__":

@@ -28,7 +28,11 @@ class Mutant(NamedTuple):
     rule: Rule
     got: str
     """part of what the report says was got"""
+    env: str = "CartPole-v1"
 
+
+CROWD = "tests.support.users_code.seat_envs:ChainCrowd"
+GAME = "tests.support.users_code.seat_envs:ChainGame"
 
 MUTANTS = [
     Mutant("stale session", "environment", "joins again after Rejoin", rules.SESSION, "session"),
@@ -98,28 +102,67 @@ MUTANTS = [
     Mutant("ignores revoke", "environment", "is released while", rules.RELEASE, "observations of the copies before"),
     Mutant("keeps unlisted lanes", "environment", "does not list", rules.UNLISTED, "observations of the copies before"),
     Mutant("last words after Refuse", "environment", "refused in a session", rules.AFTER_REFUSE, "Goodbye("),
+    Mutant("one process_nonce for every process", "environment", "draws another", rules.REAPPEARS, "the same"),
+    Mutant("begins again at a repeated Welcome", "environment", "copy of its Welcome", rules.REPEATED_WELCOME, "another"),
+    Mutant("steps counted by session", "environment", "an order of another session", rules.HEARTBEAT_STEPS, "0"),
+    Mutant("lists every ticket that came", "environment", "lists no finished", rules.HEARTBEAT_TICKETS, "ticket"),
+    Mutant("lists every ticket that came", "collector", "a late Collect", rules.HEARTBEAT_TICKETS, "which was answered"),
+    Mutant("lists every ticket that came", "collector", "forgets the session", rules.HEARTBEAT_TICKETS, "ticket"),
+    Mutant("drained is an error", "environment", "says Goodbye after Drain", rules.DRAIN, "exit code 1"),
+    Mutant("leaves without Goodbye", "environment", "says Goodbye after SIGTERM", rules.STOP, "without Goodbye"),
+    Mutant("wrong ticket", "environment", "answers Reset and Step", rules.ORDER_ONLY, "ticket"),
+    Mutant("wrong incarnation", "environment", "starts a lane again", rules.INCARNATION, "incarnation 0"),
+    Mutant("obeys a lower incarnation", "environment", "starts a lane again", rules.INCARNATION, "incarnation 2"),
+    Mutant("obeys a lower incarnation", "collector", "starts a lane again", rules.INCARNATION, "Rollout("),
+    Mutant("executes every order", "environment", "executes an order once", rules.ORDER_ONCE, ""),
+    Mutant("executes every order", "environment", "ignores a late copy of an order", rules.ORDER_OLD, "Stepped("),
+    Mutant("rows in another order", "environment", "own seed and actions", rules.SEEDED, "another"),
+    Mutant("one seed for all copies of a lane", "environment", "own seed and actions", rules.SEEDED, "another"),
+    Mutant("one action for all copies", "environment", "own seed and actions", rules.OWN_ROW, "another"),
+    Mutant("resets all copies", "environment", "only the copies that a Reset lists", rules.RESET_SOME, "others"),
+    Mutant("forgets the last observation of a rollout", "collector", "collects rollouts", rules.CONTINUES, "another"),
+    Mutant("forgets who ended in the last row", "collector", "keeps the row format", rules.FIRST_VALID, "True"),
+    Mutant(
+        "resets a copy in the step that ends its episode",
+        "collector",
+        "keeps the row format",
+        rules.LAST_OBSERVATION,
+        "the first one",
+    ),
+    Mutant("wrong episode length", "collector", "keeps the row format", rules.EPISODES, ""),
+    Mutant("sends no rollout again", "collector", "sends a lost rollout again", rules.ROLLOUT_ONCE, "none within"),
+    Mutant("does not wait for weights", "collector", "waits for the weights", rules.VERSION, "version 1"),
+    Mutant("keeps unlisted lanes", "collector", "does not list", rules.UNLISTED, "Rollout("),
+    Mutant("an episode more", "collector", "evaluates", rules.EVALUATE, "3"),
+    Mutant("evaluates again", "collector", "evaluates", rules.EVALUATE_ONCE, "another"),
+    Mutant("evaluates without end", "collector", "evaluates", rules.CUT, "steps"),
+    Mutant("takes a run of any agents", "collector", "a run of agents", rules.OTHER_AGENTS, "none within"),
+    Mutant("every row valid", "collector", "collects rollouts", rules.SEATS, "valid: expected", GAME),
+    Mutant("forgets who is reset first", "collector", "keeps the row format", rules.FIRST_RESETS, "False", GAME),
+    Mutant("wrong episode return", "collector", "keeps the row format", rules.EPISODES, "", CROWD),
+    Mutant("wrong log-probabilities", "collector", "collects rollouts", rules.LOG_PROB, "-", GAME),
 ]
 
 
-def checked(mutant: str, profile: str, names: set[str]) -> list[CheckResult]:
+def checked(mutant: str, profile: str, env: str, names: set[str]) -> list[CheckResult]:
     """The results of the checks whose names contain one of these."""
     checks = [check for check in PROFILES[profile] if any(name in check.name for name in names)]
     assert checks, names
     client = ClientCommand((sys.executable, "-m", "tests.clients.mutant_client", mutant, "{address}"))
-    return conform(client, checks, Settings(EnvSpec("CartPole-v1"), patience_s=3.0), 100.0, lambda result: None)
+    return conform(client, checks, Settings(EnvSpec(env), patience_s=3.0), 100.0, lambda result: None)
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: f"{mutant.name}, {mutant.profile}")
 def test_the_report_names_the_rule_that_a_mutant_breaks(mutant: Mutant) -> None:
-    found = [each for each in checked(mutant.name, mutant.profile, {mutant.check}) if each.outcome == "failed"]
+    found = [each for each in checked(mutant.name, mutant.profile, mutant.env, {mutant.check}) if each.outcome == "failed"]
     assert found, f"{mutant.name} was not caught"
     assert found[0].rule == mutant.rule, explanation(found[0])
     assert mutant.got in found[0].got, explanation(found[0])
     assert mutant.rule.section in " ".join(" ".join(explanation(found[0])).split())
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_without_a_mistake_the_same_checks_pass(profile: str) -> None:
-    names = {mutant.check for mutant in MUTANTS if mutant.profile == profile}
-    found = checked("none", profile, names)
+@pytest.mark.parametrize(("profile", "env"), sorted({(mutant.profile, mutant.env) for mutant in MUTANTS}))
+def test_without_a_mistake_the_same_checks_pass(profile: str, env: str) -> None:
+    names = {mutant.check for mutant in MUTANTS if (mutant.profile, mutant.env) == (profile, env)}
+    found = checked("none", profile, env, names)
     assert [each.outcome for each in found] == ["passed"] * len(found), [explanation(each) for each in found]
