@@ -68,7 +68,7 @@ MILLRACE = {  # the same for each folder of the public package
     "cli": {"dashboard", "launch", "playing", "terminal"},
     "dashboard": {"cli"},
     "integrations": set[str](),
-    "launch": {"arguments", "cli", "own_policy", "policies", "terminal"},
+    "launch": {"arguments", "own_policy", "policies", "terminal"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
 MAY_PRINT = (
