@@ -133,7 +133,7 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
             settings[name] = _coerce(config, name, value)
         else:
             known = [setting for setting in (*settings, *algorithm) if setting != "algorithm"]
-            hint = in_place_of(name, value, known) or did_you_mean(name, known)
+            hint = in_place_of(name, known) or did_you_mean(name, known)
             raise UsageError(f"{where}: unknown setting {name}{hint}")
     return convert(settings, where)
 

@@ -69,9 +69,9 @@ def given_values(
     fields: Mapping[str, FlagField],
     argv: Sequence[str],
     command: str,
-    hint: Callable[[str, str | None], str] = lambda setting, value: "",
+    hint: Callable[[str], str] = lambda name: "",
 ) -> dict[str, Any]:
-    """The values of the fields that are given. `hint` gets the name and the value of an unknown one, for the error."""
+    """The values of the fields that are given. `hint` gets the name of an unknown flag, and ends the error's line."""
     given: dict[str, Any] = {}
     arguments: list[str] = []
     words = deque(word for word in argv if word not in EVERYWHERE)
@@ -83,8 +83,7 @@ def given_values(
         name, sign, value = _parts(word)
         field = _field(fields, name)
         if field is None or field.flag.positional:
-            given_value = value if sign else next(iter(_taken(words, 1)), None)
-            raise UsageError(f"{command}: {_unknown(fields, word.partition('=')[0], command, hint(name, given_value))}")
+            raise UsageError(f"{command}: {_unknown(fields, word.partition('=')[0], command, hint(name))}")
         if field.kind is bool and not field.optional:
             if sign:
                 raise UsageError(f"{command}: {word}: expected {field.written} or --no-{field.written[2:]}")

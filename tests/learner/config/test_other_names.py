@@ -1,58 +1,69 @@
-"""What others call our settings: each that is named exists and takes the value that is shown."""
+"""What others call our settings: the names that an error answers, and the table of all names in the manual."""
 
 from __future__ import annotations
 
 import ast
+import re
+from pathlib import Path
 
 import pytest
 
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.layers import resolve
-from millrace.learner.config.other_names import OTHERWISE, SAME_VALUE, SAYS, SETTING, in_place_of, written
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.values import read_value, read_words
+from millrace.learner.config.other_names import OUR_NAME, in_place_of
 
-FIELDS = {name: field for kind in (Config, *HYPERPARAMETERS.values()) for name, field in fields_of(kind).items()}
-
-
-def test_what_is_named_in_place_of_another_name_exists() -> None:
-    assert {match[1] for says in SAYS.values() for match in SETTING.finditer(says)} <= FIELDS.keys()
-    assert not SAYS.keys() & Config.__struct_fields__, "it is a setting"
-    others = [other for names in SAME_VALUE.values() for other in names.split()] + [*OTHERWISE]
-    assert len(set(others)) == len(others), "a name has one meaning"
+OF_ANY_RUN = {*Config.__struct_fields__}
+SETTINGS = OF_ANY_RUN.union(*(record.__struct_fields__ for record in HYPERPARAMETERS.values()))
+PAGE = Path(__file__).parents[3] / "docs/how-to/moving_from.md"
+NAME = re.compile(r"`(\w+)`")
+SETTING = re.compile(r"`(\w+)(?:=([^`]*))?`")
+ONLY_IN_PYTHON = {"progress"}
 
 
-def test_what_is_shown_to_be_written_can_be_written() -> None:
-    shown = {match.groups() for says in SAYS.values() for match in SETTING.finditer(says) if match[2]}
+def table() -> list[tuple[list[str], dict[str, str]]]:
+    """The rows of the table of all names: the others' names, and our settings with the values that are shown."""
+    section = PAGE.read_text().partition("## Every name")[2]
+    rows = [line.strip("|").split(" | ") for line in section.splitlines() if line.startswith("| `")]
+    return [(NAME.findall(others), dict(SETTING.findall(ours))) for others, ours in rows]
+
+
+def test_the_names_that_an_error_gives_are_settings() -> None:
+    assert {*OUR_NAME.values()} <= SETTINGS
+    assert not OUR_NAME.keys() & SETTINGS
+
+
+def test_the_manual_has_every_name_once_and_only_our_settings_in_their_place() -> None:
+    others = [other for names, _ in table() for other in names]
+    assert len(set(others)) == len(others) > 100
+    assert not set(others) & OF_ANY_RUN, "it is a setting"
+    assert {name for _, ours in table() for name in ours} - SETTINGS == ONLY_IN_PYTHON
+
+
+def test_an_error_and_the_manual_say_the_same() -> None:
+    in_manual = {other: ours for others, ours in table() for other in others}
+    assert {other: [*in_manual[other]] for other in OUR_NAME} == {other: [ours] for other, ours in OUR_NAME.items()}
+
+
+def test_the_values_that_the_manual_shows_can_be_written() -> None:
+    shown = {(name, value) for _, ours in table() for name, value in ours.items() if value and name not in ONLY_IN_PYTHON}
     assert shown
     for name, value in shown:
-        algo = next(algo for algo, kind in HYPERPARAMETERS.items() if name in (*kind.__struct_fields__, "device"))
-        assert resolve("CartPole-v1", algo=algo, **{name: ast.literal_eval(value)})
-        flag, *words = written(name, value, flag=True).split()
-        assert flag == f"--{name.replace('_', '-')}"
-        assert read_words(FIELDS[name], words) == read_value(FIELDS[name], ast.literal_eval(value))
+        has_it = (algo for algo, record in HYPERPARAMETERS.items() if name in (*OF_ANY_RUN, *record.__struct_fields__))
+        assert resolve("CartPole-v1", algo=next(has_it), **{name: ast.literal_eval(value)})
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "flag", "says"),
+    ("name", "flag", "says"),
     [
-        ("n_envs", "8", True, "; millrace calls it --envs 8"),
-        ("n_envs", 8, False, "; millrace calls it envs=8"),
-        ("total_timesteps", None, True, "; millrace calls it --steps"),
-        ("env_config", {"a long key": "a value that is too long to be shown"}, False, "; millrace calls it env_kwargs"),
-        ("buffer_size", "9", True, "; millrace calls it --replay-size 9; it is one of dqn, sac, td3 alone"),
-        ("gradient_steps", "1", True, "; it is one of dqn alone"),
-        ("train_batch_size", 4000, False, "; a batch has envs times rollout_steps env steps"),
-        ("policy_kwargs", {}, False, "; millrace calls what is in it net=(64, 64), activation='relu', encoder"),
-        ("stepz", "8", True, ""),
+        ("n_envs", True, "; millrace calls it --envs"),
+        ("n_steps", True, "; millrace calls it --rollout-steps"),
+        ("n_steps", False, "; millrace calls it rollout_steps"),
+        ("buffer_size", True, "; millrace calls it --replay-size; it is one of dqn, sac, td3 alone"),
+        ("gradient_steps", True, "; it is one of dqn alone"),
+        ("stepz", True, ""),
     ],
 )
-def test_the_line_says_what_to_write(name: str, value: object, flag: bool, says: str) -> None:
-    known = {*Config.__struct_fields__, *HYPERPARAMETERS["ppo"].__struct_fields__}
-    assert in_place_of(name, value, known, flag=flag) == says
-
-
-def test_a_setting_of_another_algorithm_is_ours_unless_this_one_has_what_stands_for_it() -> None:
-    sac = {*Config.__struct_fields__, *HYPERPARAMETERS["sac"].__struct_fields__}
-    assert in_place_of("gradient_steps", 1, sac).endswith("for each env step: updates_per_step=1")
+def test_the_line_says_what_to_write(name: str, flag: bool, says: str) -> None:
+    known = {*OF_ANY_RUN, *HYPERPARAMETERS["ppo"].__struct_fields__}
+    assert in_place_of(name, known, flag=flag) == says
