@@ -34,12 +34,11 @@ from millrace.protocol.envs.make_env import (
 )
 from millrace.protocol.envs.seats import has_seats, seated
 from millrace.protocol.envs.unknown_ids import (
-    find,
     ids_of_gymnasium,
     is_registered,
+    load_plugins,
     plugin_modules,
     registered_by_plugins,
-    registers,
 )
 from millrace.protocol.envs.which_copy import filled
 from millrace.protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
@@ -270,7 +269,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Call `make` with the id. Raises `UsageError`."""
         registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
         plain = registrar is None and ":" not in self.id and not names_a_function(self.id)
-        failed = find(self.id) if plain and not is_registered(self.id) else []
+        failed = load_plugins(self.id) if plain and not is_registered(self.id) else []
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except UsageError:
@@ -286,7 +285,7 @@ def _why_not(env_id: str) -> str:
     """Why a registered environment that perhaps was meant cannot be made; empty if it can. No function is called."""
     if ":" in env_id:
         return ""
-    find(env_id)
+    load_plugins(env_id)
     if not is_registered(env_id):
         return "it is not registered"
     try:
@@ -392,7 +391,7 @@ def _given(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
         last = "my_env" if "lambda" in name else last_part(name)
         raise UsageError(
             f"environment {name} was made in a script, a notebook or a function, and cannot be found here; go on where it "
-            f"was made, or put it into a module and name it as my_module:{last} (train: ENV; evaluate, record: --env)"
+            f"was made, or name a module that has or registers it, as my_module:{last} (train: ENV; evaluate, record: --env)"
         )
     return name, factory
 
@@ -423,8 +422,7 @@ def _registered_here(env_id: str, given: GymnasiumSpec | None = None) -> tuple[s
         return f"<{plain}>", _SpecFactory(given)
     if known is None or _is_of_everyone(known):
         return env_id, None
-    registrar = _registering_module(known)
-    return f"{registrar or MAIN}:{plain}", _SpecFactory(known)
+    return f"{MAIN}:{plain}", _SpecFactory(known)
 
 
 def _is_of_everyone(spec: GymnasiumSpec) -> bool:
@@ -449,10 +447,3 @@ def _module_of(spec: GymnasiumSpec) -> str:
     """The module of the class or function that makes the environment."""
     where = spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
     return where.partition(":")[0]
-
-
-def _registering_module(spec: GymnasiumSpec) -> str:
-    """The module that registers it when another process imports it, as far as its source text shows; empty if none does."""
-    parts = _module_of(spec).split(".")
-    modules = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
-    return next((module for module in modules if module != MAIN and registers(module, spec.id)), "")

@@ -14,12 +14,11 @@ import pytest
 
 from millrace.learner.run_folder.last_line import last_line
 from millrace.protocol.env_spec import EnvSpec, check_arguments
-from millrace.protocol.envs import unknown_ids
 from millrace.protocol.envs.advice.old_gym import INSTALL, instead_of_id, instead_of_object, is_of_old_gym
 from millrace.protocol.envs.advice.space_advice import observation_advice
 from millrace.protocol.envs.found_names import attribute, importable, name_of
 from millrace.protocol.envs.make_env import why_not_made
-from millrace.protocol.envs.unknown_ids import installed_packages, load_plugins, what_to_write
+from millrace.protocol.envs.unknown_ids import load_plugins, what_to_write
 from millrace.protocol.envs.wrappers import wrap
 from millrace.protocol.errors import UsageError, first_line, joined, safe_repr, words_an_error, worker_exception
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
@@ -221,7 +220,6 @@ def test_advice_about_spaces_looks_at_anything(value: Any) -> None:
 @pytest.mark.parametrize("env_id", ["Odd-v0", "odd:Odd-v0", "ALE/Odd-v5", "odd:make", "", ":", "a.b_v0"])
 def test_why_an_environment_was_not_made_is_one_line(error: Exception, env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "odd", RaisesOften())
-    monkeypatch.setattr(unknown_ids, "installed_packages", lambda: iter(()))
 
     def why_not(meant: str) -> str:
         raise OddError
@@ -249,26 +247,11 @@ def test_an_argument_that_no_message_can_carry_is_refused_in_one_line(value: Any
 # -------------------------------------------------------------------------------------------- installed packages
 
 
-class Removed:
-    """What is left of an installed package whose files are gone: whatever one asks it raises, or is None."""
-
-    name: Any = None
-    files = None
-
-    @property
-    def requires(self) -> list[str]:
-        raise UnicodeDecodeError("utf-8", b"", 0, 1, "no text")
-
-
-def test_an_installed_package_that_is_damaged_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = list(metadata.distributions())
+def test_a_plugin_that_is_damaged_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
     entry_points = metadata.EntryPoints([metadata.EntryPoint("odd", "", "gymnasium.envs")])
-    before = [package.module for package in installed_packages()]
-    monkeypatch.setattr(metadata, "distributions", lambda: iter([Removed(), *found, SimpleNamespace(name="x")]))
     monkeypatch.setattr(metadata, "entry_points", lambda: entry_points)
-    assert [package.module for package in installed_packages()] == before
     assert load_plugins("Odd-v0") == []
-    monkeypatch.setattr(metadata, "distributions", lambda: 3)
+    monkeypatch.setattr(gymnasium, "registry", 3)
     assert what_to_write("Odd-v0", lambda env_id: "") == ""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -260,7 +261,7 @@ def test_a_callable_that_makes_an_id_of_the_script_alone_is_one_line_that_says_w
     assert (raised.value.detail, "\n" in line) == ("", False)
 
 
-def test_an_id_that_an_imported_module_registers_is_remembered_with_it(
+def test_an_id_is_remembered_with_its_module_if_it_is_given_with_it(
     registry: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "arcade_of_mine.py").write_text(
@@ -269,9 +270,15 @@ def test_an_id_that_an_imported_module_registers_is_remembered_with_it(
     )
     monkeypatch.syspath_prepend(tmp_path)
     __import__("arcade_of_mine")
-    assert remembered_name("Game-v0") == "arcade_of_mine:Game-v0"
-    gymnasium.register(id="Elsewhere-v0", entry_point="arcade_of_mine:Game")
-    assert remembered_name("Elsewhere-v0") == "__main__:Elsewhere-v0", "its module does not register it"
+    assert remembered_name("arcade_of_mine:Game-v0") == "arcade_of_mine:Game-v0"
+    assert remembered_name("Game-v0") == "__main__:Game-v0", "which module has registered it is not known"
+    assert type(made_elsewhere(EnvSpec.of("Game-v0")).unwrapped).__name__ == "Game"
+
+
+def test_gymnasiums_own_ids_are_those_of_a_process_that_has_imported_nothing_else() -> None:
+    ask = "import gymnasium; print(*gymnasium.registry)"
+    fresh = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=60, check=True)
+    assert ids_of_gymnasium() == set(fresh.stdout.split())
 
 
 @pytest.mark.parametrize("name", ["__main__:nowhere", "<inside>", "<lambda>", "__main__:Nowhere-v0"])

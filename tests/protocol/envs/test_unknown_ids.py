@@ -18,7 +18,6 @@ from gymnasium import spaces
 
 from millrace.protocol.env_spec import EnvSpec, remembered_name
 from millrace.protocol.envs.description import describe_env
-from millrace.protocol.envs.unknown_ids import installed_packages
 from millrace.protocol.errors import UsageError
 
 GAME = """
@@ -32,8 +31,6 @@ REGISTERS_ON_IMPORT = (
     GAME
     + """
 gymnasium.register(id="FakeFlappy-v0", entry_point="fake_flappy:Game")
-for suffix in ("", "Dense"):
-    gymnasium.register(id=f"FakeMaze{suffix}-v3", entry_point="fake_flappy:Game")
 """
 )
 REGISTERS_WHEN_CALLED = (
@@ -51,26 +48,20 @@ class Site:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def install(self, module: str, source: str, entry_points: str = "", needs: str = "gymnasium>=1.0") -> None:
+    def install(self, module: str, source: str, entry_points: str = "") -> None:
         (self.path / module).mkdir()
         (self.path / module / "__init__.py").write_text(source)
         info = self.path / f"{module}-1.0.dist-info"
         info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\nRequires-Dist: {needs}\n")
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
         (info / "RECORD").write_text(f"{module}/__init__.py,,\n{module}-1.0.dist-info/METADATA,,\n")
         if entry_points:
             (info / "entry_points.txt").write_text(entry_points)
 
-    def add(self, module: str, file: str, source: str) -> None:
-        """A file of an installed package."""
-        (self.path / module / file).write_text(source)
-        with (self.path / f"{module}-1.0.dist-info" / "RECORD").open("a") as record:
-            record.write(f"{module}/{file},,\n")
-
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    """Nothing else is installed that has environments. What is imported and registered meanwhile is forgotten."""
+    """What is imported and registered meanwhile is forgotten."""
     registry, modules = dict(gymnasium.registry), set(sys.modules)
     monkeypatch.syspath_prepend(tmp_path)
     yield Site(tmp_path)
@@ -89,30 +80,16 @@ def refusal(env_id: str) -> str:
     return line
 
 
-@pytest.mark.parametrize("env", ["FakeFlappy-v0", "FakeMazeDense-v3", "FakeMaze-v3"])
-def test_an_id_is_found_in_the_package_that_registers_it_when_it_is_imported(site: Site, env: str) -> None:
-    assert "fake_flappy" not in refusal(env)
+def test_an_id_that_no_plugin_declares_is_given_with_its_module(site: Site) -> None:
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    refusal("FakeOther-v0")
-    assert "fake_flappy" not in sys.modules, "it is imported only for an id that its source text registers"
-    assert type(EnvSpec(env).make().unwrapped).__name__ == "Game"
+    assert "write module:FakeFlappy-v0 with the module that registers it" in refusal("FakeFlappy-v0")
+    assert "fake_flappy" not in sys.modules, "a package that declares no plugin is not imported for an id"
+    assert type(EnvSpec("fake_flappy:FakeFlappy-v0").make().unwrapped).__name__ == "Game"
 
 
-def test_a_namespace_is_the_name_of_a_package_and_a_module_within_it_may_register(site: Site) -> None:
-    site.install("fake_tetris", "")
-    site.add("fake_tetris", "games.py", GAME + "gymnasium.register('Fake-Tetris/Game', 'fake_tetris.games:Game')")
-    assert type(EnvSpec("Fake-Tetris/Game").make().unwrapped).__name__ == "Game"
-    site.install("fake_silent", GAME + "gymnasium.register('/'.join(['fake_silent', 'G-v0']), 'fake_silent:Game')")
-    assert type(EnvSpec("fake_silent/G-v0").make().unwrapped).__name__ == "Game"
-
-
-def test_a_package_may_register_in_a_function_register_envs(site: Site) -> None:
-    site.install("fake_sky", GAME + "def register_envs(): gymnasium.register('FakeSky-v0', 'fake_sky:Game')")
-    assert type(EnvSpec("FakeSky-v0").make().unwrapped).__name__ == "Game"
-
-
-def test_a_package_that_cannot_be_imported_is_named_with_what_to_install(site: Site) -> None:
-    site.install("fake_flappy", "import pkg_resources_of_old" + REGISTERS_ON_IMPORT)
+def test_a_plugin_that_cannot_be_imported_is_named_with_what_to_install(site: Site) -> None:
+    plugin = "[gymnasium.envs]\n__root__ = fake_flappy:register_all\n"
+    site.install("fake_flappy", "import pkg_resources_of_old" + REGISTERS_ON_IMPORT, plugin)
     assert refusal("FakeFlappy-v0").endswith(
         "(fake_flappy: ModuleNotFoundError: No module named 'pkg_resources_of_old'; pip install it, then try again)"
     )
@@ -125,9 +102,10 @@ def test_a_registered_environment_that_makes_another_one_is_not_blamed(site: Sit
 
 
 def test_a_misspelled_id_is_suggested(site: Site) -> None:
-    site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    assert refusal("FakeFlapy-v0").endswith("is not registered: did you mean FakeFlappy-v0?")
+    site.install("fake_highway", REGISTERS_WHEN_CALLED, "[gymnasium.envs]\n__root__ = fake_highway:register_all\n")
+    assert refusal("FakeHigway-v0").endswith("is not registered: did you mean FakeHighway-v0?")
     assert refusal("CartPol-v1").endswith("did you mean CartPole-v1?")
+    site.install("fake_flappy", REGISTERS_ON_IMPORT)
     says = "module fake_flappy neither registers FakeFlapy-v0 nor has a class or function so named; did you mean "
     assert refusal("fake_flappy:FakeFlapy-v0").endswith(f"{says}FakeFlappy-v0?")
     assert refusal("fake_flappy:Gamo").endswith("; did you mean fake_flappy:Game?")
@@ -148,29 +126,15 @@ def test_what_can_be_made_after_an_installation_is_suggested_with_it(site: Site)
     )
 
 
-def test_an_id_that_nothing_resembles_says_which_packages_there_are(site: Site) -> None:
-    site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    line = refusal("Qqqqqqqqqqq-v7")
-    assert "no installed package registers it (" in line
-    assert "and one of your own is given as my_module:MyEnv-v0" in line
-    assert line.endswith("one of a client in another language needs the client (--bind)")
+def test_an_id_that_nothing_resembles_says_how_to_name_its_module(site: Site) -> None:
+    assert refusal("Qqqqqqqqqqq-v7") == (
+        "environment Qqqqqqqqqqq-v7 is not registered: write module:Qqqqqqqqqqq-v7 with the module that registers it, as in "
+        "minigrid:MiniGrid-Empty-5x5-v0; one of a client in another language needs the client (--bind)"
+    )
 
 
 def test_an_id_of_old_atari_wrappers_is_answered_with_ours() -> None:
     assert refusal("FakePongNoFrameskip-v4").endswith("write millrace/Atari-v0 --env-kwargs game FakePong")
-
-
-@pytest.mark.parametrize(
-    ("source", "needs"),
-    [
-        ("def register(**_): ...\nregister(id='FakeFlappy-v0')", "numpy"),
-        ("def register(**_): ...\nregister(id='FakeFlappy-v0')", "gymnasium; extra == 'rl'"),
-    ],
-)
-def test_a_package_that_does_not_need_gymnasium_is_not_read(site: Site, source: str, needs: str) -> None:
-    site.install("fake_other", source, needs=needs)
-    assert "fake_other" not in [package.module for package in installed_packages()]
-    assert "fake_other" not in refusal("FakeFlappy-v0")
 
 
 @pytest.mark.parametrize(
