@@ -1,10 +1,11 @@
-"""The door of the public functions: their arguments are checked against their annotations before anything starts.
+"""The door of the public functions: arguments become plain, and those that are not settings are checked.
 
 Rule: what comes in is plain. numpy's scalars and members of enums become Python's numbers and text; a whole number has at
-most 64 bits, and text can be written to a file; True and False are no numbers. What is otherwise is refused in one line, in
-the function's name. Only what is annotated as `object` is the user's own, and goes through as it is.
+most 64 bits, and text can be written to a file. A parameter that stands in the signature has the type of its annotation.
+Settings, which a function takes as `**settings: Unpack[ATypedDict]`, are checked where msgspec makes a record of them. What
+is annotated as `object` is the user's own, and goes through as it is. Errors are one line, in the function's name.
 
-Keywords that a function takes as `**name: Unpack[ATypedDict]` stand in its signature by name, for `help` and notebooks.
+The keys of such a `TypedDict` stand in the signature by name, for `help` and notebooks.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, Unpack, get_args, get_origin, get_type_hints
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
+import msgspec
 import numpy as np
 
 from millrace.protocol.errors import UsageError, usage_error
@@ -23,12 +25,10 @@ from millrace.protocol.errors import UsageError, usage_error
 WORDS: dict[Any, str] = {
     str: "text",
     type(None): "None",
-    type: "a class",
     Callable: "a function",
     os.PathLike: "a path",
-    tuple: "a tuple",
     Sequence: "a list",
-    Mapping: "a dict",
+    dict: "a dict",
 }
 UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
 """Shown as the default of a keyword whose default depends on others"""
@@ -43,17 +43,13 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     @functools.cache
     def hints() -> dict[str, Any]:
         texts = {name: text for name, text in function.__annotations__.items() if name != "return"}
-        found = {name: eval(text, function.__globals__) for name, text in texts.items()}
-        for hint in list(found.values()):
-            if get_origin(hint) is Unpack:
-                found |= get_type_hints(get_args(hint)[0])
-        return found
+        return {name: Any if _names_keys(text) else eval(text, function.__globals__) for name, text in texts.items()}
 
     def fitting(name: str, value: Any, hint: Any) -> Any:
         if hint is object:
             return value
         value = plain(value)
-        if why := next(unusable(value), "") or ("" if fits(value, hint) else f"expected {words(hint)}"):
+        if why := unusable(value) or ("" if fits(value, hint) else f"expected {words(hint)}"):
             raise UsageError(f"{who}: {name}: {why}, got {value!r:.60}")
         return value
 
@@ -65,8 +61,8 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
             return function(*args, **keywords)  # raises it with the function's name
         for name, value in given.arguments.items():
             match signature.parameters[name].kind:
-                case inspect.Parameter.VAR_KEYWORD if hints()[name] is not object:
-                    given.arguments[name] = {key: fitting(key, one, hints().get(key, Any)) for key, one in value.items()}
+                case inspect.Parameter.VAR_KEYWORD:
+                    given.arguments[name] = {key: fitting(key, one, hints()[name]) for key, one in value.items()}
                 case inspect.Parameter.VAR_POSITIONAL:
                     given.arguments[name] = tuple(fitting(name, one, hints()[name]) for one in value)
                 case _ if name in hints():  # all but self
@@ -85,12 +81,17 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
 def _by_name(function: Callable[..., Any], signature: inspect.Signature) -> Iterator[inspect.Parameter]:
     """The parameters of a function, with the keys of a TypedDict in place of the dict."""
     for parameter in signature.parameters.values():
-        if str(parameter.annotation).startswith("Unpack["):
+        if _names_keys(parameter.annotation):
             keys = get_args(eval(parameter.annotation, function.__globals__))[0].__annotations__
             for name, hint in keys.items():
                 yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=UNSET, annotation=hint.__forward_arg__)
         else:
             yield parameter
+
+
+def _names_keys(annotation: object) -> bool:
+    """Whether an annotation, which is text, says that keywords are the keys of a TypedDict."""
+    return str(annotation).startswith("Unpack[")
 
 
 def plain(value: Any) -> Any:
@@ -111,21 +112,19 @@ def plain(value: Any) -> Any:
     return value
 
 
-def unusable(value: Any) -> Iterator[str]:
-    """What was expected in place of text or a number that no message and no file can hold."""
-    match value:
-        case int() if not -(2**63) <= value < 2**64:
-            yield "expected a number of at most 64 bits"
-        case str() | os.PathLike():
-            try:
-                value.encode() if isinstance(value, str) else os.fsencode(value)
-            except UnicodeEncodeError:
-                yield "expected text that can be encoded"
-        case list() | tuple():
-            for one in value:
-                yield from unusable(one)
-        case dict():
-            yield from unusable([*value, *value.values()])
+def unusable(value: Any) -> str:
+    """What was expected in place of text or a number that no message and no file can hold; empty if it can be held."""
+    try:
+        match value:
+            case os.PathLike():
+                os.fsencode(value)
+            case str() | int() | list() | tuple() | dict():
+                msgspec.msgpack.encode(value, enc_hook=lambda own: None)
+    except UnicodeEncodeError:
+        return "expected text that can be encoded"
+    except OverflowError:
+        return "expected a number of at most 64 bits"
+    return ""
 
 
 def fits(value: Any, hint: Any) -> bool:

@@ -137,7 +137,10 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     for keyword in keywords:
         if keyword not in fields or keyword in NOT_KEYWORDS:
             raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, fields)}")
-    return kind(**{keyword: read_value(fields[keyword], value) for keyword, value in keywords.items()})
+    try:
+        return kind(**{keyword: read_value(fields[keyword], value) for keyword, value in keywords.items()})
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
 
 
 def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) -> tuple[Evaluation, list[Path]]:

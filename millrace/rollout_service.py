@@ -463,13 +463,14 @@ def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, A
     """The settings as a record, checked. Raises `UsageError`."""
     known = RolloutConfig.__struct_fields__
     if unknown := [name for name in settings if name not in known]:
+        known = (*known, "rollout_steps")
         hint = in_place_of(unknown[0], known) or did_you_mean(unknown[0], known)
-        raise UsageError(f"rollout service: unknown setting {unknown[0]}{hint}")
+        raise UsageError(f"RolloutService: unknown setting {unknown[0]}{hint}")
     plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in settings.items()}
     given = {**plain, "env": remembered_name(env), "wrappers": wrapper_names(wrappers)}
     if not given.get("bind"):
         given.pop("bind", None)
-    return convert_rollout_settings(given)
+    return convert_rollout_settings(given, "RolloutService")
 
 
 def _check_restored(state: ServiceState, env: str, policy: PolicySpec, file: str) -> None:

@@ -124,7 +124,7 @@ class UsageError(UserFacingError):
     >>> import millrace
     >>> millrace.train("CartPole-v1", learning_rat=1e-3)
     Traceback (most recent call last):
-    millrace.protocol.errors.UsageError: keyword argument: unknown setting learning_rat; did you mean learning_rate?
+    millrace.protocol.errors.UsageError: train: unknown setting learning_rat; did you mean learning_rate?
     """
 
     exit_code = 2

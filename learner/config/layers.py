@@ -42,9 +42,11 @@ def resolve(
     if isinstance(algo := keywords.get("algo", ""), type):
         keywords["algo"] = name_of(algo)
     elif not isinstance(algo, str):
-        raise UsageError(f"algo: expected text or a class, got {algo!r:.60}")
+        raise UsageError(
+            f"train: algo: expected one of {', '.join(HYPERPARAMETERS)}, module:Class or a class, got {algo!r:.60}"
+        )
     below = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
-    return validate(override(below, keywords, "keyword argument"))
+    return validate(override(below, keywords, "train"))
 
 
 def config_from_toml(text: str, where: str = "config.toml") -> Config:

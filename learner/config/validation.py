@@ -136,10 +136,10 @@ def unused_setting(config: Config) -> str:
     return f"target_return {config.target_return:g} ends no run without evaluations during training; take --eval-every N too"
 
 
-def convert_rollout_settings(settings: dict[str, Any]) -> RolloutConfig:
-    """The record of these settings, checked. Raises `UsageError`."""
-    config = _converted(settings, RolloutConfig, settings)
-    check_rollout_settings(config)
+def convert_rollout_settings(settings: dict[str, Any], where: str) -> RolloutConfig:
+    """The record of these settings, checked. Raises `UsageError`. `where` begins the message."""
+    config = _converted(settings, RolloutConfig, settings, where)
+    check_rollout_settings(config, f"{where}: ")
     return config
 
 

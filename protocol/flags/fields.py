@@ -83,6 +83,11 @@ def fields_of(record: type[msgspec.Struct]) -> dict[str, FlagField]:
     return found
 
 
+def is_choice(hint: Any) -> bool:
+    """Whether a type is a Literal, or a Literal or None."""
+    return get_origin(_plain(hint)[0]) is Literal
+
+
 def choices(hint: Any) -> list[str]:
     """The values that a type allows: a Literal, or a Literal or None."""
     kind, optional = _plain(hint)

@@ -6,16 +6,18 @@ in TOML (toml_words.py); those of any other field are read as its type.
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import msgspec
 
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.fields import FlagField, choices
+from millrace.protocol.flags.fields import FlagField, choices, is_choice
 from millrace.protocol.flags.toml_words import as_text, read_word
 
 
@@ -74,19 +76,27 @@ def read_value(field: FlagField, value: Any) -> Any:
 
 def _converted(field: FlagField, value: Any, given: str, *, strict: bool) -> Any:
     try:
-        return msgspec.convert(value, field.hint, strict=strict, dec_hook=lambda kind, plain: kind(plain))
+        return msgspec.convert(value, field.hint, strict=strict, dec_hook=_path)
     except msgspec.ValidationError as error:
         raise UsageError(f"{field.name}: {what_was_expected(str(error), field.hint)}, got {given}") from None
     except UnicodeEncodeError:  # a word of the command line, or a name of a file, may be any bytes
         raise UsageError(f"{field.name}: expected text in UTF-8, got {given}") from None
 
 
+def _path(kind: Any, value: object) -> Path:
+    """The path that text says. `kind` is `Path`, the only type of a field that msgspec does not know."""
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError("Expected `text or a path`")
+    return Path(value)
+
+
 def what_was_expected(message: str, hint: Any) -> str:
     """What a value should have been, from msgspec's message and the type of the field."""
-    if message.startswith("Invalid enum value"):
+    if message.startswith("Invalid enum value") or (hint is not None and is_choice(hint)):
         return f"expected one of {', '.join(choices(hint))}"
     text = message.partition(" - at ")[0].replace(" | null", ' or "none"').replace("`object`", "table")
     text = text.replace("bool | int | float | str", "a number, text, true or false")
+    text = text.replace("`str", "`text").replace("`array", "`a list")
     return re.sub(", got .*", "", text).replace("`", "").replace("Expected", "expected", 1)
 
 

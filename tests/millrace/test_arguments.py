@@ -192,6 +192,16 @@ SURROGATE = "CartPole-v1\ud800"
     [
         (millrace.train, {"env": SURROGATE}, r"train: env: expected text that can be encoded, got 'CartPole-v1\ud800'"),
         (millrace.train, {"env": "CartPole-v1", "workers": False}, "train: workers: expected int, got False"),
+        (millrace.train, {"env": "CartPole-v1", "workers": 0}, "train: workers: expected int >= 1, got 0"),
+        (millrace.train, {"env": "CartPole-v1", "run_dir": 3}, "train: run_dir: expected text, got 3"),
+        (millrace.train, {"env": "CartPole-v1", "info_keys": "x"}, "train: info_keys: expected a list, got 'x'"),
+        (millrace.train, {"env": "CartPole-v1", "core": 3}, "train: core: expected one of lstm, gru, none, got 3"),
+        (millrace.train, {"env": "CartPole-v1", "env_kwargs": 3}, "train: env_kwargs: expected table, got 3"),
+        (
+            millrace.train,
+            {"env": "CartPole-v1", "run_dir": "\ud800"},
+            r"train: run_dir: expected text that can be encoded, got '\ud800'",
+        ),
         (millrace.train, {"env": "CartPole-v1", "preset": True}, "train: preset: expected text, got True"),
         (millrace.train, {"env": "CartPole-v1", "callbacks": 2}, "train: callbacks: expected a list, got 2"),
         (
@@ -203,7 +213,7 @@ SURROGATE = "CartPole-v1\ud800"
         (
             millrace.train,
             {"env": "CartPole-v1", "algo": 2},
-            "train: algo: expected one of ppo, a2c, dqn, impala, reinforce, sac, td3 or text or a class, got 2",
+            "train: algo: expected one of ppo, a2c, dqn, impala, reinforce, sac, td3, module:Class or a class, got 2",
         ),
         (millrace.train, {"resume": 2}, "train: resume: expected text or a path or None, got 2"),
         (millrace.load, {"run": 2}, "load: run: expected text or a path, got 2"),
@@ -220,6 +230,14 @@ SURROGATE = "CartPole-v1\ud800"
             {"env": "CartPole-v1", "rollout_steps": True},
             "RolloutService: rollout_steps: expected int, got True",
         ),
+        (millrace.RolloutService, {"env": "CartPole-v1", "envs": 8.5}, "RolloutService: envs: expected int, got 8.5"),
+        (
+            millrace.RolloutService,
+            {"env": "CartPole-v1", "n_steps": 32},
+            "RolloutService: unknown setting n_steps; millrace calls it rollout_steps",
+        ),
+        (millrace.evaluate, {"run": "x", "against": 2}, "evaluate: against: expected text or a path, got 2"),
+        (millrace.evaluate, {"run": "x", "copies": 0}, "evaluate: copies: expected int >= 1, got 0"),
         (
             millrace.make_vec,
             {"env": SURROGATE},

@@ -173,8 +173,8 @@ def test_config_toml_has_all_of_them(tmp_path: Path) -> None:
     [
         ({"penalty": "much"}, "penalty: expected float, got 'much'"),
         ({"kind": "rigid"}, "kind: expected one of soft, hard, got 'rigid'"),
-        ({"penatly": 0.1}, "keyword argument: unknown setting penatly; did you mean penalty?"),
-        ({"clip_range": 0.1}, "keyword argument: unknown setting clip_range; it is one of ppo alone"),
+        ({"penatly": 0.1}, "train: unknown setting penatly; did you mean penalty?"),
+        ({"clip_range": 0.1}, "train: unknown setting clip_range; it is one of ppo alone"),
     ],
 )
 def test_a_wrong_setting_is_refused_as_ours_are(settings: dict[str, Any], says: str) -> None:

@@ -108,7 +108,7 @@ def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert isinstance(resolve("CartPole-v1", target_return=5e2).target_return, float)
     assert ppo(resolve("CartPole-v1", steps="1_000", net="32,1e2")).net == (32, 100)
     assert "steps: expected int" in refusal(steps=1.5)
-    assert refusal(net=[64, 0]) == "keyword argument: net: expected int >= 1, got [64, 0]"
+    assert refusal(net=[64, 0]) == "train: net: expected int >= 1, got [64, 0]"
 
 
 def test_a_run_that_no_other_worker_can_join_waits_for_no_more_workers_than_it_starts() -> None:
