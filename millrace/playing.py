@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
 from millrace.arguments import checked
-from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.rollout_config import RolloutConfig
@@ -22,6 +21,7 @@ from millrace.learner.recording.record import record as record_dataset
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from millrace.learner.run_folder.results import Evaluation
 from millrace.learner.run_folder.run_folder import RunFolder, Which
+from millrace.play_flags import EvaluateFlags, RecordFlags
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean

@@ -65,7 +65,7 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"dashboard", "launch", "playing", "terminal"},
+    "cli": {"dashboard", "launch", "play_flags", "playing", "terminal"},
     "dashboard": {"cli"},
     "integrations": set[str](),
     "launch": {"arguments", "own_policy", "policies", "terminal"},

@@ -3,53 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
-from msgspec import Meta
 
-from millrace.protocol.bounds import MAX_SEEDS, Count, Natural
 from millrace.protocol.flags.fields import Flag
-
-
-class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Flags of the commands whose workers play episodes of a run's policy."""
-
-    run: Annotated[Path, Flag(positional=True)]
-    """run folder"""
-    best: bool = False
-    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
-    env: str = ""
-    """the environment, if the run does not find it by itself, such as my_module:make_env or my_module:MyEnv-v0"""
-    wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
-    """the wrappers, innermost first, if the run does not find them by itself"""
-    workers: Count = 2
-    """number of worker processes that play the episodes; the result does not depend on it"""
-    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
-    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
-    bind: str = ""
-    """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
-    inference: Literal["workers", "learner"] = "workers"
-    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
-    max_env_failures: Natural = 3
-    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
-
-
-class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
-    """Play greedy episodes of a run's newest policy; print mean and standard deviation of the return."""
-
-    episodes: Annotated[Count | None, Flag("INT")] = None
-    """number of episodes; if not given: 100, or 3 with --video"""
-    against: Annotated[Path | None, Flag("RUN")] = None
-    """run folder of a policy that plays the other teams; both draw their actions, and each team is played in turn"""
-    seed: Natural = 1_000_000
-    """seed of the episodes"""
-    copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
-    """number of episodes that a worker plays at the same time"""
-    max_steps: Count = 1_000_000
-    """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
-    video: bool = False
-    """film the episodes: an mp4 of each in the folder videos of the run (pip install moviepy pygame-ce)"""
 
 
 class ListFlags(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,21 +35,6 @@ class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """run folders"""
     out: Annotated[Path | None, Flag("PATH")] = None
     """file to write, as SVG or PNG; if not given, curves.png in the first run folder"""
-
-
-class RecordFlags(PlayFlags, frozen=True, kw_only=True):
-    """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'minari[hdf5]')."""
-
-    out: str
-    """id of the dataset, such as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
-    steps: Count = 50_000
-    """number of env steps; the last episode is finished, unless that would take more than twice as many"""
-    npy: Annotated[Path | None, Flag("PATH")] = None
-    """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
-    stochastic: bool = False
-    """sample actions from the policy, as in training, instead of taking the most probable ones"""
-    seed: Natural = 2_000_000
-    """seed of the episodes and of the sampled actions"""
 
 
 class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from millrace.cli.flags import EvaluateFlags, RecordFlags
+from millrace.play_flags import EvaluateFlags, RecordFlags
 from millrace.protocol.flags.parse import parse_flags
 from millrace.terminal import count_line
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from benchmarks.program import BENCHMARKS
+from millrace import play_flags
 from millrace.cli import flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
 from millrace.extras.conformance.command import ConformFlags
@@ -33,8 +34,8 @@ LISTED = re.compile(r"^\s*millrace/? {2,}")
 BEFORE = {"nohup", "exec", "time", "nice", "env", "srun"}
 """Words that may stand before a command"""
 RECORDS: dict[str, type[Any]] = {
-    "evaluate": flags.EvaluateFlags,
-    "record": flags.RecordFlags,
+    "evaluate": play_flags.EvaluateFlags,
+    "record": play_flags.RecordFlags,
     "list": flags.ListFlags,
     "dashboard": flags.DashboardFlags,
     "plot": flags.PlotFlags,

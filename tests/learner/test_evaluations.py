@@ -9,7 +9,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from millrace.cli.flags import EvaluateFlags
 from millrace.learner.algorithms import Algorithm
 from millrace.learner.between_updates.evaluations import Evaluations
 from millrace.learner.between_updates.run_parts import RunParts
@@ -21,6 +20,7 @@ from millrace.learner.run_folder.atomic_write import Writes
 from millrace.learner.run_folder.results import EvaluatedPolicy
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_state import RunState
+from millrace.play_flags import EvaluateFlags
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.rollout import Episode
 from tests.support.conversation.fake_ends import run_spec

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 
 import millrace
 from millrace.cli.commands import COMMANDS
-from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.cli.main import main
 from millrace.cli.shown_run import next_commands
 from millrace.learner.callbacks.callbacks import Callbacks
@@ -30,6 +29,7 @@ from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import Best, Evaluation, Summary
 from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.play_flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers
