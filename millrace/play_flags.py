@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from millrace.flags.fields import Flag
 from millrace.protocol.bounds import MAX_SEEDS, Count, Natural
-from millrace.protocol.flags.fields import Flag
 
 
 class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
 from millrace.arguments import checked
+from millrace.flags.fields import fields_of
+from millrace.flags.values import read_value
 from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.rollout_config import RolloutConfig
@@ -25,8 +27,6 @@ from millrace.play_flags import EvaluateFlags, RecordFlags
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.values import read_value
 from millrace.terminal import count_line
 
 NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are handed on apart

@@ -27,6 +27,8 @@ FORBIDDEN = {
     "learner": {"workers", "millrace"},
     "millrace": {"benchmarks", "tests"},
 }
+COMMAND_LINES = "millrace.flags."
+"""What every command line is made with, those of learner and workers too: they may import it. It imports only protocol."""
 LEARNER = {  # what each folder of the learner may import of the learner; train.py, run.py and the like may import all
     "config": {"run_folder"},
     "algorithms": {"config"},
@@ -65,10 +67,11 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"dashboard", "launch", "play_flags", "playing", "terminal"},
+    "cli": {"dashboard", "flags", "launch", "play_flags", "playing", "terminal"},
     "dashboard": {"cli"},
+    "flags": set[str](),
     "integrations": set[str](),
-    "launch": {"arguments", "own_policy", "policies", "terminal"},
+    "launch": {"arguments", "flags", "own_policy", "policies", "terminal"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
 MAY_PRINT = (
@@ -251,8 +254,16 @@ def circles(arrows: Mapping[str, set[str]]) -> list[list[str]]:
 @pytest.mark.parametrize("folder", PACKAGES)
 def test_imports_between_packages_go_one_way(folder: str) -> None:
     assert sources(folder)
+    may_all = (COMMAND_LINES,) if folder in ("learner", "workers") else ()
     for source in sources(folder):
-        assert not imported(source) & FORBIDDEN[folder], source
+        names = {name for name in modules_imported(source) if not name.startswith(may_all)}
+        assert not {package(name) for name in names} & FORBIDDEN[folder], source
+
+
+def test_what_command_lines_are_made_with_imports_only_protocol() -> None:
+    assert sources("millrace/flags")
+    for source in sources("millrace/flags"):
+        assert not imported(source) & {"learner", "workers"}, source
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -363,7 +374,7 @@ def test_only_the_command_line_prints() -> None:
 
 
 def test_command_lines_are_made_in_one_way() -> None:
-    """By `millrace.protocol.flags`, of a record."""
+    """By `millrace.flags`, of a record."""
     for source in sources(*PACKAGES):
         assert not imported(source) & {"argparse", "click", "getopt", "optparse", "tyro"}, source
 

@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 
 from benchmarks.markdown_tables import table
+from millrace.flags.field_texts import field_texts
 from millrace.learner.config.command_line import BASIC, GROUPS, LAYERS, RunFlags
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.resume_rules import OnResume, declared
 from millrace.protocol.bounds import LARGEST
-from millrace.protocol.flags.field_texts import field_texts
 from website.tables import anchored
 
 HEAD = """# Settings

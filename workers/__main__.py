@@ -13,10 +13,10 @@ import os
 import signal
 import sys
 
+from millrace.flags.parse import parse_flags
 from millrace.protocol.address import check_worker_name
 from millrace.protocol.bounds import MAX_NAME, one_line
 from millrace.protocol.errors import UsageError, UserFacingError
-from millrace.protocol.flags.parse import parse_flags
 from millrace.protocol.keys.key_folder import read_token
 from millrace.protocol.keys.keys import Token
 from millrace.workers.conversation.connection_rules import checked_token

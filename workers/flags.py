@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from millrace.protocol.flags.fields import Flag, NotNegative
+from millrace.flags.fields import Flag, NotNegative
 
 SecondsFlag = Annotated[NotNegative, Flag("S")]
 HIDDEN = Flag(hidden=True)

@@ -6,13 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+from millrace.flags.fields import Flag, fields_of
+from millrace.flags.parse import asks_for_help, given_values, show_help, words_of
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import lower_layers, override
 from millrace.learner.config.other_names import in_place_of
 from millrace.learner.config.validation import validate
 from millrace.learner.run_folder.newest_run import AUTO, newest_run
-from millrace.protocol.flags.fields import Flag, fields_of
-from millrace.protocol.flags.parse import asks_for_help, given_values, show_help, words_of
 
 
 class RunFlags(Config, frozen=True, kw_only=True):

@@ -13,11 +13,11 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
+from millrace.flags.fields import Flag, NotNegative
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, PPOConfig
 from millrace.learner.config.resume_rules import Fixed, Free
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.protocol.bounds import MAX_SEEDS, Count, Natural
-from millrace.protocol.flags.fields import Flag, NotNegative
 
 TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
 PRESETS = Path(__file__).with_name("presets.toml")

@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from millrace.flags.fields import NotNegative, Positive
 from millrace.learner.config.resume_rules import Fixed, Free
 from millrace.protocol.bounds import Count, Natural
-from millrace.protocol.flags.fields import NotNegative, Positive
 
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Schedule = Literal["constant", "linear"]

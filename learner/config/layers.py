@@ -14,6 +14,8 @@ from typing import Any
 
 import msgspec
 
+from millrace.flags.fields import fields_of
+from millrace.flags.values import with_whole_numbers
 from millrace.learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
@@ -24,8 +26,6 @@ from millrace.learner.run_folder.regular_files import MOST_TEXT_BYTES
 from millrace.learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
 from millrace.protocol.envs.found_names import moved
 from millrace.protocol.errors import UsageError, did_you_mean
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.values import with_whole_numbers
 
 
 def resolve(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from millrace.protocol.flags.toml_words import written
+from millrace.flags.toml_words import written
 
 if TYPE_CHECKING:
     from millrace.learner.config.config import Config

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from millrace.flags.fields import Flag, NotNegative, Positive
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.bounds import Count, Natural
@@ -18,7 +19,6 @@ from millrace.protocol.env_spec import Scalar
 from millrace.protocol.envs.kinds_of_copies import KINDS
 from millrace.protocol.envs.seats import STATE
 from millrace.protocol.envs.wrappers import WrapperLike
-from millrace.protocol.flags.fields import Flag, NotNegative, Positive
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 HEARTBEAT_S = 1.0

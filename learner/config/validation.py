@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from millrace.flags.fields import fields_of
+from millrace.flags.values import what_was_expected
 from millrace.learner.config.algorithm_names import settings_record
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.evaluation_size import evaluation_size
@@ -21,8 +23,6 @@ from millrace.protocol.env_spec import check_arguments
 from millrace.protocol.envs.kinds_of_copies import check_kind
 from millrace.protocol.envs.wrappers import wrapper_name
 from millrace.protocol.errors import UsageError, safe_repr
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.values import what_was_expected
 from millrace.protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message

@@ -11,9 +11,9 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from millrace.flags.program_name import typed_name
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.errors import UserFacingError, first_line
-from millrace.protocol.flags.program_name import typed_name
 
 OURS, OF_LEARNER = "millrace.", "millrace.learner."  # how names of our modules begin
 

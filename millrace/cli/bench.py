@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 from millrace.cli.commands import COMMANDS
+from millrace.flags.parse import asks_for_help, show_help
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.parse import asks_for_help, show_help
 
 HERE = Path(__file__).parents[2]
 """The folder that holds `millrace`"""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from millrace.protocol.flags.fields import Flag
+from millrace.flags.fields import Flag
 
 
 class ListFlags(msgspec.Struct, frozen=True, kw_only=True):

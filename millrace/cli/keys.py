@@ -11,8 +11,8 @@ from typing import Annotated
 import msgspec
 
 from millrace.cli.subcommands import chosen_subcommand
-from millrace.protocol.flags.fields import Flag
-from millrace.protocol.flags.parse import parse_flags
+from millrace.flags.fields import Flag
+from millrace.flags.parse import parse_flags
 from millrace.protocol.keys.key_folder import KeyFolder, chosen_key_folder
 from millrace.protocol.keys.keys import public_key
 

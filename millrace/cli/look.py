@@ -7,12 +7,12 @@ from pathlib import Path
 
 from millrace.cli.flags import ListFlags, PlotFlags, ReportFlags
 from millrace.cli.status import table
+from millrace.flags.parse import parse_flags
 from millrace.learner.report.page import write_page
 from millrace.learner.report.picture import draw
 from millrace.learner.report.run_lines import RunLine, algorithm_label, find_runs, read_line
 from millrace.learner.report.sentences import per_second
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.parse import parse_flags
 
 
 def list_runs(argv: list[str]) -> int:

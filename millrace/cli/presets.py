@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import msgspec
 
+from millrace.flags.parse import parse_flags
+from millrace.flags.program_name import typed_name
 from millrace.learner.config.presets import algorithms_and_environments, named_presets
-from millrace.protocol.flags.parse import parse_flags
-from millrace.protocol.flags.program_name import typed_name
 
 
 class PresetsFlags(msgspec.Struct, frozen=True):

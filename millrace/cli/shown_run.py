@@ -11,11 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from millrace.flags.program_name import typed_name
 from millrace.learner.config.presets import origin
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.standard_streams import unfailing
-from millrace.protocol.flags.program_name import typed_name
 from millrace.protocol.logs.notices import log_notice
 from millrace.terminal import progress_view
 

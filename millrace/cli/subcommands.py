@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
+from millrace.flags.fields import fields_of
+from millrace.flags.parse import HELP_FLAGS
 from millrace.protocol.errors import UsageError, did_you_mean
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.parse import HELP_FLAGS
 
 Records = Mapping[str, type[msgspec.Struct]]
 """The flags of each subcommand"""

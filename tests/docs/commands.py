@@ -19,8 +19,6 @@ from millrace.extras.launchers.command import LAUNCHERS
 from millrace.learner.config.command_line import RunFlags
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
 from millrace.workers.flags import WorkerFlags
 from tests.docs.pages import Block
 from website.commands_page import help_of, lines_of

@@ -16,11 +16,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import pytest
 
 import millrace
+from millrace.flags.field_texts import field_texts
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.play_flags import EvaluateFlags, PlayFlags, RecordFlags
-from millrace.protocol.flags.field_texts import field_texts
 
 MODULE = Path(millrace.__file__).with_name("keywords.py")
 HEAD = '''"""The keywords of `train`, `RolloutService`, `evaluate` and `record`, for editors and type checkers.

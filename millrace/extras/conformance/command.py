@@ -17,8 +17,6 @@ from millrace.extras.conformance.profiles import PROFILES
 from millrace.extras.conformance.report import as_data, explanation, line_of, summary
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.fields import Flag, Positive
-from millrace.protocol.flags.parse import cut_at_dashes, parse_flags
 
 
 class ConformFlags(msgspec.Struct, frozen=True, kw_only=True):

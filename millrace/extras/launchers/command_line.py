@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from millrace.extras.launchers.flags import LaunchFlags
+from millrace.flags.parse import cut_at_dashes, parse_flags
 from millrace.learner.config.command_line import read_config
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.parse import cut_at_dashes, parse_flags
 
 Flags = TypeVar("Flags", bound=LaunchFlags)
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import msgspec
 
+from millrace.flags.fields import Flag
 from millrace.protocol.bounds import Count
-from millrace.protocol.flags.fields import Flag
 
 
 class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):

@@ -5,9 +5,9 @@ import re
 import msgspec
 import pytest
 
+from millrace.flags.field_texts import field_texts
 from millrace.learner.config.command_line import BASIC, GROUPS, RunFlags, read_config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
-from millrace.protocol.flags.field_texts import field_texts
 
 
 def help_text(capsys: pytest.CaptureFixture[str], *argv: str) -> str:

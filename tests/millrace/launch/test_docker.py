@@ -45,8 +45,9 @@ def packages(modules: set[str]) -> set[str]:
 
 
 def test_the_worker_image_holds_what_workers_import_and_nothing_else() -> None:
-    ours = {"protocol", "workers"}
-    found = set().union(*(imported(source) for source in sources("protocol", "workers") if "/envs/" not in source))
+    folders = ("protocol", "workers", "millrace/flags")
+    ours = {"protocol", "workers", "millrace"}
+    found = set().union(*(imported(source) for source in sources(*folders) if "/envs/" not in source))
     assert names(DOCKER / "worker.txt") == packages(found - ours - NOT_FOR_WORKERS - sys.stdlib_module_names)
     assert names(DOCKER / "worker.txt") < names(ROOT / "constraints.txt")
 

@@ -15,10 +15,10 @@ from typing import Any, NoReturn, TypeVar
 
 import msgspec
 
+from millrace.flags.fields import FlagField, fields_of
+from millrace.flags.help import Group, help_text
+from millrace.flags.values import read_words
 from millrace.protocol.errors import UsageError, did_you_mean, unexpected_arguments
-from millrace.protocol.flags.fields import FlagField, fields_of
-from millrace.protocol.flags.help import Group, help_text
-from millrace.protocol.flags.values import read_words
 
 HELP_FLAGS = ("-h", "--help")
 EVERYWHERE = (*HELP_FLAGS, "--debug")  # flags that every command takes

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from millrace.flags.fields import fields_of
+from millrace.flags.toml_words import as_text, read_word, written
+from millrace.flags.values import read_words
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.presets import environment_name
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.fields import fields_of
-from millrace.protocol.flags.toml_words import as_text, read_word, written
-from millrace.protocol.flags.values import read_words
 
 FIELD = fields_of(Config)["env_kwargs"]
 

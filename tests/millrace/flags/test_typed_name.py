@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from millrace.cli.shown_run import next_commands
-from millrace.protocol.flags.program_name import typed_name
+from millrace.flags.program_name import typed_name
 
 
 def program(path: Path) -> Path:

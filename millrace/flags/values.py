@@ -15,10 +15,10 @@ from typing import Any, get_args, get_origin
 
 import msgspec
 
+from millrace.flags.fields import FlagField, choices, is_choice
+from millrace.flags.toml_words import as_text, read_word
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.fields import FlagField, choices, is_choice
-from millrace.protocol.flags.toml_words import as_text, read_word
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:

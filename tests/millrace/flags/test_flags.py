@@ -9,10 +9,10 @@ import msgspec
 import pytest
 from msgspec import Meta
 
+from millrace.flags.fields import Flag, fields_of
+from millrace.flags.help import help_text
+from millrace.flags.parse import parse_flags, words_of
 from millrace.protocol.errors import UsageError
-from millrace.protocol.flags.fields import Flag, fields_of
-from millrace.protocol.flags.help import help_text
-from millrace.protocol.flags.parse import parse_flags, words_of
 
 
 class Base(msgspec.Struct, frozen=True, kw_only=True):

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from millrace.protocol.flags.field_texts import field_texts
-from millrace.protocol.flags.fields import FlagField, fields_of
+from millrace.flags.field_texts import field_texts
+from millrace.flags.fields import FlagField, fields_of
 
 WIDEST_COLUMNS = 120
 TEXT_COLUMN = 26  # where the texts begin
