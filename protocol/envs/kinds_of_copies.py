@@ -31,9 +31,9 @@ class CopiesKind(NamedTuple):
     """A way to step the env copies of a lane."""
 
     open: Callable[[RunSpec, EnvCopy, Callable[[], None]], Any]
-    """Makes the copies of a lane, as `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy` says which copy the first one is;
-    the last argument is called between two calls of the environment, and may raise. Raises `UsageError` if the environment
-    has no such copies.
+    """Makes the copies of a lane, as `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy` says which copy the first
+    one is; the last argument is called between two calls of the environment, and may raise. Raises `UsageError` if the
+    environment has no such copies.
     """
     spaces: Callable[[EnvSpec], tuple[gymnasium.Space[Any], gymnasium.Space[Any]]] | None = None
     """Observation and action space of one copy: a worker refuses them if the environment itself has others. None: they are

@@ -16,6 +16,8 @@ from millrace.cli import flags, keys, presets, status
 from millrace.cli.commands import COMMANDS
 from millrace.extras.conformance.command import ConformFlags
 from millrace.extras.launchers.command import LAUNCHERS
+from millrace.flags.fields import fields_of
+from millrace.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
 from millrace.learner.config.command_line import RunFlags
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import UsageError

@@ -15,6 +15,8 @@ from millrace.extras.conformance.examiner import Check, CheckResult
 from millrace.extras.conformance.learner import Settings
 from millrace.extras.conformance.profiles import PROFILES
 from millrace.extras.conformance.report import as_data, explanation, line_of, summary
+from millrace.flags.fields import Flag, Positive
+from millrace.flags.parse import cut_at_dashes, parse_flags
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 
