@@ -16,7 +16,6 @@ STILL = {
     ("learner/algorithms/replay/continuous.py", "datasets"),
     ("learner/between_updates/audience.py", "datasets"),
     ("learner/between_updates/between_updates.py", "datasets"),
-    ("learner/between_updates/run_files.py", "datasets"),
     ("learner/between_updates/run_files.py", "monitoring"),
     ("learner/run.py", "datasets"),
     ("learner/run_setup.py", "monitoring"),

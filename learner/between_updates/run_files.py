@@ -17,9 +17,9 @@ import msgspec
 from millrace.learner.algorithms.algorithm import acting_weights
 from millrace.learner.between_updates.evaluations import Evaluations
 from millrace.learner.between_updates.run_parts import RunParts
-from millrace.learner.recording.image_sample import image_samples
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.env_attributes import EnvAttributes
+from millrace.learner.run_folder.image_sample import image_samples
 from millrace.learner.run_folder.last_line import resume_command
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress, Row, steps_per_second

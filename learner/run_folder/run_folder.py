@@ -8,7 +8,7 @@
       checkpoints/          to resume from (checkpoint.py)
       policy.safetensors    the arrays of the acting policy, by name
       best.safetensors      the same of the best policy in the run's own evaluations
-      observation*.png      what the policy sees, if that is an image (recording/image_sample.py)
+      observation*.png      what the policy sees, if that is an image (image_sample.py)
       policy.json           the meaning of these arrays: with it, another program can act
       summary.json          the results of the run (results.py)
       log.jsonl             warnings and notices of the learner (json_log.py)

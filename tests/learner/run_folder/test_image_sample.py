@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from millrace.learner.recording.image_sample import GAP, GRAY, image_samples, png
+from millrace.learner.run_folder.image_sample import GAP, GRAY, image_samples, png
 from millrace.protocol.specs import Leaf
 
 T, COPIES, SIDE = 9, 2, 7
