@@ -24,14 +24,14 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.costs import large_observations, minibatch_rows
 from millrace.learner.config.validation import unused_setting
 from millrace.learner.conversations import open_hub
+from millrace.learner.extras import started_by
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.recording.prior_dataset import PriorDataset
-from millrace.learner.recording.training_recorder import TrainingRecorder
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from millrace.learner.run_folder.lease import Closed, Listens
-from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
-from millrace.learner.run_setup import KnownEnvironment, RunSetup
+from millrace.learner.run_folder.run_folder import Interrupted
+from millrace.learner.run_setup import RunSetup
 from millrace.learner.run_spec import run_spec
 from millrace.learner.run_state import RunState, restore, start_from
 from millrace.learner.torch_setup import threads, torch_device, updates_use_all_cores
@@ -92,22 +92,26 @@ class OpenRun:
             cores = CrowdedCores((config.torch_threads or 1) if torch_device(config) == "cpu" else 0)
             train(self.algorithm, self.policy, self.hub, self.between, workers, self._check_time, cores)
         except RunTakenOver as error:
-            self.hub.drain(str(error), timeout_s=DRAIN_S)
+            reason = str(error)
+            self.hub.drain(reason, timeout_s=DRAIN_S)
+            self._end_after_error(lambda: audience.leave(reason))
             raise
         except BaseException as error:
             if line := files.saved(elsewhere=self.setup.elsewhere):
                 error.add_note(line)
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
             self.hub.drain(reason, timeout_s=self.setup.interrupts.at_most(DRAIN_S))
-            try:
-                audience.finish(reason, cut_short=True)
-            except Exception as later:  # a callback may raise again, and the error of the run is what counts
-                log.warning("%s", _why(later))
+            self._end_after_error(lambda: audience.finish(reason, cut_short=True))
             raise
         finally:
             files.close()
-            audience.close()
-        audience.confirm_recorded()
+
+    def _end_after_error(self, end: Callable[[], None]) -> None:
+        """Tell the callbacks. One of them may raise again, but the error of the run is what counts."""
+        try:
+            end()
+        except Exception as later:
+            log.warning("%s", _why(later))
 
     def _learn_from_prior(self, prior: PriorDataset) -> None:
         """Make the gradient steps before the first rollouts, with checkpoints when it is time, and at an interrupt."""
@@ -162,14 +166,16 @@ def open_run(
     if state.opponent_policies is not None and pool is not None:
         hub.keep_opponents(*state.opponent_policies)
     state.opponent_policies = None
-    dataset = _training_recorder(config, folder, setup.known, spec)
+    if config.record:
+        about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
+        callbacks.add(started_by("record")(config.record, setup.known.described, spec, about))
     setup.check_interrupt()
     folder.remove_temporary()
     folder.write_config(config, workers_elsewhere=not processes.expected)
     folder.remove_summary()
     tally = Tally(config, spec, state, lambda: callbacks.stop_reason, pool)
     parts = RunParts(config, spec, folder, algorithm, hub, tally)
-    between = open_files(parts, callbacks, dataset, setup.known.evaluation_limit)
+    between = open_files(parts, callbacks, setup.known.evaluation_limit)
     run = OpenRun(setup, spec.policy, algorithm, hub, between, prior)
     hub.report_progress(between.audience.progress())
     if setup.resumed:
@@ -253,10 +259,3 @@ def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec, check:
     algorithm.add_prior(batches(), dataset.rows + dataset.episodes)
     log.info("prior %s: %d transitions of %d episodes", dataset_id, dataset.rows, dataset.episodes)
     return dataset
-
-
-def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironment, spec: RunSpec) -> TrainingRecorder | None:
-    if not config.record:
-        return None
-    about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
-    return TrainingRecorder(config.record, known.described, spec, about)

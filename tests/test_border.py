@@ -14,8 +14,6 @@ from tests.test_architecture import PACKAGES, module, modules_imported, sources
 STILL = {
     ("learner/algorithms/actor_critic.py", "datasets"),
     ("learner/algorithms/replay/continuous.py", "datasets"),
-    ("learner/between_updates/audience.py", "datasets"),
-    ("learner/between_updates/between_updates.py", "datasets"),
     ("learner/between_updates/run_files.py", "monitoring"),
     ("learner/run.py", "datasets"),
     ("learner/run_setup.py", "monitoring"),

@@ -1,4 +1,4 @@
-"""Tells how far a run is: its callbacks (the terminal is one of them), `millrace status`, Prometheus, a dataset of episodes.
+"""Tells how far a run is: its callbacks (the terminal is one of them), `millrace status`, Prometheus.
 
 Rule: what is told was counted before, and stands in a row of the metrics. What callbacks log is added to the row of the
 newest update, also if one of them raises. `on_checkpoint` follows a checkpoint, so what it asks for may not be in it.
@@ -16,13 +16,11 @@ import msgspec
 from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.callbacks.callbacks import Callbacks
-from millrace.learner.recording.training_recorder import TrainingRecorder
 from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.run_folder.progress import Progress, Row, named, steps_per_second
 from millrace.learner.run_folder.requests import Requests
 from millrace.protocol.arrays import Array
-from millrace.protocol.errors import RunError
 from millrace.protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
@@ -33,18 +31,10 @@ SHOW_EVERY_S = 0.2  # progress between two updates
 class Audience:
     """All that watch one run."""
 
-    def __init__(
-        self,
-        run: RunParts,
-        callbacks: Callbacks,
-        files: RunFiles,
-        requests: Requests,
-        dataset: TrainingRecorder | None,
-    ) -> None:
-        """`requests`: what callbacks ask for. `dataset` gets the episodes of training. It is closed with the audience."""
+    def __init__(self, run: RunParts, callbacks: Callbacks, files: RunFiles, requests: Requests) -> None:
+        """`requests`: what callbacks ask for."""
         self._config, self._hub, self._tally, self._state = run.config, run.hub, run.tally, run.tally.state
-        self._callbacks, self._files, self._requests, self._dataset = callbacks, files, requests, dataset
-        self._not_recorded: RunError | None = None
+        self._callbacks, self._files, self._requests = callbacks, files, requests
         self._settings = msgspec.to_builtins(run.config)
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._workers_alive = 0
@@ -77,17 +67,16 @@ class Audience:
             self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
-        """These rollouts have come. True if an update is to be made of them: no callback ends the run.
-
-        Their episodes are recorded, if the run records episodes.
-        """
+        """These rollouts have come. True if an update is to be made of them: no callback ends the run."""
         began_s = time.monotonic()
         if self._callbacks.wants("on_rollouts"):
-            progress = msgspec.structs.replace(self.progress(), rollouts=tuple(one.rollout for one in rollouts))
-            self._callbacks.on_rollouts(progress)
-            if self._callbacks.stop_reason is not None:
+            progress = msgspec.structs.replace(
+                self.progress(),
+                rollouts=tuple(one.rollout for one in rollouts),
+                incarnations=tuple(one.incarnation for one in rollouts),
+            )
+            if not self._callbacks.on_rollouts(progress):
                 return False
-        self._record(rollouts)
         self._tally.gathered_s = time.monotonic() - began_s
         return True
 
@@ -130,19 +119,13 @@ class Audience:
         """
         if not self._finished:
             self._files.write_summary(reason, cut_short=cut_short)
-            self._finished = True
-            self._requests.closed = "the run has ended"
-            self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
+            self.leave(reason, cut_short=cut_short)
 
-    def close(self) -> None:
-        """Close the dataset if episodes were recorded. Also for a run that was cut short."""
-        if self._dataset is not None:
-            log.warning("%s", self._dataset.close())
-
-    def confirm_recorded(self) -> None:
-        """Raise `RunError` if the dataset that the run was to write could not be written."""
-        if self._not_recorded is not None:
-            raise self._not_recorded
+    def leave(self, reason: str, *, cut_short: bool = True) -> None:
+        """The run has ended in this process. Without a summary, because another process may go on with it."""
+        self._finished = True
+        self._requests.closed = "the run has ended"
+        self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
 
     def env_attributes(self) -> Array | None:
         """The attributes of env copies that callbacks have set, for the weights of this version."""
@@ -153,16 +136,6 @@ class Audience:
         return self._progress(self._hub.snapshot())
 
     # ---------------------------------------------------------------- inside
-
-    def _record(self, rollouts: Sequence[AcceptedRollout]) -> None:
-        """Record episodes. If the disk refuses them, training continues, as it does without checkpoints."""
-        if self._dataset is None:
-            return
-        try:
-            self._dataset.add(rollouts)
-        except RunError as error:
-            log.warning("%s; it is removed, and training continues", error)
-            self._dataset, self._not_recorded = None, error
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
         """`collected`: env steps that wait for the next update, if that is awaited."""

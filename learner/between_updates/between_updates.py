@@ -10,7 +10,6 @@ from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.between_updates.tally import Tally
 from millrace.learner.callbacks.callbacks import Callbacks
-from millrace.learner.recording.training_recorder import TrainingRecorder
 from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.learner.run_folder.requests import Requests
 from millrace.protocol.envs.kinds_of_copies import copies_kind
@@ -25,9 +24,7 @@ class BetweenUpdates(NamedTuple):
     evaluations: Evaluations
 
 
-def open_files(
-    run: RunParts, callbacks: Callbacks, dataset: TrainingRecorder | None, time_limit: int | None
-) -> BetweenUpdates:
+def open_files(run: RunParts, callbacks: Callbacks, time_limit: int | None) -> BetweenUpdates:
     """Open the metrics, and bring the files of a resumed run back to its state. Raises `RunError`.
 
     `time_limit`: env steps after which an episode of an evaluation is truncated, if any.
@@ -35,7 +32,7 @@ def open_files(
     requests = Requests(EnvAttributes(run.tally.state.env_attributes, _why_no_attributes(run.spec.vector)))
     evaluations = Evaluations(run, time_limit)
     files = RunFiles(run, evaluations, requests.attributes)
-    return BetweenUpdates(run.tally, files, Audience(run, callbacks, files, requests, dataset), evaluations)
+    return BetweenUpdates(run.tally, files, Audience(run, callbacks, files, requests), evaluations)
 
 
 def _why_no_attributes(vector: str) -> str:

@@ -30,7 +30,10 @@ class Callback:
         return None
 
     def on_rollouts(self, progress: Progress) -> object:
-        """`progress.rollouts` have come, and an update will be made of them next. Their arrays are read-only."""
+        """`progress.rollouts` have come, and an update will be made of them next. Their arrays are read-only.
+
+        Not called if an earlier callback has ended the run.
+        """
         return None
 
     def on_update(self, progress: Progress) -> object:

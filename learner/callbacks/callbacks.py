@@ -44,6 +44,10 @@ class Callbacks:
         self._callbacks += [_checked(named_callback(name), name) for name in dict.fromkeys(names)]
         return self
 
+    def add(self, callback: object) -> None:
+        """Add a callback, which is called after the others. Raises `UsageError`, as `Callbacks` does."""
+        self._callbacks.append(_checked(callback))
+
     def wants(self, moment: str) -> bool:
         """Whether any callback has this method."""
         return any(_method(callback, moment) for callback in self._callbacks)
@@ -54,9 +58,12 @@ class Callbacks:
             self._started.append(callback)
             self._call_one(callback, "on_start", progress)
 
-    def on_rollouts(self, progress: Progress) -> None:
-        """Rollouts have come."""
-        self._call("on_rollouts", progress)
+    def on_rollouts(self, progress: Progress) -> bool:
+        """Rollouts have come. Returns whether an update is to be made of them; if not, the other callbacks are not told."""
+        for callback in self._callbacks:
+            if self.stop_reason is None:
+                self._call_one(callback, "on_rollouts", progress)
+        return self.stop_reason is None
 
     def on_update(self, progress: Progress) -> None:
         """An update was made."""

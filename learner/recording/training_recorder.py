@@ -1,26 +1,33 @@
-"""`--record`: writes the whole episodes of training as a Minari dataset."""
+"""`--record`: a callback that writes the whole episodes of training as a Minari dataset.
+
+Rule: a dataset that cannot be written costs no training. It is removed, the run goes on, and fails at its end.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
 from typing import Any
 
 import gymnasium
 
+from millrace.learner.callbacks.callback import Callback
 from millrace.learner.recording.episodes import EpisodeAssembler
 from millrace.learner.recording.minari import MinariDataset
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.errors import RunError
+from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 
+log = logging.getLogger("millrace.learner")
 
-class TrainingRecorder:
+
+class TrainingRecorder(Callback):
     """Writes every whole episode of training into a dataset, with the actions as they were taken.
 
-    Steps of episodes that cannot be whole are counted instead.
+    Steps of episodes that cannot be whole are counted instead. Without a whole episode, no dataset is written.
     """
 
     def __init__(self, dataset_id: str, env: DescribedEnv, run: RunSpec, about: str) -> None:
@@ -32,31 +39,41 @@ class TrainingRecorder:
         self._id = dataset_id
         self._episodes = 0
         self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env, masked=run.masked), about)
+        self._refused: RunError | None = None
 
-    def add(self, rollouts: Sequence[AcceptedRollout]) -> None:
-        """Add the rollouts of an update. Raises `RunError` if the dataset cannot be written; then it is removed."""
-        for arrived in rollouts:
-            for episode in self._assembler.add(arrived.rollout, arrived.incarnation):
-                try:
-                    self._dataset.add(episode)
-                except RunError:
-                    self._episodes = 0
-                    self._dataset.discard()
-                    raise
-                self._episodes += 1
+    def on_rollouts(self, progress: Progress) -> None:
+        """Add the rollouts of an update."""
+        if self._refused is not None:
+            return
+        try:
+            for rollout, incarnation in zip(progress.rollouts, progress.incarnations, strict=True):
+                self._add(rollout, incarnation)
+        except RunError as error:
+            log.warning("%s; it is removed, and training continues", error)
+            self._dataset.discard()
+            self._refused = error
 
-    def close(self) -> str:
-        """Finish the dataset. Returns one line that describes it. Without a whole episode, no dataset is written.
+    def on_end(self, progress: Progress) -> None:
+        """Finish the dataset, and log one line that describes it.
 
-        Raises `RunError` if it cannot be written; then it is removed.
+        Raises `RunError` if it could not be written, now or earlier, and nothing else ended the run; then it is removed.
         """
+        if self._refused is None:
+            self._finish()
+        elif not progress.cut_short:
+            raise self._refused
+
+    def _add(self, rollout: Rollout, incarnation: int) -> None:
+        for episode in self._assembler.add(rollout, incarnation):
+            self._dataset.add(episode)
+            self._episodes += 1
+
+    def _finish(self) -> None:
         if self._episodes:
             with self._dataset:
                 pass  # leaving it writes the episodes that are still in memory
-        else:
-            self._dataset.discard()
         parts = self._assembler.waiting + self._assembler.left_out
-        return f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out"
+        log.warning(f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out")
 
 
 class EnvironmentOfDataset(gymnasium.Env[Any, Any]):

@@ -18,7 +18,7 @@ from millrace.protocol.rollout import Episode, Rollout
 ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
-NOT_SHOWN = ("settings", "episodes", "rollouts", "requests")
+NOT_SHOWN = ("settings", "episodes", "rollouts", "incarnations", "requests")
 """Fields of `Progress` that a log of it leaves out."""
 Row = Mapping[str, float | None]
 
@@ -95,6 +95,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """path of the newest checkpoint; empty before the first"""
     rollouts: tuple[Rollout, ...] = ()
     """in `Callback.on_rollouts`: the rollouts of the next update, in the order in which they came"""
+    incarnations: tuple[int, ...] = ()
+    """in `Callback.on_rollouts`: for each rollout the incarnation of its lane, which rises when the lane gets new copies;
+    `Rollout.sequence` then starts from 0 again
+    """
     stop_reason: str = ""
     """in `Callback.on_end`: why the run ended"""
     cut_short: bool = False

@@ -79,6 +79,27 @@ def test_false_ends_the_run_and_the_first_counts(answer: object) -> None:
     assert callbacks.stop_reason == "ended by Told.on_start"
 
 
+def test_rollouts_of_which_no_update_is_made_are_told_to_no_further_callback() -> None:
+    class Counts(Callback):
+        def __init__(self, answer: object) -> None:
+            self.answer = answer
+            self.told = 0
+
+        def on_rollouts(self, progress: Progress) -> object:
+            self.told += 1
+            return self.answer
+
+    first, refuses, last = Counts(None), Counts(False), Counts(None)
+    callbacks = Callbacks([first, refuses])
+    callbacks.add(last)
+    assert not callbacks.on_rollouts(NOW)
+    assert (first.told, refuses.told, last.told) == (1, 1, 0)
+    refuses.answer = None
+    assert not callbacks.on_rollouts(NOW), "the run has been ended"
+    assert Callbacks([first, refuses, last]).on_rollouts(NOW)
+    assert (first.told, refuses.told, last.told) == (2, 2, 1)
+
+
 @pytest.mark.parametrize("answer", [None, True, 0, 0.0, "", [], np.array([])])
 def test_nothing_else_ends_it(answer: object) -> None:
     callbacks = Callbacks([Told(answer), lambda progress: answer])

@@ -1,5 +1,6 @@
 """Episodes kept: whole, in order, as they were; and the dataset that Minari reads back."""
 
+import re
 import sys
 import warnings
 from collections import Counter
@@ -26,7 +27,7 @@ from millrace.learner.recording.prior_dataset import PriorDataset
 from millrace.learner.recording.record import RecordedDataset
 from millrace.learner.recording.record import record as record_with
 from millrace.learner.recording.training_recorder import TrainingRecorder
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.env_actions import make_action_converter
@@ -505,7 +506,7 @@ def test_what_minari_leaves_when_it_fails_is_removed(tmp_path: Path, root: Path,
 
 @pytest.mark.parametrize("chunk_bytes", [1, 2**20])
 def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
-    root: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
+    root: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, chunk_bytes: int
 ) -> None:
     """`chunk_bytes`: whether the second episode is written while the run trains, or at its end."""
     from minari.dataset.minari_storage import MinariStorage
@@ -515,22 +516,40 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
 
     run = run_of(f"{TOY}Countdown-v0", T=6, N=1)  # an episode, and the reset after it
     collector = Collector(run, random_policy(run.policy))
-    first, second = ([AcceptedRollout(collector.collect([Assignment(n, 0, 0, n)], 0, 1, no_pulse)[0], 0)] for n in range(2))
+    first, second = (
+        Progress(rollouts=(collector.collect([Assignment(n, 0, 0, n)], 0, 1, no_pulse)[0],), incarnations=(0,))
+        for n in range(2)
+    )
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
     monkeypatch.setattr(dataset_module, "CHUNK_BYTES", chunk_bytes)
-    recorder.add(first)
+    recorder.on_rollouts(first)
     monkeypatch.setattr(dataset_module, "append_episodes", full)
     monkeypatch.setattr(MinariStorage, "new", full)
     says = "dataset ns/countdown-v0 was not written: OSError: .*No space left on device"
     if chunk_bytes == 1:
         assert "ns/countdown-v0/data" in everything(root)
-        with pytest.raises(RunError, match=says):
-            recorder.add(second)
-        assert recorder.close() == "dataset ns/countdown-v0: 0 training episodes; 0 steps of others left out"
+        recorder.on_rollouts(second)
+        assert re.fullmatch(f"{says}; it is removed, and training continues", caplog.messages[-1])
+        assert everything(root) == set()
+        recorder.on_rollouts(second)
+        recorder.on_end(Progress(cut_short=True))  # the run has an error of its own
+        assert len(caplog.messages) == 1, "it is said once"
     else:
-        recorder.add(second)
-        with pytest.raises(RunError, match=says):
-            recorder.close()
+        recorder.on_rollouts(second)
+    with pytest.raises(RunError, match=says):
+        recorder.on_end(Progress())
+    assert everything(root) == set()
+
+
+def test_a_run_that_ends_before_a_whole_episode_leaves_no_dataset(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = run_of(f"{TOY}Countdown-v0", T=3, N=1)
+    collector = Collector(run, random_policy(run.policy))
+    recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
+    recorder.on_rollouts(
+        Progress(rollouts=tuple(collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)), incarnations=(0,))
+    )
+    recorder.on_end(Progress())
+    assert caplog.messages == ["dataset ns/countdown-v0: 0 training episodes; 3 steps of others left out"]
     assert everything(root) == set()
 
 

@@ -14,8 +14,11 @@ import pytest
 import millrace
 from millrace import Callback, Progress
 from millrace.learner.callbacks.callbacks import MOMENTS
+from millrace.learner.run_folder.lease import Owner
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.run_folder import Interrupted
+from millrace.learner.run_folder.run_lock import LOCK_FILE
+from millrace.protocol.errors import RunTakenOver
 from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
 from tests.system.stage.runs import accounted
 
@@ -222,6 +225,17 @@ def test_an_interrupt_while_a_callback_runs(tmp_path: Path, whole: Path) -> None
     assert [n for moment, n in again.told if moment == "on_update"] == list(range(5, UPDATES + 1))
     assert again.told[0] == ("on_start", 4)
     accounted(summary(folder), lanes=2, rows=ROWS)
+
+
+def test_a_run_that_another_process_takes_over_ends_without_a_summary(tmp_path: Path) -> None:
+    other = Owner(host="far", pid=77, boot="another kernel", token="theirs").encoded()
+    told = Acts("on_update", lambda progress: Path(progress.run, LOCK_FILE).write_bytes(other), updates=4)
+    with pytest.raises(RunTakenOver):
+        run(tmp_path, told, checkpoint_every_s=0.0)
+    (end,) = told.of("on_end")
+    assert (end.updates, end.cut_short) == (4, True)
+    assert "process 77 on far has taken it over" in end.stop_reason
+    assert not (folder_of(tmp_path / "runs") / "summary.json").exists()
 
 
 def test_a_raise_after_an_error_is_only_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -213,8 +213,11 @@ def test_a_dataset_for_which_there_is_no_space_costs_no_training(
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(disk))
         filler = filled(disk)
         os.truncate(filler, filler.stat().st_size - 30_000)  # so that the first write begins
-        with pytest.raises(RunError, match=r"^dataset cartpole/training-v0 was not written: .*No space left on device$"):
+        with pytest.raises(RunError) as caught:
             run(tmp_path, "CartPole-v1", steps=3_000, record="cartpole/training-v0", **SMALL)
+        says = r"dataset cartpole/training-v0 was not written: .*No space left on device"
+        assert re.fullmatch(says, str(caught.value))
+        assert caught.value.__notes__[0] == "raised in TrainingRecorder.on_end"
         assert list(disk.iterdir()) == [filler]
     (folder,) = tmp_path.glob("runs*/*")
     assert summary(folder)["stop_reason"] == ALL_STEPS_DONE
