@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any
 
 STARTED_BY = {
+    "prior": "millrace.learner.recording.prior_dataset:PriorDataset",
     "record": "millrace.learner.recording.training_recorder:TrainingRecorder",
 }
 """setting -> `module:name`"""

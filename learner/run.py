@@ -14,6 +14,7 @@ import msgspec
 import torch
 
 from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.between_updates.between_updates import BetweenUpdates, open_files
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.between_updates.run_parts import RunParts
@@ -26,7 +27,6 @@ from millrace.learner.config.validation import unused_setting
 from millrace.learner.conversations import open_hub
 from millrace.learner.extras import started_by
 from millrace.learner.members.process_callbacks import ProcessCallbacks
-from millrace.learner.recording.prior_dataset import PriorDataset
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from millrace.learner.run_folder.lease import Closed, Listens
@@ -61,7 +61,7 @@ class OpenRun:
     algorithm: Algorithm
     hub: Hub
     between: BetweenUpdates
-    prior: PriorDataset | None
+    prior: PriorData | None
     """The data that the run learns from besides its own, if there are any."""
 
     def announce(self, address: str, advertise: str, keyring: Keyring | None) -> None:
@@ -113,7 +113,7 @@ class OpenRun:
         except Exception as later:
             log.warning("%s", _why(later))
 
-    def _learn_from_prior(self, prior: PriorDataset) -> None:
+    def _learn_from_prior(self, prior: PriorData) -> None:
         """Make the gradient steps before the first rollouts, with checkpoints when it is time, and at an interrupt."""
         tally, files, audience, _ = self.between
 
@@ -222,7 +222,7 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: ProcessCallback
     return replace(setup, config=config)
 
 
-def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorDataset | None]:
+def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData | None]:
     """An algorithm that starts from another run, if it is to, and has its prior data. A resumed one has its own start."""
     config, folder, policy = setup.config, setup.folder, spec.policy
     algorithm = algorithm_class(config.algo)(
@@ -246,16 +246,31 @@ def _why(error: BaseException) -> str:
     return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")
 
 
-def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec, check: Callable[[], None]) -> PriorDataset:
-    if missing := [name for name in FOR_PRIOR if not hasattr(algorithm, name)]:
-        raise UsageError(f"prior {dataset_id}: {type(algorithm).__name__} lacks {', '.join(missing)}")
-    dataset = PriorDataset(dataset_id, policy)
+@dataclass(frozen=True)
+class _InterruptiblePrior:
+    """Prior data whose reading `check` may end: it is called after each episode, and what it raises passes."""
 
-    def batches() -> Iterator[Batch]:
-        for batch in dataset.batches():
-            check()
+    data: PriorData
+    check: Callable[[], None]
+
+    @property
+    def rows(self) -> int:
+        return self.data.rows
+
+    @property
+    def episodes(self) -> int:
+        return self.data.episodes
+
+    def batches(self) -> Iterator[Batch]:
+        for batch in self.data.batches():
+            self.check()
             yield batch
 
-    algorithm.add_prior(batches(), dataset.rows + dataset.episodes)
-    log.info("prior %s: %d transitions of %d episodes", dataset_id, dataset.rows, dataset.episodes)
-    return dataset
+
+def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec, check: Callable[[], None]) -> PriorData:
+    if missing := [name for name in FOR_PRIOR if not hasattr(algorithm, name)]:
+        raise UsageError(f"prior {dataset_id}: {type(algorithm).__name__} lacks {', '.join(missing)}")
+    prior: PriorData = started_by("prior")(dataset_id, policy)
+    algorithm.add_prior(_InterruptiblePrior(prior, check))
+    log.info("prior %s: %d transitions of %d episodes", dataset_id, prior.rows, prior.episodes)
+    return prior

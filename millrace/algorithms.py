@@ -36,6 +36,7 @@ What it learns from:
 
 - `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
+- `PriorData`: the dataset that `Algorithm.add_prior` gets.
 - `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
 - `Demonstrations`: the steps that `Clones.cloning_loss` gets. `Clones` is the base of those that clone (`--clone-epochs`).
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
@@ -67,6 +68,7 @@ from millrace.learner.algorithms.impala import IMPALA
 from millrace.learner.algorithms.minibatches import LossInput, Observations
 from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.algorithms.reinforce import REINFORCE
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
@@ -137,6 +139,7 @@ __all__ = [
     "OffPolicyConfig",
     "PPOConfig",
     "PolicySpec",
+    "PriorData",
     "Purpose",
     "QNetwork",
     "REINFORCEConfig",

@@ -15,7 +15,6 @@ STILL = {
     ("learner/algorithms/actor_critic.py", "datasets"),
     ("learner/algorithms/replay/continuous.py", "datasets"),
     ("learner/between_updates/run_files.py", "monitoring"),
-    ("learner/run.py", "datasets"),
     ("learner/run_setup.py", "monitoring"),
     ("millrace/__init__.py", "datasets"),
     ("millrace/__init__.py", "monitoring"),

@@ -76,8 +76,8 @@ GROUPS = {
         "What algorithms learn from",
         "The arguments and results of an algorithm's methods.",
         "algorithms.Batch algorithms.LossInput algorithms.Observations algorithms.Estimates algorithms.Transitions "
-        "algorithms.CriticLoss algorithms.Demonstrations algorithms.Start algorithms.UpdateMetrics algorithms.PolicySpec "
-        "algorithms.ActionSpec algorithms.Leaf",
+        "algorithms.CriticLoss algorithms.Demonstrations algorithms.PriorData algorithms.Start algorithms.UpdateMetrics "
+        "algorithms.PolicySpec algorithms.ActionSpec algorithms.Leaf",
     ),
     "algorithm_tools": Group(
         "Tools of algorithms",

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.config.hyperparameters import AlgorithmConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError, safe_repr
@@ -125,8 +126,8 @@ class Algorithm(ABC):
         """
         raise UsageError(f"{type(self).__name__} does not start from another run: it has no method start_from")
 
-    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
-        """Take the rows of a dataset (`--prior`): batches of one column each, with this number of observations in all.
+    def add_prior(self, prior: PriorData) -> None:
+        """Take the rows of a dataset (`--prior`).
 
         Called once, before the first update and before `load_state_dict`. By default raises `UsageError`.
         """

@@ -19,6 +19,7 @@ from torch.optim import Optimizer
 from millrace.learner.algorithms.algorithm import Algorithm, Start
 from millrace.learner.algorithms.kernels.optimizer_step import load_state, state_of
 from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.learner.algorithms.prior_data import PriorData
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import RunError, UsageError
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
@@ -93,9 +94,9 @@ class GradientDescent(Algorithm):
         """Rewards as the critic learns them."""
         return self.rewards.scaled(reward) if self.config.normalize_rewards else reward
 
-    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+    def add_prior(self, prior: PriorData) -> None:
         """Count the rows of a dataset for all statistics."""
-        for batch in batches:
+        for batch in prior.batches():
             self.count(batch)
         self.statistics = self.normalizer.buffers()
 

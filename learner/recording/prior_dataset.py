@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.recording.dataset_files import DatasetFiles
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
@@ -25,7 +26,7 @@ from millrace.protocol.specs import PolicySpec
 NO_LANE = -1  # `Batch.lane` of prior data
 
 
-class PriorDataset:
+class PriorDataset(PriorData):
     """A Minari dataset from the folder that MINARI_DATASETS_PATH names, checked against the policy of a run."""
 
     def __init__(self, dataset_id: str, policy: PolicySpec) -> None:
@@ -33,11 +34,18 @@ class PriorDataset:
         self._id, self._policy = dataset_id, policy
         self._files = _open(dataset_id)
         self._check_spaces()
-        self.rows = self._files.rows
-        """number of transitions"""
-        self.episodes = self._files.episodes
         if not self.rows:
             raise UsageError(f"prior {dataset_id}: expected transitions, got an empty dataset")
+
+    @property
+    def rows(self) -> int:
+        """Number of transitions."""
+        return self._files.rows
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return self._files.episodes
 
     def batches(self) -> Iterator[Batch]:
         """One batch for each episode, in the order of the dataset. Raises `UsageError` if an episode cannot be used."""

@@ -8,12 +8,13 @@ drawn, with the current statistics. With one torch thread on a CPU the same batc
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor
 
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics
+from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
@@ -139,15 +140,15 @@ class OffPolicy(GradientDescent):
 
     # ---------------------------------------------------------------- prior data
 
-    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+    def add_prior(self, prior: PriorData) -> None:
         """Store the rows of a dataset beside the replay buffer. They count for all statistics."""
 
         def counted() -> Iterator[Batch]:
-            for batch in batches:
+            for batch in prior.batches():
                 self.count(batch)
                 yield batch
 
-        self.replay.add_prior(counted(), observations, self.config.prior_share)
+        self.replay.add_prior(counted(), prior.rows + prior.episodes, self.config.prior_share)
         self.statistics = self.normalizer.buffers()
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:

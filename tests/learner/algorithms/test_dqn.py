@@ -22,8 +22,9 @@ from millrace.protocol.policy.layout import named_views
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
-from tests.support.numbers.batches import BOX, COPIES, LANES, no_pulse
+from tests.support.numbers.batches import BOX, no_pulse
 from tests.support.numbers.batches import batch as noise_batch
+from tests.support.numbers.prior_data import GivenPrior
 from tests.support.numbers.rounding import flat_gradient, in_float64, sampled
 
 CHOICE = ActionSpec("discrete", (), "int64", (4,), (0,))
@@ -46,7 +47,7 @@ def batch(seed: int) -> Batch:
 def test_rewards_of_prior_data_count_for_the_scale_of_all_rewards() -> None:
     algorithm, scaler = dqn(changed(PLAIN, normalize_rewards=True)), RewardScaler(PLAIN.gamma)
     prior, own = batch(1), batch(2)
-    algorithm.add_prior([prior], prior.valid.size + LANES * COPIES)
+    algorithm.add_prior(GivenPrior([prior]))
     scaler.count(prior)
     assert scaler.std > 2
     (drawn,) = algorithm.replay.samples(1, 64, 1.0)
@@ -61,7 +62,7 @@ def test_a_resumed_run_takes_its_new_learning_rate_for_prior_data_too() -> None:
     interrupted = dqn(changed(PLAIN, prior_steps=2))
     resumed = dqn(changed(PLAIN, prior_steps=5, learning_rate=10 * PLAIN.learning_rate))
     for each in (interrupted, resumed):
-        each.add_prior([batch(1)], batch(1).valid.size + LANES * COPIES)
+        each.add_prior(GivenPrior([batch(1)]))
     interrupted.learn_from_prior(no_pulse)
     resumed.load_state_dict(interrupted.state_dict())
     resumed.learn_from_prior(no_pulse)

@@ -20,6 +20,7 @@ from millrace.protocol.policy.exploration import Squashed
 from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.support.numbers.prior_data import GivenPrior
 
 BOX = Leaf("", "box", (3,), "float32")
 IMAGE = Leaf("i", "box", (8, 8, 1), "uint8", divisor=255)
@@ -86,7 +87,7 @@ def episodes_of(action: ActionSpec, *, image: bool = False) -> list[Batch]:
 
 def cloned(algorithm: Any, batches: list[Batch], pulse: Callable[[], None] = lambda: None) -> dict[str, float]:
     """As a run calls it."""
-    algorithm.add_prior(batches, sum(len(one.action) + 1 for one in batches))
+    algorithm.add_prior(GivenPrior(batches))
     found: dict[str, float] = algorithm.clone(batches, pulse)
     return found
 
@@ -197,7 +198,7 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
     cloned(whole, episodes)
     with pytest.raises(KeyboardInterrupt):
         cloned(stopped, episodes, pulse)
-    resumed.add_prior(episodes, 261)
+    resumed.add_prior(GivenPrior(episodes))
     resumed.load_state_dict(stopped.state_dict())
     resumed.clone(episodes, lambda: None)
     assert whole.clone_steps == resumed.clone_steps > 2

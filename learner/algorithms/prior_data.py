@@ -1,0 +1,32 @@
+"""What an algorithm needs of the data that it learns from besides the rollouts of its run (`--prior`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from millrace.protocol.rollout import Batch
+
+
+class PriorData(Protocol):
+    """Whole episodes, in an order that stays the same.
+
+    >>> import numpy as np
+    >>> from millrace.algorithms import PriorData
+    >>> def mean_reward(prior: PriorData) -> float:
+    ...     return float(np.mean(np.concatenate([batch.reward for batch in prior.batches()])))
+    """
+
+    @property
+    def rows(self) -> int:
+        """Number of transitions."""
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+
+    def batches(self) -> Iterator[Batch]:
+        """Each episode as a batch of one column [T, 1]. Every call begins with the first episode.
+
+        Raises `UsageError` if an episode cannot be used.
+        """
