@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any
 
 STARTED_BY = {
+    "clone_epochs": "millrace.extras.datasets.cloning:clone",
     "prior": "millrace.learner.recording.prior_dataset:PriorDataset",
     "record": "millrace.learner.recording.training_recorder:TrainingRecorder",
 }

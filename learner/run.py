@@ -124,7 +124,7 @@ class OpenRun:
 
         try:
             if getattr(self.setup.config.algorithm, "clone_epochs", 0):
-                audience.cloned(self.algorithm.clone(prior.batches(), pulse))
+                audience.cloned(started_by("clone_epochs")(self.algorithm, prior.batches(), pulse))
                 tally.state.next_evaluation = 0  # one is due, if the run makes any
             self.algorithm.learn_from_prior(pulse)
         except Interrupted:

@@ -38,7 +38,6 @@ What it learns from:
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
 - `PriorData`: the dataset that `Algorithm.add_prior` gets.
 - `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
-- `Demonstrations`: the steps that `Clones.cloning_loss` gets. `Clones` is the base of those that clone (`--clone-epochs`).
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
 Tools:
@@ -60,8 +59,6 @@ from __future__ import annotations
 from millrace.learner.algorithms.a2c import A2C
 from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
 from millrace.learner.algorithms.algorithm import Algorithm, Start
-from millrace.learner.algorithms.cloning.clones import Clones
-from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
 from millrace.learner.algorithms.impala import IMPALA
@@ -118,12 +115,10 @@ __all__ = [
     "Algorithm",
     "AlgorithmConfig",
     "Batch",
-    "Clones",
     "Continuous",
     "ContinuousConfig",
     "CriticLoss",
     "DQNConfig",
-    "Demonstrations",
     "EpisodeEnds",
     "Estimates",
     "Fixed",

@@ -83,6 +83,7 @@ MAY_UNPICKLE = {"protocol/env_spec.py"}
 ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
 """functions that run code of the environment: of gymnasium, of `EnvSpec` and of the extra `envs`"""
 TORCH_IN_PROTOCOL = "protocol/policy/"
+TORCH_IN_EXTRAS = "millrace/extras/datasets/cloning.py"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
 CONFORMANCE = "millrace/extras/conformance/"
 CHECKS_A_CLIENT = CONFORMANCE + "conform.py"
@@ -316,7 +317,7 @@ def test_the_checks_of_a_client_are_pure() -> None:
 
 def test_torch_stays_with_the_learner() -> None:
     for source in sources(*PACKAGES):
-        if not source.startswith(("learner/", TORCH_IN_PROTOCOL)):
+        if not source.startswith(("learner/", TORCH_IN_PROTOCOL, TORCH_IN_EXTRAS)):
             assert "torch" not in imported(source), source
 
 

@@ -62,7 +62,7 @@ GROUPS = {
         "Algorithms",
         "What an algorithm of your own derives from. Importing `millrace.algorithms` imports PyTorch.",
         "algorithms.Algorithm algorithms.GradientDescent algorithms.ActorCritic algorithms.OffPolicy algorithms.Continuous "
-        "algorithms.Clones algorithms.PPO algorithms.A2C algorithms.IMPALA algorithms.REINFORCE algorithms.DQN "
+        "algorithms.PPO algorithms.A2C algorithms.IMPALA algorithms.REINFORCE algorithms.DQN "
         "algorithms.SAC algorithms.TD3 testing.check_algorithm testing.AlgorithmMistakes",
     ),
     "algorithm_settings": Group(
@@ -76,7 +76,7 @@ GROUPS = {
         "What algorithms learn from",
         "The arguments and results of an algorithm's methods.",
         "algorithms.Batch algorithms.LossInput algorithms.Observations algorithms.Estimates algorithms.Transitions "
-        "algorithms.CriticLoss algorithms.Demonstrations algorithms.PriorData algorithms.Start algorithms.UpdateMetrics "
+        "algorithms.CriticLoss algorithms.PriorData algorithms.Start algorithms.UpdateMetrics "
         "algorithms.PolicySpec algorithms.ActionSpec algorithms.Leaf",
     ),
     "algorithm_tools": Group(

@@ -18,9 +18,7 @@ from torch import Tensor
 
 from millrace.learner.algorithms import losses
 from millrace.learner.algorithms.algorithm import Algorithm
-from millrace.learner.algorithms.cloning.clones import Clones
-from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
-from millrace.learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
+from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, clip_norm
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_critic_network
 from millrace.learner.algorithms.minibatches import LossInput, Minibatch, Observations, flat_tensor
@@ -29,7 +27,6 @@ from millrace.learner.config.hyperparameters import ActorCriticConfig, Algorithm
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.errors import RunError, UsageError
 from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
-from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -49,7 +46,7 @@ class Estimates(NamedTuple):
     metrics: UpdateMetrics  # without the prefix "train/"
 
 
-class ActorCritic(Clones):
+class ActorCritic(GradientDescent):
     """An actor and a critic, and the update that trains them: epochs of gradient steps on minibatches of a batch.
 
     A subclass defines `loss`, with ordinary torch operations, unless its loss is the policy gradient with a squared value
@@ -226,15 +223,6 @@ class ActorCritic(Clones):
     def values(self, observations: Observations, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN] under the present weights."""
         return observations.evaluate(observations.shape[0], lambda inputs, _: self.net.value(*inputs), pulse)
-
-    def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
-        """See `Clones`."""
-        params, value = self.net.forward(*self.inputs(rows.obs(rows.at)))
-        with torch.no_grad():
-            last_value = self.net.value(*self.inputs(rows.obs(rows.last)))
-        action, returns, discount = map(self.tensor, (rows.action, rows.returns, rows.discount))
-        log_prob = policy_log_prob(self.policy, params, action)
-        return self.vf_coef * losses.value_loss(value, returns + discount * last_value) - log_prob.mean(), params
 
     # ---------------------------------------------------------------- weights and checkpoints
 

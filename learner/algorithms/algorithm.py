@@ -133,14 +133,6 @@ class Algorithm(ABC):
         """
         raise UsageError(f"prior: {type(self).__name__} does not learn from prior data: it has no method add_prior")
 
-    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
-        """Make those gradient steps of cloning these episodes (`--clone-epochs`) that are not made yet. Returns metrics.
-
-        Called before the first update, and before `learn_from_prior`. Calls `pulse`, which may save the state, between
-        gradient steps, and raises `RunError`, as `update` does. By default raises `UsageError`.
-        """
-        raise UsageError(f"clone_epochs: {type(self).__name__} does not clone: it has no method clone")
-
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Make those gradient steps on prior data that come before the first rollouts and are not made yet. Default: none.
 

@@ -54,6 +54,7 @@ class GradientDescent(Algorithm):
         self.normalizer = ObservationNormalizer(replace(policy, head="actor_critic"))
         self.statistics: Floats = self.normalizer.buffers()  # float32 means and standard deviations, as published
         self.rewards = RewardScaler(config.gamma)
+        self.pretraining_steps = 0  # gradient steps that somebody else made before the first update, as cloning does
         self._remembered: dict[str, Any] = {}
 
     # ---------------------------------------------------------------- an update
@@ -149,12 +150,13 @@ class GradientDescent(Algorithm):
 
     def other_state(self) -> dict[str, Any]:
         """What the next update depends on besides tensors, optimizers and statistics: plain data, copied."""
-        return {"env_steps": self.env_steps, "version": self.version}
+        return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
         """Continue from `other_state`."""
         self.env_steps = int(state["env_steps"])
         self.version = int(state["version"])
+        self.pretraining_steps = int(state["pretraining_steps"])
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""

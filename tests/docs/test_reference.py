@@ -21,7 +21,7 @@ from millrace.learner.metric_names import METRICS
 from millrace.learner.run_folder import run_folder
 from millrace.protocol import errors
 from millrace.protocol.errors import UserFacingError
-from tests.learner.algorithms.cloning.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
+from tests.extras.datasets.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
 from website import commands_page, python_page, settings_page
 from website.doctest_fences import with_fences
 from website.pages import KEPT, ROOT

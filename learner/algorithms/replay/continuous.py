@@ -7,7 +7,7 @@ size of the rollouts and the number and speed of the workers. Where these settin
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -17,8 +17,6 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from millrace.learner.algorithms.algorithm import Start
-from millrace.learner.algorithms.cloning.clones import Clones
-from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_and_critics
@@ -28,18 +26,15 @@ from millrace.learner.config.hyperparameters import ContinuousConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.networks import ActorAndCritics
-from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.random_streams import Purpose, torch_seed
-from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
-class Continuous(Clones, OffPolicy):
+class Continuous(OffPolicy):
     """An off-policy algorithm for a bounded Box: the networks, their targets, their optimizers and the source of noise."""
 
     Config = ContinuousConfig
     net: ActorAndCritics
-    cloned_by = "actor_optimizer"
 
     @classmethod
     def bounded_policy_spec(
@@ -83,17 +78,10 @@ class Continuous(Clones, OffPolicy):
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
         self.optimizers = {name: make_optimizer("adam", part) for name, part in trained.items()}
 
-    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> UpdateMetrics:
-        """See `Clones`: the actor alone. It acts from the first env step."""
-        found = super().clone(episodes, pulse)
+    def begin_with_actor(self) -> None:
+        """The actor was trained before the first rollouts: it acts from the first env step, and its target equals it."""
         self.target.actor.copy_(self.net.actor)
         self._acts_at_once = True
-        return found
-
-    def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
-        """See `Clones`."""
-        params = self.net.params(*self.inputs(rows.obs(rows.at)))
-        return -policy_log_prob(self.policy, params, self.tensor(rows.action)).mean(), params
 
     def steps_due(self) -> int:
         """The gradient steps that the replay ratio demands now."""

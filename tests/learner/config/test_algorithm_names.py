@@ -122,7 +122,7 @@ def refusal(call: Callable[[], object]) -> str:
 
 def test_the_needed_methods_are_those_of_the_interface() -> None:
     own = {name for name, value in vars(Algorithm).items() if isinstance(value, FunctionType | staticmethod)}
-    assert own == {*NEEDED, *FOR_PRIOR, "start_from", "clone"}
+    assert own == {*NEEDED, *FOR_PRIOR, "start_from"}
 
 
 def test_flags_that_are_no_settings_are_known() -> None:

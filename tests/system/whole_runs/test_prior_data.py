@@ -14,8 +14,9 @@ import pytest
 from torch import Tensor
 
 from millrace.cli.main import main
+from millrace.extras.datasets import cloning
+from millrace.extras.datasets.demonstrations import Demonstrations
 from millrace.launch.training import train
-from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.replay.off_policy import Transitions
@@ -156,21 +157,21 @@ def test_a_clone_does_not_depend_on_the_number_of_workers_and_a_resumed_run_does
     first, second, *_ = read_rows(one / "metrics.jsonl")
     assert (first["time/iterations"], second["time/iterations"]) == (0, 1)
     assert 0.4 < first["clone/accuracy"] < 0.7, "the actions are random"
-    monkeypatch.setattr(PPO, "cloning_loss", None)
+    monkeypatch.setattr(cloning, "cloning_loss", None)
     run(tmp_path, "1", resume=one, base=CLONED, steps=1_024)
 
 
 def test_cloning_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = run(tmp_path, "whole", base=CLONED)
-    loss = PPO.cloning_loss
+    loss = cloning.cloning_loss
 
-    def interrupted_loss(self: PPO, rows: Demonstrations) -> tuple[Tensor, Tensor]:
-        if self.clone_steps == 10:
+    def interrupted_loss(algorithm: PPO, rows: Demonstrations) -> tuple[Tensor, Tensor]:
+        if algorithm.pretraining_steps == 10:
             signal.raise_signal(signal.SIGTERM)
-        return loss(self, rows)
+        return loss(algorithm, rows)
 
     with monkeypatch.context() as patched, pytest.raises(Interrupted) as stopped:
-        patched.setattr(PPO, "cloning_loss", interrupted_loss)
+        patched.setattr(cloning, "cloning_loss", interrupted_loss)
         run(tmp_path, "stopped", base=CLONED)
     resumed = run(tmp_path, "stopped", resume=stopped.value.run, base=CLONED)
     assert policy_of(resumed) == policy_of(whole)

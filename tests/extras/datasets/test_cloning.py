@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from millrace.extras.datasets import cloning
+from millrace.extras.datasets.cloning import clone, cloning_loss
+from millrace.extras.datasets.demonstrations import Demonstrations
 from millrace.learner.algorithms import algorithm_class
-from millrace.learner.algorithms.cloning.demonstrations import Demonstrations
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.arrays import Array
-from millrace.protocol.errors import RunError
+from millrace.protocol.errors import RunError, UsageError
 from millrace.protocol.policy.exploration import Squashed
 from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.rollout import Batch
@@ -88,8 +90,7 @@ def episodes_of(action: ActionSpec, *, image: bool = False) -> list[Batch]:
 def cloned(algorithm: Any, batches: list[Batch], pulse: Callable[[], None] = lambda: None) -> dict[str, float]:
     """As a run calls it."""
     algorithm.add_prior(GivenPrior(batches))
-    found: dict[str, float] = algorithm.clone(batches, pulse)
-    return found
+    return clone(algorithm, batches, pulse)
 
 
 def test_the_loss_is_the_one_that_the_file_states() -> None:
@@ -97,7 +98,7 @@ def test_the_loss_is_the_one_that_the_file_states() -> None:
     ppo: PPO = made("ppo", DISCRETE, normalize_rewards=False, normalize_observations=False, gamma=0.9, vf_coef=0.3)
     batches = [episode(0, 4, DISCRETE), episode(1, 3, DISCRETE, terminated=False)]
     rows = Demonstrations.of(batches, np.asarray, 0.9)
-    loss, params = ppo.cloning_loss(rows)
+    loss, params = cloning_loss(ppo, rows)
     x = [torch.from_numpy(one.obs[0][:, 0]) for one in batches]
     with torch.no_grad():
         log_probs = [torch.log_softmax(ppo.net.params(each[:-1]), -1) for each in x]
@@ -192,7 +193,7 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
     episodes = episodes_of(action)
 
     def pulse() -> None:
-        if stopped.clone_steps == 2:
+        if stopped.pretraining_steps == 2:
             raise KeyboardInterrupt
 
     cloned(whole, episodes)
@@ -200,8 +201,8 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
         cloned(stopped, episodes, pulse)
     resumed.add_prior(GivenPrior(episodes))
     resumed.load_state_dict(stopped.state_dict())
-    resumed.clone(episodes, lambda: None)
-    assert whole.clone_steps == resumed.clone_steps > 2
+    clone(resumed, episodes, lambda: None)
+    assert whole.pretraining_steps == resumed.pretraining_steps > 2
     assert torch.equal(whole.net.flat, resumed.net.flat)
     untrained = made(algo, action, clone_epochs=3)
     assert not torch.equal(whole.net.flat, untrained.net.flat)
@@ -209,13 +210,18 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
 
 def test_a_loss_that_is_not_finite_changes_no_weight(monkeypatch: pytest.MonkeyPatch) -> None:
     ppo: PPO = made("ppo", DISCRETE, clone_epochs=1, normalize_rewards=False)
-    before, loss = ppo.net.flat.clone(), ppo.cloning_loss
+    before = ppo.net.flat.clone()
 
-    def endless(rows: Demonstrations) -> Any:
-        found, params = loss(rows)
+    def endless(algorithm: PPO, rows: Demonstrations) -> Any:
+        found, params = cloning_loss(algorithm, rows)
         return found * float("inf"), params
 
-    monkeypatch.setattr(ppo, "cloning_loss", endless)
+    monkeypatch.setattr(cloning, "cloning_loss", endless)
     with pytest.raises(RunError, match="clone/loss: expected finite"):
         cloned(ppo, episodes_of(DISCRETE))
     assert torch.equal(ppo.net.flat, before)
+
+
+def test_an_algorithm_without_a_policy_to_clone_is_named() -> None:
+    with pytest.raises(UsageError, match=r"^clone_epochs: expected an ActorCritic or a Continuous to clone, got DQN$"):
+        clone(made("dqn", DISCRETE), episodes_of(DISCRETE), lambda: None)

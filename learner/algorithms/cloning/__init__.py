@@ -1,1 +1,0 @@
-"""Cloning: the start of a policy from demonstrations."""

@@ -1,0 +1,1 @@
+"""Recorded episodes: Minari datasets, videos, and learning from a dataset."""
