@@ -54,6 +54,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
     "per": (f"train CartPole-v1 --algo dqn --priority-alpha 0.6 --n-step 3 --normalize-observations {REPLAY}",),
     "prior": (f"train CartPole-v1 --algo dqn --prior {RECORDED} --prior-steps 20 {REPLAY}",),
+    "clone": (f"train CartPole-v1 --algo ppo --prior {RECORDED} --clone-epochs 3 {ON_POLICY}",),
     "record": (
         f"train CartPole-v1 --algo a2c --record {RECORDED} {ON_POLICY}",
         "record RUN --out same/greedy-v0 --steps 100",
@@ -61,6 +62,8 @@ RUNS: dict[str, tuple[str, ...]] = {
     ),
 }
 """The commands of each run, in one folder. COMMON is added to `train`, and RUN is its run folder."""
+FROM_RECORDED = {"prior", "clone"}
+"""Runs that learn from the dataset of the run `record` of the base."""
 LAGS = {"ppo": 1, "a2c": 2, "impala": 2, "dqn": 1, "sac": 2, "lstm": 2, "masks": 1}
 RUNS |= {f"{name} at lag {lag}": (f"{RUNS[name][0]} --max-lag {lag}",) for name, lag in LAGS.items()}
 TIMES = ("stage/", "time/fps", "time/time_elapsed", "ledger/transitions_received", "ledger/transitions_waiting")
@@ -166,7 +169,7 @@ def make(side: Side, name: str, recorded: Path) -> str:
     """Make a run. Returns why it was refused, or nothing. `recorded`: the datasets of the run `record` of the base."""
     folder = side.files / name
     (folder / "datasets").mkdir(parents=True)
-    if name == "prior" and (recorded / RECORDED).exists():
+    if name in FROM_RECORDED and (recorded / RECORDED).exists():
         shutil.copytree(recorded / RECORDED, folder / "datasets" / RECORDED)
     for line in RUNS[name]:
         words = line.split()
@@ -208,7 +211,7 @@ def main() -> int:
                 side.files.mkdir()
                 check_code(side)
             recorded = base.files / "record" / "datasets"
-            first = [(base, "record")] if {"record", "prior"} & {*flags.only} else []
+            first = [(base, "record")] if {"record", *FROM_RECORDED} & {*flags.only} else []
             jobs = [job for name in flags.only for side in (base, here, alone) if (job := (side, name)) not in first]
             refused = {(side, name): make(side, name, recorded) for side, name in first}
             with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
