@@ -1,4 +1,6 @@
-"""What settings start of the extras: the only place where the core names them. It imports an extra when a setting asks.
+"""What a setting starts of an extra. The core imports no extra before somebody asks for it, and names it only here.
+
+(Besides, an extra may give a command, in `millrace/cli/commands.py`, and a public name, in `millrace/__init__.py`.)
 
 Rule: each entry is `module:name`. The caller says which type of the core the object has.
 """
@@ -10,13 +12,15 @@ from typing import Any
 
 STARTED_BY = {
     "clone_epochs": "millrace.extras.datasets.cloning:clone",
-    "prior": "millrace.learner.recording.prior_dataset:PriorDataset",
-    "record": "millrace.learner.recording.training_recorder:TrainingRecorder",
+    "Run.record": "millrace.extras.datasets.record:record",
+    "prior": "millrace.extras.datasets.prior_dataset:PriorDataset",
+    "record": "millrace.extras.datasets.training_recorder:TrainingRecorder",
+    "video": "millrace.extras.datasets.video:prepare_videos",
 }
-"""setting -> `module:name`"""
+"""setting, or public method -> `module:name`"""
 
 
 def started_by(setting: str) -> Any:
-    """Import the object that this setting starts."""
+    """Import the object that this setting starts, and return it."""
     module, name = STARTED_BY[setting].split(":")
     return getattr(import_module(module), name)

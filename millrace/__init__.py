@@ -33,16 +33,16 @@ from millrace.protocol.errors import (  # noqa: E402
 )
 
 if TYPE_CHECKING:
+    from millrace.extras.datasets.record import record
     from millrace.launch.page_beside import Dashboard
     from millrace.launch.vector import make_vec
     from millrace.learner.algorithms.normalizer import Normalizer
     from millrace.learner.callbacks.callback import Callback
-    from millrace.learner.recording.record import RecordedDataset
     from millrace.learner.run_folder.progress import Progress
-    from millrace.learner.run_folder.results import Evaluation, Summary
+    from millrace.learner.run_folder.results import Evaluation, RecordedDataset, Summary
     from millrace.loaded_policy import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
-    from millrace.playing import evaluate, record
+    from millrace.playing import evaluate
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.protocol.envs.which_copy import EnvCopy
     from millrace.rollout_service import RolloutBatch, RolloutService
@@ -107,7 +107,7 @@ _IMPORTED_WHEN_USED = {
     "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
     "Progress": "millrace.learner.run_folder.progress",
-    "RecordedDataset": "millrace.learner.recording.record",
+    "RecordedDataset": "millrace.learner.run_folder.results",
     "Recurrent": "millrace.policies",
     "ResetAhead": "millrace.workers.copies.reset_ahead",
     "RolloutBatch": "millrace.rollout_service",
@@ -118,7 +118,7 @@ _IMPORTED_WHEN_USED = {
     "evaluate": "millrace.playing",
     "load": "millrace.loaded_policy",
     "make_vec": "millrace.launch.vector",
-    "record": "millrace.playing",
+    "record": "millrace.extras.datasets.record",
     "train": "millrace.runs",
 }
 """Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""

@@ -1,4 +1,4 @@
-"""Evaluating and recording a run's policy: the commands `evaluate` and `record`, and the functions of the same names.
+"""Evaluating a run's policy: the command `evaluate` and the function of the same name; and what else plays a policy needs.
 
 Rule: a keyword of the function is the flag of the command, by the same name and with the same default. Worker processes play
 the episodes; the caller's process runs no environment code.
@@ -17,9 +17,8 @@ from millrace.flags.values import read_value
 from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.policy_player import SavedPolicy, saved_policy, useful_workers
-from millrace.learner.recording.record import RecordedDataset
-from millrace.learner.recording.record import record as record_dataset
+from millrace.learner.extras import started_by
+from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy, useful_workers
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from millrace.learner.run_folder.results import Evaluation
 from millrace.learner.run_folder.run_folder import RunFolder, Which
@@ -32,7 +31,9 @@ from millrace.terminal import count_line
 NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are handed on apart
 ShowPlayed = Callable[[str], None]
 """Gets how far it is, as text."""
-_Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
+_Flags = TypeVar("_Flags", bound=PlayFlags)
+RecordVideos = Callable[[PolicyPlayer, Path, int, int, int, str], tuple[Evaluation, list[Path]]]
+"""Gets player, run folder, episodes, seed, max_steps and the prefix of the names of the videos."""
 
 
 class Given(NamedTuple):
@@ -95,42 +96,6 @@ def evaluate(
         return play(flags, watch, Given(env, wrappers))[0]
 
 
-@checked
-def record(
-    run: str | os.PathLike[str],
-    out: str,
-    steps: int = 50_000,
-    *,
-    env: EnvLike | None = None,
-    wrappers: Sequence[WrapperLike] | None = None,
-    progress: bool = True,
-    **keywords: Unpack[RecordKeywords],
-) -> RecordedDataset:
-    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. It needs the extra `record`.
-
-    Arguments:
-        run: A `Run`, or a run folder.
-        out: Id of the dataset, as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets.
-        steps: Number of env steps. The last episode is finished, unless that would take more than twice as many.
-        env: The environment that the run was started with, if it is not found by its name: it was made in another script or
-            notebook. (`Run.record` of the `Run` that `train` returned knows it.)
-        wrappers: Likewise the wrappers.
-        progress: Show how far it is.
-        **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
-            and action; `seed`, `best`, `workers`, `transport`, `bind`, `inference` and `max_env_failures`.
-
-    Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
-    on the number of workers. Raises `UserFacingError` with a message of one line; then it leaves no files.
-
-    >>> import millrace
-    >>> millrace.record(run, "cartpole/example-v0", steps=20, workers=1).dataset_id
-    'cartpole/example-v0'
-    """
-    flags = flags_of(RecordFlags, "record", run=Path(run), out=out, steps=steps, **keywords)
-    with count_line("recording", show=progress) as watch:
-        return write_dataset(flags, watch, Given(env, wrappers))
-
-
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     """The flags that these keyword arguments make. Raises `UsageError` that names one that is wrong."""
     fields = fields_of(kind)
@@ -149,49 +114,37 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
     """
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
+    record_videos: RecordVideos | None = None
     if flags.video:
         if flags.inference == "learner":
             raise UsageError("video: expected inference workers, got learner; only a worker that acts renders its episodes")
-        from millrace.learner.recording.video import prepare_rendering, record_videos
-
-        prepare_rendering()
-    saved = _saved(flags, given)
+        record_videos = started_by("video")()
+    saved = policy_to_play(flags, given)
     copies = 1 if flags.video else flags.copies
     count = useful_workers(flags.workers, episodes, copies)
-    workers = _workers(flags, count, min(copies, episodes))
+    workers = playing_workers(flags, count, min(copies, episodes))
     if flags.against is not None:
         saved = saved._replace(against=RunFolder.open_policy(flags.against).read_policy(_which(flags)))
     with policy_player(saved, workers, watch) as player:
-        if flags.video:
+        if record_videos is not None:
             prefix = "" if flags.against is None else f"against-{flags.against.resolve().name}-"
             return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps, prefix)
         played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps), bound="--max-steps:")
         return evaluation_of(played, player.facts), []
 
 
-def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
-    """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
-    saved = _saved(flags, given)
-    for found, why in ((saved.seats, f"{saved.env.id} has several agents"), (saved.spec.critic, "the run has critic_keys")):
-        if found:
-            raise UsageError(f"record: {why}, which a dataset has not")
-    with policy_player(saved, _workers(flags, flags.workers, 1), watch) as player:
-        return record_dataset(
-            player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
-        )
-
-
-def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> PlayingWorkers:
+def playing_workers(flags: PlayFlags, count: int, copies: int) -> PlayingWorkers:
+    """`count` workers that play episodes, or those from elsewhere, on at most so many `copies` each."""
     settings = RolloutConfig(max_env_failures=flags.max_env_failures)
     return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
 
 
-def _which(flags: EvaluateFlags | RecordFlags) -> Which:
+def _which(flags: PlayFlags) -> Which:
     return "best" if flags.best else "final"
 
 
-def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
-    """The policy to play, and its environment."""
+def policy_to_play(flags: PlayFlags, given: Given | None) -> SavedPolicy:
+    """The policy to play, and its environment. Raises `UserFacingError` if one of them is not found or cannot be played."""
     env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
     saved = saved_policy(flags.run, _which(flags), env=env, wrappers=wrappers)
     if saved.seats and flags.inference == "learner":

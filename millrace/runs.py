@@ -6,7 +6,7 @@ Rule: what a run folder lacks is None or empty, and what cannot be read is said 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from html import escape
 from pathlib import Path
@@ -19,14 +19,14 @@ from millrace.keywords import TrainKeywords
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import config_of_run, resolve
-from millrace.learner.recording.record import RecordedDataset
+from millrace.learner.extras import started_by
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
 from millrace.learner.run_folder.newest_run import AUTO, newest_run
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from millrace.learner.run_folder.results import Evaluation, Summary
+from millrace.learner.run_folder.results import Evaluation, RecordedDataset, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_folder.run_format import read_config
-from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
+from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
@@ -158,6 +158,7 @@ class Run(os.PathLike[str]):
         >>> millrace.Run(run).record("cartpole/of-a-run-v0", steps=20).dataset_id
         'cartpole/of-a-run-v0'
         """
+        record: Callable[..., RecordedDataset] = started_by("Run.record")
         return record(self, out, steps, **self._with_given(keywords))
 
     @checked

@@ -1,4 +1,4 @@
-"""Results of a run: greedy evaluations, the best policy, and the summary (summary.json)."""
+"""Results of a run: greedy evaluations, the best policy, the summary (summary.json), a dataset of its episodes."""
 
 from __future__ import annotations
 
@@ -193,6 +193,29 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """seconds that the learner spent in each stage: collecting, updating, evaluating and so on"""
     versions: dict[str, str] = {}
     """versions of millrace and of the packages that decide its results"""
+
+
+class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
+    """Size and returns of a dataset.
+
+    >>> import millrace
+    >>> result = millrace.record(run, "cartpole/example-v0", steps=20, workers=1)
+    >>> isinstance(result, millrace.RecordedDataset), result.steps >= 20
+    (True, True)
+    """
+
+    dataset_id: str
+    episodes: int
+    steps: int
+    return_mean: float
+    return_std: float
+    cut: int
+    """episodes that were stopped because they were too long"""
+
+    def __str__(self) -> str:
+        cut = ", the last of them cut short" if self.cut else ""
+        returns = f"return {self.return_mean:.1f} ± {self.return_std:.1f}"
+        return f"dataset {self.dataset_id}: {self.steps:,} steps, {self.episodes:,} episodes{cut}, {returns}"
 
 
 def read_summary(run: Path) -> Summary:

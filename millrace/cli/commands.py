@@ -37,7 +37,7 @@ GROUPS = {  # one line a command
         "list": Command("millrace.cli.look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
         "dashboard": Command("millrace.cli.dashboard:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
         "evaluate": Command("millrace.cli.play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
-        "record": Command("millrace.cli.play:record", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
+        "record": Command("millrace.extras.datasets.command:run", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
         "plot": Command("millrace.cli.look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as SVG or PNG"),
         "report": Command("millrace.cli.look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
     },

@@ -14,10 +14,10 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
+from millrace.extras.datasets.played_episodes import recording_seeds
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import PPOConfig, SACConfig
-from millrace.learner.recording.played_episodes import recording_seeds
 from millrace.learner.rollouts.evaluation_dealer import episode_seeds
 from millrace.learner.vector_env.lost_lanes import replacement_seeds
 from millrace.protocol.messages import Evaluate

@@ -208,7 +208,7 @@ def test_a_dataset_for_which_there_is_no_space_costs_no_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, chunk_bytes: int
 ) -> None:
     """HDF5 would end the process. The run is complete, and fails as one whose summary cannot be written."""
-    monkeypatch.setattr("millrace.learner.recording.minari.CHUNK_BYTES", chunk_bytes)
+    monkeypatch.setattr("millrace.extras.datasets.minari.CHUNK_BYTES", chunk_bytes)
     with small_disk(tmp_path / "disk") as disk:
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(disk))
         filler = filled(disk)

@@ -16,12 +16,12 @@ from torch import Tensor
 from millrace.cli.main import main
 from millrace.extras.datasets import cloning
 from millrace.extras.datasets.demonstrations import Demonstrations
+from millrace.extras.datasets.prior_dataset import PriorDataset
 from millrace.launch.training import train
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.replay.off_policy import Transitions
 from millrace.learner.config.layers import resolve
-from millrace.learner.recording.prior_dataset import PriorDataset
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.protocol.errors import UsageError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from millrace.learner.recording.episodes import EpisodeAssembler
+from millrace.extras.datasets.episodes import EpisodeAssembler
 from millrace.protocol.errors import NoWorkers
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.torch_policy import TorchPolicy

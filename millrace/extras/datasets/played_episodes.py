@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from millrace.extras.datasets.episodes import RecordedEpisode
 from millrace.learner.policy_player import PolicyPlayer
-from millrace.learner.recording.episodes import RecordedEpisode
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from millrace.protocol.arrays import Array
 from millrace.protocol.envs.env_actions import action_converter_of

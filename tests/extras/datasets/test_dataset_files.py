@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from millrace.learner.recording.prior_dataset import PriorDataset
+from millrace.extras.datasets.prior_dataset import PriorDataset
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import PolicySpec

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from millrace.learner.recording.episode_file import append_episodes
+from millrace.extras.datasets.episode_file import append_episodes
 
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("minari")

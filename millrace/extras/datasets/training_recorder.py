@@ -10,9 +10,9 @@ from typing import Any
 
 import gymnasium
 
+from millrace.extras.datasets.episodes import EpisodeAssembler
+from millrace.extras.datasets.minari import MinariDataset
 from millrace.learner.callbacks.callback import Callback
-from millrace.learner.recording.episodes import EpisodeAssembler
-from millrace.learner.recording.minari import MinariDataset
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.description import DescribedEnv

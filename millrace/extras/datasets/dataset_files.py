@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from millrace.learner.recording.closed_hdf5 import ClosedHDF5, UnfitFile
-from millrace.learner.recording.minari_spaces import space_of_json
+from millrace.extras.datasets.closed_hdf5 import ClosedHDF5, UnfitFile
+from millrace.extras.datasets.minari_spaces import space_of_json
 from millrace.learner.run_folder.regular_files import read, reason
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import Natural, one_line

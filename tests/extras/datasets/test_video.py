@@ -10,8 +10,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from millrace.extras.datasets import video
 from millrace.learner.policy_player import PolicyPlayer
-from millrace.learner.recording import video
 from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode
 from millrace.protocol.rollout import Episode
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from millrace.extras.datasets.dataset_files import DatasetFiles
 from millrace.learner.algorithms.prior_data import PriorData
-from millrace.learner.recording.dataset_files import DatasetFiles
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.env_actions import stored_actions_of

@@ -1,4 +1,4 @@
-"""`millrace record`: episodes of a run's policy as a Minari dataset, and if wanted as a .npy file of rows.
+"""Episodes of a run's policy as a Minari dataset, and if wanted as a .npy file of rows.
 
 Rule: a dataset consists of whole episodes with raw rewards. It is complete, or there is none. Episodes are played one after
 another on one env copy, so that short episodes are not favored. Each has its own reset seed, which is stored with it. The
@@ -10,41 +10,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
+from millrace.extras.datasets.minari import MinariDataset
+from millrace.extras.datasets.npy_rows import NpyRows
+from millrace.extras.datasets.played_episodes import PlayedEpisodes, recording_seeds
+from millrace.extras.datasets.training_recorder import EnvironmentOfDataset
 from millrace.learner.policy_player import PolicyPlayer
-from millrace.learner.recording.minari import MinariDataset
-from millrace.learner.recording.npy_rows import NpyRows
-from millrace.learner.recording.played_episodes import PlayedEpisodes, recording_seeds
-from millrace.learner.recording.training_recorder import EnvironmentOfDataset
+from millrace.learner.run_folder.results import RecordedDataset
 from millrace.protocol.errors import UsageError
 
 
-class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
-    """Size and returns of a dataset.
-
-    >>> import millrace
-    >>> result = millrace.record(run, "cartpole/example-v0", steps=20, workers=1)
-    >>> isinstance(result, millrace.RecordedDataset), result.steps >= 20
-    (True, True)
-    """
-
-    dataset_id: str
-    episodes: int
-    steps: int
-    return_mean: float
-    return_std: float
-    cut: int
-    """episodes that were stopped because they were too long"""
-
-    def __str__(self) -> str:
-        cut = ", the last of them cut short" if self.cut else ""
-        returns = f"return {self.return_mean:.1f} ± {self.return_std:.1f}"
-        return f"dataset {self.dataset_id}: {self.steps:,} steps, {self.episodes:,} episodes{cut}, {returns}"
-
-
-def record(
+def record_episodes(
     player: PolicyPlayer,
     run: Path,
     dataset_id: str,

@@ -13,11 +13,12 @@ import tempfile
 import warnings
 from pathlib import Path
 
+from millrace.extras.datasets.played_episodes import PlayedEpisodes
 from millrace.learner.policy_player import PolicyPlayer
-from millrace.learner.recording.played_episodes import PlayedEpisodes
 from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode, episode_seeds, evaluation_of
 from millrace.learner.run_folder.regular_files import subfolder
 from millrace.learner.run_folder.results import Evaluation
+from millrace.playing import RecordVideos
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 
@@ -28,14 +29,18 @@ LEAST_FRAMES_PER_S, MOST_FRAMES_PER_S = 0.01, 1_000  # what it names is what a w
 FOLDER = "videos"
 
 
-def prepare_rendering() -> None:
-    """Let pygame render without a screen. Call it before workers start. Raises `UsageError` if no video could be made."""
+def prepare_videos() -> RecordVideos:
+    """Let pygame render without a screen, and return `record_videos`. Call it before workers start.
+
+    Raises `UsageError` if no video could be made.
+    """
     try:
         import moviepy  # noqa: F401
     except ImportError as error:
         raise UsageError("videos need moviepy; pip install moviepy pygame-ce") from error
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    return record_videos
 
 
 def record_videos(

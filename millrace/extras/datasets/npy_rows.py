@@ -15,7 +15,7 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
-from millrace.learner.recording.episodes import RecordedEpisode
+from millrace.extras.datasets.episodes import RecordedEpisode
 from millrace.learner.run_folder.atomic_write import write_atomically
 from millrace.protocol.errors import RunError
 

@@ -16,18 +16,18 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from millrace.extras.datasets import minari as dataset_module
+from millrace.extras.datasets.episodes import EpisodeAssembler, RecordedEpisode
+from millrace.extras.datasets.played_episodes import recording_seeds
+from millrace.extras.datasets.prior_dataset import PriorDataset
+from millrace.extras.datasets.recording import record_episodes
+from millrace.extras.datasets.training_recorder import TrainingRecorder
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.policy_player import saved_policy
-from millrace.learner.recording import minari as dataset_module
-from millrace.learner.recording.episodes import EpisodeAssembler, RecordedEpisode
-from millrace.learner.recording.played_episodes import recording_seeds
-from millrace.learner.recording.prior_dataset import PriorDataset
-from millrace.learner.recording.record import RecordedDataset
-from millrace.learner.recording.record import record as record_with
-from millrace.learner.recording.training_recorder import TrainingRecorder
 from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import RecordedDataset
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.env_actions import make_action_converter
@@ -290,7 +290,7 @@ def record(
 ) -> RecordedDataset:
     playing = PlayingWorkers(workers, "inproc", settings=RolloutConfig(max_env_failures=0))
     with policy_player(saved_policy(run), playing, lambda text: None) as player:
-        return record_with(player, run, dataset_id, steps, seed, stochastic=stochastic, npy=npy)
+        return record_episodes(player, run, dataset_id, steps, seed, stochastic=stochastic, npy=npy)
 
 
 def played(run: Path, seed: int, stochastic: bool, episodes: int) -> list[RecordedEpisode]:
@@ -470,7 +470,7 @@ def test_without_the_rows_there_is_no_dataset(tmp_path: Path, root: Path, monkey
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("millrace.learner.recording.npy_rows.write_atomically", full)
+    monkeypatch.setattr("millrace.extras.datasets.npy_rows.write_atomically", full)
     run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
     fails(run, "ns/box-v0", RunError, "rows.npy was not written: No space left on device", npy=tmp_path / "rows.npy")
     assert everything(root) == set()

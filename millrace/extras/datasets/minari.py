@@ -15,9 +15,9 @@ from typing import Any, Self
 import gymnasium
 from gymnasium import spaces
 
-from millrace.learner.recording.dataset_files import ARRAYS
-from millrace.learner.recording.episode_file import append_episodes
-from millrace.learner.recording.episodes import RecordedEpisode
+from millrace.extras.datasets.dataset_files import ARRAYS
+from millrace.extras.datasets.episode_file import append_episodes
+from millrace.extras.datasets.episodes import RecordedEpisode
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import RunError, UsageError, first_line
 

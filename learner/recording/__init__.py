@@ -1,1 +1,0 @@
-"""Episodes of a policy, recorded: Minari datasets and videos."""
