@@ -22,7 +22,7 @@ from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_poli
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from millrace.learner.run_folder.results import Evaluation
 from millrace.learner.run_folder.run_folder import RunFolder, Which
-from millrace.play_flags import EvaluateFlags, RecordFlags
+from millrace.play_flags import EvaluateFlags, PlayFlags
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from millrace.flags.parse import parse_flags
 from millrace.play_flags import RecordFlags
-from millrace.protocol.flags.parse import parse_flags
 from millrace.terminal import count_line
 
 

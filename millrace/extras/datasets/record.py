@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Unpack
 
 from millrace.arguments import checked
-from millrace.play_flags import RecordFlags
 from millrace.extras.datasets.recording import record_episodes
 from millrace.keywords import RecordKeywords
 from millrace.launch.policy_workers import policy_player
 from millrace.learner.run_folder.results import RecordedDataset
+from millrace.play_flags import RecordFlags
 from millrace.playing import Given, ShowPlayed, flags_of, playing_workers, policy_to_play
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike
