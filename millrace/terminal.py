@@ -23,11 +23,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from millrace.learner.report.sentences import bottleneck, ending, lag_in_words, per_second, went_wrong
 from millrace.learner.rollouts.opponent_pool import ELO_KEY
 from millrace.learner.run_folder.json_log import JsonLines, progress_line
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
+from millrace.learner.run_folder.sentences import bottleneck, ending, lag_in_words, per_second, went_wrong
 from millrace.protocol.bounds import escaped, one_line
 from millrace.protocol.logs.notices import is_notice
 from millrace.protocol.specs import SCORE

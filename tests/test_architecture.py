@@ -46,7 +46,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},
     "run_folder": {"rehearsed_pickle"},
-    "report": {"config", "run_folder"},
+    "report": {"config", "run_folder", "run_lines"},
 }
 WORKERS = {  # the same for each folder and file of the workers; the files that are not named stand above all of these
     "activity": set[str](),

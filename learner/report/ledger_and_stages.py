@@ -7,7 +7,7 @@ from html import escape
 from millrace.learner.report.charts import COLORS, MINUS, Segment, bar, key
 from millrace.learner.report.html_parts import section
 from millrace.learner.report.reported_runs import ReportData
-from millrace.learner.report.run_lines import duration
+from millrace.learner.run_lines import duration
 
 TICKETS = ("issued", ("used", "outstanding", "lost"))
 TRANSITIONS = ("received", ("used", "waiting", "duplicate", "late", "invalid"))

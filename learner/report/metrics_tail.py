@@ -15,14 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from millrace.learner.run_folder.metrics_log import METRICS_FILE, decoded_row
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, MOST_LINE_BYTES, decoded_row
 from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
 from millrace.learner.run_folder.results import EVALUATION_KEY
 from millrace.protocol.arrays import Ints
 
 MOST_ROWS = 256  # at least, and twice as many at most: a chart has 500 points
 CHUNK_BYTES = 1 << 22
-MOST_LINE_BYTES = 1 << 16
 NEWLINE = 10
 OF_AN_EVALUATION = b'"%s"' % EVALUATION_KEY.encode()
 
@@ -111,11 +110,3 @@ def _places(text: bytes, part: bytes) -> Iterator[int]:
     while place >= 0:
         yield place
         place = text.find(part, place + 1)
-
-
-def newest_row(run: Path) -> dict[str, Any]:
-    """The last whole row of a metrics.jsonl; empty if there is none. Reads its end only. Raises OSError."""
-    with os.fdopen(open_regular(run / METRICS_FILE), "rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES))
-        lines = file.read(MOST_LINE_BYTES).split(b"\n")[:-1]
-    return next((row for line in reversed(lines) if (row := decoded_row(line)) is not None), {})

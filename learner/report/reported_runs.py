@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import msgspec
 
 from millrace.learner.report.curve import Curve, points, read_run_files
-from millrace.learner.report.run_lines import algorithm_label
 from millrace.learner.run_folder.json_log import LoggedLine, newest_lines
 from millrace.learner.run_folder.metrics_log import METRICS_FILE
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
 from millrace.learner.run_folder.regular_files import regular_files
 from millrace.learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
 from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_lines import algorithm_label
 from millrace.protocol.arrays import Doubles
 from millrace.protocol.bounds import Natural, Real, Seconds
 from millrace.protocol.errors import UsageError

@@ -14,11 +14,11 @@ from millrace.learner.report.charts import chart_for_all_widths, key
 from millrace.learner.report.html_parts import return_text, section
 from millrace.learner.report.panels import WHAT_IS_DRAWN, how_it_is_drawn, panels
 from millrace.learner.report.reported_runs import ReportData, RunGroup, differing_settings
-from millrace.learner.report.run_lines import duration
-from millrace.learner.report.sentences import per_second
 from millrace.learner.run_folder.episode_window import WINDOW_EPISODES
 from millrace.learner.run_folder.regular_files import read
 from millrace.learner.run_folder.results import FactMean
+from millrace.learner.run_folder.sentences import per_second
+from millrace.learner.run_lines import duration
 
 WIDE, NARROW = (1080, 360), (540, 320)
 MOST_BYTES_OF_ONE, MOST_BYTES_OF_ALL = 4 * 2**20, 24 * 2**20  # films or pictures

@@ -30,6 +30,7 @@ from millrace.protocol.errors import RunError
 log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
+MOST_LINE_BYTES = 1 << 16  # of a row that is read without the rest of the file
 MOST_WAITING = 100_000  # rows that the disk refused: 100 MB of memory
 EVENTS_EVERY_S = 0.2  # a fast run makes a hundred updates in that time, and an event takes as long as a small minibatch
 
@@ -210,6 +211,14 @@ def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
     *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := decoded_row(line)) is not None]
     return rows, len(lines) - len(rows)
+
+
+def newest_row(run: Path) -> dict[str, Any]:
+    """The last whole row of a metrics.jsonl; empty if there is none. Reads its end only. Raises OSError."""
+    with os.fdopen(open_regular(run / METRICS_FILE), "rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES))
+        lines = file.read(MOST_LINE_BYTES).split(b"\n")[:-1]
+    return next((row for line in reversed(lines) if (row := decoded_row(line)) is not None), {})
 
 
 _DECODER = msgspec.json.Decoder(dict[str, int | float | None])

@@ -7,7 +7,7 @@ from pathlib import Path
 from millrace.cli.flags import DashboardFlags
 from millrace.dashboard.serve import serve
 from millrace.flags.parse import parse_flags
-from millrace.learner.report.run_lines import find_runs
+from millrace.learner.run_lines import find_runs
 from millrace.protocol.address import is_local
 from millrace.protocol.errors import UsageError
 

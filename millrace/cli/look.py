@@ -10,8 +10,8 @@ from millrace.cli.status import table
 from millrace.flags.parse import parse_flags
 from millrace.learner.report.page import write_page
 from millrace.learner.report.picture import draw
-from millrace.learner.report.run_lines import RunLine, algorithm_label, find_runs, read_line
-from millrace.learner.report.sentences import per_second
+from millrace.learner.run_folder.sentences import per_second
+from millrace.learner.run_lines import RunLine, algorithm_label, find_runs, read_line
 from millrace.protocol.errors import UsageError
 
 

@@ -23,10 +23,10 @@ from msgspec import Meta
 from millrace.flags.fields import Flag
 from millrace.flags.parse import parse_flags
 from millrace.learner.members.held_up import in_words
-from millrace.learner.report.run_lines import RunLine, in_sentences, read_line
-from millrace.learner.report.sentences import bottleneck, lag_in_words, per_second, went_wrong
 from millrace.learner.run_folder.run_format import is_run_folder
 from millrace.learner.run_folder.run_lock import learner_of_run
+from millrace.learner.run_folder.sentences import bottleneck, lag_in_words, per_second, went_wrong
+from millrace.learner.run_lines import RunLine, in_sentences, read_line
 from millrace.protocol.errors import Refused, RunError, UsageError
 from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
 from millrace.protocol.keys.keys import Token

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 from millrace.learner.report.metrics_tail import MetricsTail
 from millrace.learner.report.reported_runs import ReportedRun, read_run
-from millrace.learner.report.run_lines import RunLine, find_runs, read_line
 from millrace.learner.run_folder.json_log import RUN_LOG_FILE
 from millrace.learner.run_folder.metrics_log import METRICS_FILE
 from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files
 from millrace.learner.run_folder.results import SUMMARY_FILE
 from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
 from millrace.learner.run_folder.run_lock import LOCK_FILE
+from millrace.learner.run_lines import RunLine, find_runs, read_line
 from millrace.protocol.bounds import escaped
 from millrace.protocol.errors import UsageError
 

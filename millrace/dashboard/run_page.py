@@ -22,11 +22,11 @@ from millrace.learner.report.curve import points
 from millrace.learner.report.history import clock_time
 from millrace.learner.report.html_parts import return_text, section
 from millrace.learner.report.reported_runs import ReportedRun, RunResults
-from millrace.learner.report.run_lines import RunLine, algorithm_label, duration, headline
-from millrace.learner.report.sentences import bottleneck, per_second, went_wrong
 from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
+from millrace.learner.run_folder.sentences import bottleneck, per_second, went_wrong
+from millrace.learner.run_lines import RunLine, algorithm_label, duration, headline
 from millrace.protocol.arrays import Doubles
 from millrace.protocol.bounds import escaped
 from millrace.protocol.messages import Status, WorkerStatus

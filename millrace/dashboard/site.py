@@ -25,9 +25,9 @@ from millrace.learner.report.history import history
 from millrace.learner.report.html_parts import document, return_text, section
 from millrace.learner.report.page import STYLE
 from millrace.learner.report.reported_runs import ReportData, group_runs
-from millrace.learner.report.run_lines import RunLine, algorithm_label, duration
-from millrace.learner.report.sentences import per_second
 from millrace.learner.run_folder.regular_files import open_regular
+from millrace.learner.run_folder.sentences import per_second
+from millrace.learner.run_lines import RunLine, algorithm_label, duration
 from millrace.protocol.errors import UsageError
 
 SCRIPT = Path(__file__).with_name("page.js")

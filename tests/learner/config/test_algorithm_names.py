@@ -20,10 +20,10 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from millrace.learner.config.layers import config_from_toml, config_of_run, resolve
 from millrace.learner.config.resume_rules import Free, OnResume, declared
-from millrace.learner.report.run_lines import algorithm_label
 from millrace.learner.resume_checks import check_settings
 from millrace.learner.run_folder.newest_run import newest_run
 from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_lines import algorithm_label
 from millrace.protocol.errors import UsageError
 
 SOURCE = '''

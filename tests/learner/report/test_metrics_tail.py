@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from millrace.learner.report.metrics_tail import MOST_LINE_BYTES, MetricsTail, newest_row
-from millrace.learner.run_folder.metrics_log import METRICS_FILE, MetricsLog, read_rows
+from millrace.learner.report.metrics_tail import MetricsTail
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, MOST_LINE_BYTES, MetricsLog, newest_row, read_rows
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, Progress
 
 

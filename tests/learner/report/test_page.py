@@ -24,11 +24,11 @@ from millrace.learner.report import sections
 from millrace.learner.report.charts import COLORS, MINUS, Series, chart, key, ticks, with_si_prefix
 from millrace.learner.report.page import page, write_page
 from millrace.learner.report.reported_runs import MAY_DIFFER_IN_A_GROUP, ReportData, group_runs, read_run
-from millrace.learner.report.run_lines import duration
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import Evaluation, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_lines import duration
 from millrace.protocol.errors import RunError, UsageError
 
 ROOT = Path(__file__).parents[3]

@@ -13,8 +13,8 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
-from millrace.learner.report.sentences import per_second
 from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.sentences import per_second
 from millrace.learner.standard_streams import never_fails
 from millrace.protocol.logs.notices import log_notice
 from millrace.sparkline import ASCII, BLOCKS, COLUMNS, MOST_POINTS, Sparkline

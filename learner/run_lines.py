@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from millrace.learner.config.presets import environment_name
-from millrace.learner.report.metrics_tail import newest_row
-from millrace.learner.report.sentences import ending, per_second
 from millrace.learner.run_folder.last_line import resume_command
 from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.metrics_log import newest_row
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
 from millrace.learner.run_folder.regular_files import reason
 from millrace.learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
 from millrace.learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
 from millrace.learner.run_folder.run_lock import living_owner
+from millrace.learner.run_folder.sentences import ending, per_second
 from millrace.protocol.bounds import INVALID, LARGEST, MAX_NAME, one_line
 from millrace.protocol.errors import UsageError
 

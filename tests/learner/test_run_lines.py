@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from millrace.learner.report.run_lines import find_runs, headline, in_sentences, read_line
 from millrace.learner.run_folder.lease import Listens, decoded
 from millrace.learner.run_folder.metrics_log import METRICS_FILE
 from millrace.learner.run_folder.run_format import CONFIG_FILE
 from millrace.learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
+from millrace.learner.run_lines import find_runs, headline, in_sentences, read_line
 from millrace.protocol.errors import UsageError
 from tests.learner.report.test_page import a_run
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from millrace.learner.report.sentences import bottleneck, went_wrong
+from millrace.learner.run_folder.sentences import bottleneck, went_wrong
 
 IN_TURN = "Updates are the slowest part: the learner updates for 80% of the time, and workers wait for 80%."
 
