@@ -13,7 +13,7 @@ from millrace.learner.run_folder.run_format import CONFIG_FILE
 from millrace.learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
 from millrace.learner.run_lines import find_runs, headline, in_sentences, read_line
 from millrace.protocol.errors import UsageError
-from tests.learner.report.test_page import a_run
+from tests.support.run_folders import a_run
 
 GONE = 2**22 + 1  # no process has so high a number
 

@@ -20,7 +20,7 @@ from millrace.learner.run_folder.run_lock import LOCK_FILE, RunLock
 from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import KeyFolder, read_token
 from millrace.protocol.keys.keys import Key, Token
-from tests.learner.report.test_page import a_run
+from tests.support.run_folders import a_run
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 WIDE, HERE = "tcp://box:5555", "tcp://127.0.0.1:5555"

@@ -26,7 +26,8 @@ from millrace.learner.run_folder.results import Best, Evaluation
 from millrace.learner.run_folder.run_lock import RunLock
 from millrace.protocol.logs.notices import log_notice
 from millrace.protocol.messages import Status, WorkerStatus
-from tests.learner.report.test_page import Reader, a_run
+from tests.learner.report.test_page import Reader
+from tests.support.run_folders import a_run
 
 log = logging.getLogger("millrace.learner")
 
