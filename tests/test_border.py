@@ -13,27 +13,13 @@ from tests.test_architecture import PACKAGES, module, modules_imported, sources
 
 STILL = {
     ("learner/between_updates/run_files.py", "monitoring"),
-<<<<<<< HEAD
-=======
-    ("learner/run.py", "datasets"),
     ("learner/run_lines.py", "monitoring"),
->>>>>>> d4071132 (What people read of a run, its line and its sentences, belongs to the core)
     ("learner/run_setup.py", "monitoring"),
     ("millrace/__init__.py", "datasets"),  # the face: it names `record` for type checkers, and imports it when it is used
     ("millrace/__init__.py", "monitoring"),
-<<<<<<< HEAD
-    ("millrace/cli/status.py", "monitoring"),
-=======
-    ("millrace/algorithms.py", "datasets"),
->>>>>>> d4071132 (What people read of a run, its line and its sentences, belongs to the core)
     ("millrace/launch/learner_inference.py", "monitoring"),
     ("millrace/launch/training.py", "monitoring"),
     ("millrace/runs.py", "monitoring"),
-<<<<<<< HEAD
-    ("millrace/terminal.py", "monitoring"),
-=======
-    ("workers/collect/collector.py", "envs"),
->>>>>>> d4071132 (What people read of a run, its line and its sentences, belongs to the core)
 }
 FOLDER = "millrace/extras/"
 ELSEWHERE = {  # files of an extra that do not yet stand in its folder
