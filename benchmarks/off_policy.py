@@ -24,7 +24,7 @@ from rich.table import Table
 
 import millrace
 from benchmarks.writing import COLORS, DPI, GREY, RESULTS, write
-from millrace.learner.report.curve import Curve, common_grid, read_run_files
+from millrace.extras.monitoring.report.curve import Curve, common_grid, read_run_files
 from millrace.learner.run_folder.run_folder import RunFolder
 
 if TYPE_CHECKING:

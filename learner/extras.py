@@ -16,6 +16,10 @@ STARTED_BY = {
     "prior": "millrace.extras.datasets.prior_dataset:PriorDataset",
     "record": "millrace.extras.datasets.training_recorder:TrainingRecorder",
     "video": "millrace.extras.datasets.video:prepare_videos",
+    "Run.plot": "millrace.extras.monitoring.report.picture:draw",
+    "dashboard": "millrace.extras.monitoring.dashboard.page_beside:page_of_run",
+    "metrics_bind": "millrace.extras.monitoring.prometheus:metrics_server",
+    "tensorboard": "millrace.extras.monitoring.tensorboard:TensorBoardCallback",
 }
 """setting, or public method -> `module:name`"""
 

@@ -147,6 +147,8 @@ def open_run(
     everything fits.
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
+    if setup.config.tensorboard:
+        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets what the others log
     if line := unused_setting(setup.config):
         log.warning("%s", line)
     spec = run_spec(setup.config, setup.known.env, setup.known.spaces)

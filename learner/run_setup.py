@@ -17,6 +17,7 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.costs import endless_evaluations
 from millrace.learner.conversations import describe_settings, describe_spec
 from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.extras import started_by
 from millrace.learner.imports_ahead import ImportsAhead
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.describe import described_by_workers
@@ -85,18 +86,26 @@ class RunSetup:
 def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]:
     """A new run folder, or the folder of the run to `resume`, locked. A new one is removed if no `Run` can be made of it.
 
-    Raises `UsageError`, also if another process trains the run.
+    A page shows it meanwhile, if `config` says so. Raises `UsageError`, also if another process trains the run.
     """
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
     folder.stay()
     try:
-        with RunLock(folder.path) as folder.lock, kept_log(folder.path):
+        with RunLock(folder.path) as folder.lock, kept_log(folder.path), _page_beside(config, folder.path):
             for line in () if resume is None else resume.differences:
                 log.warning("%s", line)
             yield folder
     except BaseException:
         folder.remove()
         raise
+
+
+def _page_beside(config: Config, run: Path) -> AbstractContextManager[None]:
+    """Shows the run in a browser while it is entered, if that is wanted."""
+    if not config.dashboard:
+        return nullcontext()
+    page: AbstractContextManager[None] = started_by("dashboard")(run)
+    return page
 
 
 def _spaces(config: Config, env: DescribedEnv) -> EnvSpaces:
@@ -176,6 +185,5 @@ def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:
     """Serves metrics at `config.metrics_bind` while it is entered; without an address it imports no HTTP server."""
     if not config.metrics_bind:
         return nullcontext(lambda hub: None)
-    from millrace.learner.prometheus import metrics_server
-
-    return metrics_server(config)
+    server: AbstractContextManager[HubObserver] = started_by("metrics_bind")(config)
+    return server

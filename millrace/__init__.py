@@ -34,7 +34,7 @@ from millrace.protocol.errors import (  # noqa: E402
 
 if TYPE_CHECKING:
     from millrace.extras.datasets.record import record
-    from millrace.launch.page_beside import Dashboard
+    from millrace.extras.monitoring.dashboard.page_beside import Dashboard
     from millrace.launch.vector import make_vec
     from millrace.learner.algorithms.normalizer import Normalizer
     from millrace.learner.callbacks.callback import Callback
@@ -85,7 +85,6 @@ __all__ = [
     "algorithms",
     "env_copy",
     "evaluate",
-    "integrations",
     "load",
     "make_vec",
     "record",
@@ -96,7 +95,7 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "millrace.learner.callbacks.callback",
-    "Dashboard": "millrace.launch.page_beside",
+    "Dashboard": "millrace.extras.monitoring.dashboard.page_beside",
     "EnvCopy": "millrace.protocol.envs.which_copy",
     "Evaluation": "millrace.learner.run_folder.results",
     "LoadedPolicy": "millrace.loaded_policy",
@@ -123,7 +122,7 @@ _IMPORTED_WHEN_USED = {
 }
 """Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""
 
-_MODULES = ("algorithms", "integrations", "testing")
+_MODULES = ("algorithms", "testing")
 """Public modules, which are imported when they are used, too"""
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, Unpack
+from typing import Any, Protocol, TypeVar, Unpack
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from millrace.protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
 from millrace.protocol.errors import UsageError, UserFacingError
 from millrace.terminal import progress_view
-
-if TYPE_CHECKING:
-    from millrace.learner.report.picture import Picture
 
 NOT_FINISHED = "not finished"
 
@@ -76,6 +73,22 @@ class Metrics(dict[str, Array]):
     def __repr__(self) -> str:
         lost = f", {self.unreadable} more cannot be read" if self.unreadable else ""
         return f"<metrics of {self._updates} updates{lost}: {', '.join(self)}>"
+
+
+class Picture(Protocol):
+    """Learning curves as a picture, which notebooks show."""
+
+    svg: str
+    """the picture as SVG text"""
+
+    def _repr_svg_(self) -> str:
+        """What a notebook shows."""
+
+    def png(self) -> bytes:
+        """The picture as a PNG."""
+
+    def save(self, out: str | os.PathLike[str]) -> Path:
+        """Write it to a file, whose name ends in .svg or .png. Raises `UserFacingError`, with a one-line message."""
 
 
 class Run(os.PathLike[str]):
@@ -185,9 +198,7 @@ class Run(os.PathLike[str]):
         >>> picture.save("curve.svg").name
         'curve.svg'
         """
-        from millrace.learner.report.picture import draw
-
-        picture = draw([self.path])
+        picture: Picture = started_by("Run.plot")([self.path])
         if out is not None:
             picture.save(out)
         return picture

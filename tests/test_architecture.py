@@ -46,7 +46,6 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},
     "run_folder": {"rehearsed_pickle"},
-    "report": {"config", "run_folder", "run_lines"},
 }
 WORKERS = {  # the same for each folder and file of the workers; the files that are not named stand above all of these
     "activity": set[str](),
@@ -65,10 +64,8 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"dashboard", "flags", "launch", "play_flags", "playing", "terminal"},
-    "dashboard": {"cli"},
+    "cli": {"flags", "launch", "play_flags", "playing", "terminal"},
     "flags": set[str](),
-    "integrations": set[str](),
     "launch": {"arguments", "flags", "own_policy", "policies", "terminal"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
@@ -96,8 +93,6 @@ IMPORTED_LATE = {  # what else is imported in functions; milliseconds after `mil
     "cloudpickle": "5 ms, for callables only",
     "importlib.metadata": "the version, and kinds of env copies that others install, for which few ask",
     "millrace.learner.imports_ahead": "only if it was imported before",
-    "millrace.learner.prometheus": "26 ms, for --metrics-bind only",
-    "millrace.learner.report.picture": "for plots only",
     "millrace.extras.datasets.record": "160 ms, after the flags are known to be right",
     "millrace.cli.main": "a signal waits until it is imported",
     "millrace.launch.learner_inference": "it is for --inference learner only",
@@ -448,7 +443,7 @@ def test_every_public_name_of_millrace_is_documented() -> None:
             "millrace.learner.algorithms, millrace.learner.config.command_line, millrace.learner.policy_player",
             SLOW_TO_IMPORT,
         ),
-        ("millrace.learner.report.picture, millrace.cli.main", SLOW_TO_IMPORT),
+        ("millrace.extras.monitoring.report.picture, millrace.cli.main", SLOW_TO_IMPORT),
     ],
 )
 def test_what_must_start_quickly_imports_nothing_that_is_slow_to_import(names: str, heavy: set[str]) -> None:

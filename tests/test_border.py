@@ -1,54 +1,27 @@
 """The border between the core and the extras: the core imports no extra. An extra may import the core, never another extra.
 
-`STILL` lists the places where the core does: they may only become fewer.
+So an extra can be added, changed or left out without touching the core. The core names what it takes of an extra, and which
+command an extra gives, as text (`learner/extras.py`, `millrace/cli/commands.py`, `protocol/envs/kinds_of_copies.py`).
 """
 
 from __future__ import annotations
 
+import ast
 from functools import cache
 
 import pytest
 
-from tests.test_architecture import PACKAGES, module, modules_imported, sources
+from tests.test_architecture import PACKAGES, imports_in_functions, module, modules_imported, sources, tree
 
-STILL = {
-    ("learner/between_updates/run_files.py", "monitoring"),
-    ("learner/run_lines.py", "monitoring"),
-    ("learner/run_setup.py", "monitoring"),
-    ("millrace/__init__.py", "datasets"),  # the face: it names `record` for type checkers, and imports it when it is used
-    ("millrace/__init__.py", "monitoring"),
-    ("millrace/launch/learner_inference.py", "monitoring"),
-    ("millrace/launch/training.py", "monitoring"),
-    ("millrace/runs.py", "monitoring"),
-}
+FACE = "millrace/__init__.py"
+"""The public names, some of them of extras: a type checker sees where each is from; a program imports it when it is used."""
 FOLDER = "millrace/extras/"
-ELSEWHERE = {  # files of an extra that do not yet stand in its folder
-    "monitoring": (
-        "learner/report/",
-        "learner/metric_names.py",
-        "learner/prometheus.py",
-        "learner/run_folder/metrics_log.py",
-        "millrace/dashboard/",
-        "millrace/integrations/",
-        "millrace/launch/page_beside.py",
-        "millrace/cli/dashboard.py",
-        "millrace/cli/look.py",
-    ),
-}
+EXTRAS = ("conformance", "datasets", "envs", "launchers", "monitoring")
 
 
 def extra_of(source: str) -> str | None:
     """The extra that a file belongs to; None if it belongs to the core."""
-    if source.startswith(FOLDER):
-        return source.removeprefix(FOLDER).split("/")[0].removesuffix(".py")
-    return next((extra for extra, places in ELSEWHERE.items() if source.startswith(places)), None)
-
-
-@pytest.mark.parametrize("extra", ELSEWHERE)
-def test_the_files_of_an_extra_are_known(extra: str) -> None:
-    """So that a file which has moved is not taken for one of the core."""
-    for place in ELSEWHERE[extra]:
-        assert any(source.startswith(place) for source in sources(*PACKAGES)), place
+    return source.removeprefix(FOLDER).split("/")[0].removesuffix(".py") if source.startswith(FOLDER) else None
 
 
 @cache
@@ -63,15 +36,21 @@ def extras_imported(source: str) -> set[str]:
     return {extras[owner] for owner in owners & extras.keys()}
 
 
+def test_these_are_the_extras() -> None:
+    assert {*extra_of_each_module().values()} == {*EXTRAS, "__init__"}
+
+
 def test_the_core_imports_no_extra() -> None:
-    crossings = {
-        (source, extra) for source in sources(*PACKAGES) if extra_of(source) is None for extra in extras_imported(source)
-    }
-    assert crossings == STILL
+    core = [source for source in sources(*PACKAGES) if extra_of(source) is None and source != FACE]
+    assert {source: extras for source in core if (extras := extras_imported(source))} == {}
 
 
-def test_no_extra_imports_another() -> None:
-    for source in sources(*PACKAGES):
-        extra = extra_of(source)
-        if extra is not None:
-            assert extras_imported(source) <= {extra}, source
+def test_a_program_that_imports_the_face_imports_no_extra() -> None:
+    at_the_top = {ast.unparse(node) for node in tree(FACE).body if isinstance(node, ast.Import | ast.ImportFrom)}
+    assert not [line for line in at_the_top | imports_in_functions(FACE) if "extras" in line]
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_no_extra_imports_another(extra: str) -> None:
+    for source in sources(f"{FOLDER}{extra}"):
+        assert extras_imported(source) <= {extra}, source

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from prometheus_client.metrics_core import Metric
 
 from benchmarks.markdown_tables import table
+from millrace.extras.monitoring.metric_names import METRICS, label
+from millrace.extras.monitoring.prometheus import MetricsCollector, MetricsSnapshot
 from millrace.learner.config.config import Config
-from millrace.learner.metric_names import METRICS, label
-from millrace.learner.prometheus import MetricsCollector, MetricsSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import FactMean

@@ -40,8 +40,8 @@ GROUPS = {
     "policies": Group("Use a policy", "A saved policy acts without its environment or algorithm.", "load LoadedPolicy"),
     "callbacks": Group(
         "Callbacks",
-        "`train(callbacks=[…])` takes any number of them. `millrace.integrations` has those for other tools.",
-        "Callback Progress integrations.WandbCallback integrations.MlflowCallback",
+        "`train(callbacks=[…])` takes any number of them. The last two are for other programs.",
+        "Callback Progress extras.monitoring.wandb.WandbCallback extras.monitoring.mlflow.MlflowCallback",
     ),
     "environments": Group(
         "Environments",

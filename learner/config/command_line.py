@@ -50,7 +50,8 @@ GROUPS = {
         "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
     ),
     "files and logs": (
-        "checkpoint_every_s", "keep_checkpoints", "record", "prior", "callbacks", "metrics_bind", "dashboard", "log_json",
+        "checkpoint_every_s", "keep_checkpoints", "record", "prior", "callbacks", "tensorboard", "metrics_bind", "dashboard",
+        "log_json",
     ),
 }  # fmt: skip
 """The settings of each group, by its title. Before them come `BASIC` and the settings of the algorithm."""

@@ -80,7 +80,8 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     settings: dict[str, Any] = {}
     """all settings of the run, by name; those of the algorithm in `algorithm`"""
     metrics: dict[str, float] = {}
-    """numbers of the last update, by the names under which they are logged: losses and the like"""
+    """numbers of the last update, or before the first one of cloning, by the names under which they are logged: losses and
+    the like"""
     episodes: tuple[Episode, ...] = ()
     """the episodes that ended in the rollouts of the last update"""
     lags: tuple[int, ...] = ()

@@ -34,12 +34,12 @@ GROUPS = {  # one line a command
         "launch": Command("millrace.extras.launchers.command:run", "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
     },
     "Look at runs": {
-        "list": Command("millrace.cli.look:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
-        "dashboard": Command("millrace.cli.dashboard:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
+        "list": Command("millrace.cli.list:list_runs", "[FOLDER]", "list runs: state, return and progress of each"),
+        "dashboard": Command("millrace.extras.monitoring.dashboard.command:dashboard", "[RUNS ...]", "show runs in a browser, while they train and afterwards"),
         "evaluate": Command("millrace.cli.play:evaluate", "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
         "record": Command("millrace.extras.datasets.command:run", "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
-        "plot": Command("millrace.cli.look:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as SVG or PNG"),
-        "report": Command("millrace.cli.look:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
+        "plot": Command("millrace.extras.monitoring.report.command:plot", "RUN [RUN ...] [--out FILE]", "draw learning curves as SVG or PNG"),
+        "report": Command("millrace.extras.monitoring.report.command:report", "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
     },
     "Write a client in another language": {
         "conform": Command("millrace.extras.conformance.command:run", "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),

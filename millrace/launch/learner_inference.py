@@ -16,7 +16,6 @@ from pathlib import Path
 from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import worker_flags
-from millrace.launch.page_beside import opened_folder
 from millrace.launch.vector import listen
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
@@ -26,7 +25,7 @@ from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.bind_settings import BindSettings
 from millrace.learner.members.describe_coordinator import Accept
 from millrace.learner.resume_checks import Resumption
-from millrace.learner.run_setup import RunSetup, known_environment, prometheus_observer
+from millrace.learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from millrace.learner.torch_setup import one_thread, torch_device
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.env_spec import EnvSpec
@@ -54,7 +53,7 @@ def train(
         link = endpoint.link
         listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
-        folder = opened_folder(config, resume, stack)
+        folder = stack.enter_context(run_folder(config, resume))
         started = listening.start(worker_flags(config, folder.path))
 
         def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:

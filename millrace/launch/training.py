@@ -11,7 +11,6 @@ from pathlib import Path
 
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import FlagsOfWorker, no_flags, stopped_on_error, worker_flags
-from millrace.launch.page_beside import opened_folder
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
 from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
@@ -24,6 +23,7 @@ from millrace.learner.run_setup import (
     known_environment,
     named_environment,
     prometheus_observer,
+    run_folder,
 )
 from millrace.learner.torch_setup import one_thread
 from millrace.protocol.env_spec import EnvSpec
@@ -55,7 +55,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         log.warning("%s", line)
     with ExitStack() as stack:
         # A run to resume is locked before the address is bound: of two learners of one run, the second is told so.
-        folder = None if resume is None else opened_folder(config, resume, stack)
+        folder = None if resume is None else stack.enter_context(run_folder(config, resume))
         where = BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise)
         # Workers elsewhere decide for themselves whether they take code.
         code = "" if elsewhere else env.called_code or ("an encoder" if config.algorithm.encoder else "")
@@ -63,7 +63,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         observer = stack.enter_context(prometheus_observer(config))
         flags: FlagsOfWorker = no_flags
         if not elsewhere:
-            folder = folder or opened_folder(config, None, stack)
+            folder = folder or stack.enter_context(run_folder(config, None))
             if config.transport != "inproc":
                 flags = worker_flags(config, folder.path)
         started = endpoint.workers(config.workers + config.eval_workers, flags, evaluating=config.eval_workers)
@@ -72,7 +72,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
-        folder = folder or opened_folder(config, None, stack)  # not before a worker elsewhere has come
+        folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
         from millrace.learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
 
         with interrupts, one_thread():

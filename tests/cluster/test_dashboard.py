@@ -14,10 +14,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from millrace.dashboard.known_runs import key_of
+from millrace.extras.monitoring.dashboard.known_runs import key_of
 from millrace.learner.run_folder.json_log import kept_log
 from tests.cluster.chromium import Page
-from tests.millrace.dashboard.test_site import HOSTILE, a_hostile_run
+from tests.extras.monitoring.dashboard.test_site import HOSTILE, a_hostile_run
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import WORKER_TIMEOUT_S, Learner, Stage, Worker, free_port, wait_for
 

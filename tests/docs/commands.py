@@ -12,10 +12,13 @@ from typing import Any, NamedTuple
 
 from benchmarks.program import BENCHMARKS
 from millrace import play_flags
-from millrace.cli import flags, keys, presets, status
+from millrace.cli import keys, presets, status
 from millrace.cli.commands import COMMANDS
+from millrace.cli.list import ListFlags
 from millrace.extras.conformance.command import ConformFlags
 from millrace.extras.launchers.command import LAUNCHERS
+from millrace.extras.monitoring.dashboard.command import DashboardFlags
+from millrace.extras.monitoring.report.command import PlotFlags, ReportFlags
 from millrace.flags.fields import fields_of
 from millrace.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
 from millrace.learner.config.command_line import RunFlags
@@ -36,10 +39,10 @@ BEFORE = {"nohup", "exec", "time", "nice", "env", "srun"}
 RECORDS: dict[str, type[Any]] = {
     "evaluate": play_flags.EvaluateFlags,
     "record": play_flags.RecordFlags,
-    "list": flags.ListFlags,
-    "dashboard": flags.DashboardFlags,
-    "plot": flags.PlotFlags,
-    "report": flags.ReportFlags,
+    "list": ListFlags,
+    "dashboard": DashboardFlags,
+    "plot": PlotFlags,
+    "report": ReportFlags,
     "status": status.StatusFlags,
     "conform": ConformFlags,
     "presets": presets.PresetsFlags,

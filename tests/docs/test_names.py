@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from millrace.cli.commands import COMMANDS
-from millrace.learner.metric_names import METRICS
+from millrace.extras.monitoring.metric_names import METRICS
 from tests.docs import pages
 from tests.docs.commands import all_flags, mistake, shown_in
 from website.metrics_page import prometheus

@@ -14,10 +14,10 @@ import pytest
 
 import millrace
 from millrace.cli.commands import COMMANDS
+from millrace.extras.monitoring.metric_names import METRICS
 from millrace.learner.config.command_line import RunFlags
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.metric_names import METRICS
 from millrace.learner.run_folder import run_folder
 from millrace.protocol import errors
 from millrace.protocol.errors import UserFacingError
@@ -126,10 +126,11 @@ def test_a_type_that_nobody_knows_is_an_error() -> None:
 
 def test_every_public_name_is_on_one_python_page() -> None:
     pytest.importorskip("stable_baselines3", reason="the page of the Python names has those of millrace.sb3")
-    modules = {"algorithms", "testing", "integrations"}
+    modules = {"algorithms", "testing"}
     public = {f"millrace.{name}" for name in set(millrace.__all__) - modules - {"__version__"}}
     for module in modules:
         public |= {f"millrace.{module}.{name}" for name in getattr(millrace, module).__all__}
+    public |= {"millrace.extras.monitoring.wandb.WandbCallback", "millrace.extras.monitoring.mlflow.MlflowCallback"}
     text = "".join(make() for make in python_page.pages().values())
     shown = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
     assert {name for name in shown if not name.startswith("millrace.sb3.")} == public

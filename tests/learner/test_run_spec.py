@@ -7,8 +7,6 @@ import pytest
 
 from millrace.learner.config.config import Config
 from millrace.learner.env_spaces import EnvSpaces
-from millrace.learner.metric_names import METRICS
-from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
 from millrace.learner.run_spec import run_spec
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import read_description
@@ -22,7 +20,6 @@ from millrace.protocol.space_spec import (
     SpaceSpec,
     check_size,
 )
-from millrace.protocol.specs import SCORE
 from millrace.protocol.wire.plain_values import pack
 
 SMALL = DiscreteSpace(2, 0, "int64")
@@ -72,9 +69,3 @@ def test_a_number_of_the_environment_may_not_be_called_as_the_return_of_an_agent
             UsageError, match=r"^info_keys: expected another name than return_b, which is the return of agent b$"
         ):
             run_spec(config, env, described)
-
-
-def test_every_other_metric_beside_the_facts_is_known() -> None:
-    logged = [name.partition("/") for group in METRICS.values() for name in group]
-    beside = {name for where, _, name in logged if where in ("rollout", "eval") and "NAME" not in name and name != SCORE}
-    assert beside == METRICS_BESIDE_FACTS

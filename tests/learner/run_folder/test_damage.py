@@ -32,12 +32,12 @@ import tomli_w
 import torch
 
 import millrace
+from millrace.extras.monitoring.report.page import page
+from millrace.extras.monitoring.report.picture import draw
 from millrace.launch.training import train
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.config.layers import resolve
 from millrace.learner.env_spaces import EnvSpaces
-from millrace.learner.report.page import page
-from millrace.learner.report.picture import draw
 from millrace.learner.resume_checks import unless_finished
 from millrace.learner.run_folder.json_log import kept_log
 from millrace.learner.run_folder.lease import Owner

@@ -79,7 +79,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "run.lock": lambda run: RunLock(run).__enter__(),
     "metrics.jsonl": MetricsLog,
     "workers/w0.log": lambda run: worker_flags(Config(), run),
-    "tensorboard": MetricsLog,
     "checkpoints": lambda run: checkpoint.save(run, {}, env_steps=1, keep=3),
     "workers": lambda run: worker_flags(Config(), run),
     "videos": lambda run: subfolder(run, "videos"),

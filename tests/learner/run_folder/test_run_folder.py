@@ -1,7 +1,6 @@
 """The run folder and what stands in it: whole files, the same bytes for the same policy, curves that never go back."""
 
 import errno
-import itertools
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,7 @@ from gymnasium import spaces
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import config_of_run, resolve
 from millrace.learner.run_folder.episode_window import EpisodeWindow
-from millrace.learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
+from millrace.learner.run_folder.metrics_log import MetricsLog, read_rows
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import Evaluation, Summary
 from millrace.learner.run_folder.run_folder import RunFolder, as_folder_name
@@ -209,40 +208,19 @@ def test_a_row_has_the_names_that_users_know(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def scalars(folder: Path, name: str) -> list[tuple[int, float]]:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(folder / "tensorboard"))
-    events.Reload()
-    return [(event.step, event.value) for event in events.Scalars(name)]
-
-
-def test_tensorboard_gets_rows_a_while_apart_and_evaluations_and_the_last(tmp_path: Path) -> None:
-    now = 0.0
-    log = MetricsLog(tmp_path, clock=lambda: now)
-    for number in range(1, 26):
-        log.write(Progress(env_steps=number, return_mean=1.0), {"eval/mean_reward": 9.0} if number == 7 else {})
-        now += EVENTS_EVERY_S / 10
-    log.close()
-    assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == list(range(1, 26))
-    assert scalars(tmp_path, "rollout/ep_rew_mean") == [(number, 1.0) for number in (1, 7, 17, 25)]
-
-
 def test_a_resumed_run_takes_back_what_its_checkpoint_does_not_know(tmp_path: Path) -> None:
-    seconds = itertools.count()
-    log = MetricsLog(tmp_path, clock=lambda: next(seconds))
+    log = MetricsLog(tmp_path)
     for steps in (100, 200, 300, 400):
         log.write(Progress(env_steps=steps, return_mean=1.0), {})
     log.close()
     with (tmp_path / "metrics.jsonl").open("ab") as file:
         file.write(b'{"time/total_timesteps": 50')  # killed in mid-row
-    log = MetricsLog(tmp_path, from_env_steps=200, clock=lambda: next(seconds))
+    log = MetricsLog(tmp_path, from_env_steps=200)
     assert log.removed == 2
     for steps in (250, 350):
         log.write(Progress(env_steps=steps, return_mean=2.0), {})
     log.close()
     assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == [100, 200, 250, 350]
-    assert scalars(tmp_path, "rollout/ep_rew_mean") == [(100, 1.0), (200, 1.0), (250, 2.0), (350, 2.0)]
 
 
 def test_a_resumed_run_takes_back_updates_that_only_reset_env_copies(tmp_path: Path) -> None:
@@ -293,7 +271,6 @@ def test_rows_that_the_disk_refuses_are_written_later(tmp_path: Path) -> None:
     rows = read_rows(tmp_path / "metrics.jsonl")
     assert [row["time/total_timesteps"] for row in rows] == [100, 200, 300]
     assert [row.get("eval/mean_reward") for row in rows] == [3.0, None, 5.0]
-    assert scalars(tmp_path, "eval/mean_reward") == [(100, 3.0), (300, 5.0)]
 
 
 def test_the_window_holds_the_last_hundred_episodes() -> None:

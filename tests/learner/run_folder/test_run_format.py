@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from millrace.extras.monitoring.report.page import write_page
+from millrace.extras.monitoring.report.picture import draw
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.layers import config_of_run, resolve
-from millrace.learner.report.page import write_page
-from millrace.learner.report.picture import draw
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.run_folder import RunFolder

@@ -20,9 +20,9 @@ import yaml
 from prometheus_client.samples import Sample
 
 from millrace.cli.main import NOT_IN_WORKERS
+from millrace.extras.monitoring.prometheus import MetricsCollector, MetricsSnapshot
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.config import Config
-from millrace.learner.prometheus import MetricsCollector, MetricsSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.keys.key_folder import KeyFolder

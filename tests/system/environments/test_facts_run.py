@@ -10,7 +10,7 @@ import pytest
 
 import millrace
 from millrace.cli.main import main
-from millrace.learner.report.page import write_page
+from millrace.extras.monitoring.report.page import write_page
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.run_folder import RunFolder
 

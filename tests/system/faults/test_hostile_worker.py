@@ -29,7 +29,7 @@ from typing import get_args
 import pytest
 
 from millrace.cli.status import as_table, ask, in_json, observer_name
-from millrace.learner.report.page import write_page
+from millrace.extras.monitoring.report.page import write_page
 from millrace.protocol.bounds import Stage as WorkerStage
 from millrace.protocol.keys.key_folder import KeyFolder, read_token
 from millrace.protocol.wire.worker_link import WorkerLink

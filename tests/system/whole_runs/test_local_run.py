@@ -22,11 +22,11 @@ import psutil
 import pytest
 
 import millrace
+from millrace.extras.monitoring.report.reported_runs import read_run
 from millrace.launch import learner_inference
 from millrace.launch.training import train
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
-from millrace.learner.report.reported_runs import read_run
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import ALL_STEPS_DONE

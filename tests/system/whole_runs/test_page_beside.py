@@ -27,7 +27,7 @@ def page_processes() -> list[psutil.Process]:
     found = []
     for child in psutil.Process().children():
         with suppress(psutil.NoSuchProcess):  # it has just ended
-            found += [child] if "millrace.dashboard.serve" in child.cmdline() else []
+            found += [child] if "millrace.extras.monitoring.dashboard.serve" in child.cmdline() else []
     return found
 
 

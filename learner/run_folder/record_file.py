@@ -1,0 +1,84 @@
+"""A file of a run that grows by whole records: metrics.jsonl is one.
+
+Rule: the file ends with a whole record. What the disk refuses waits in memory, and is written later.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+
+from millrace.learner.run_folder.regular_files import open_regular, subfolder
+from millrace.protocol.errors import RunError
+
+MOST_WAITING = 100_000  # records that the disk refused: 100 MB of memory for rows of metrics
+
+
+class RecordFile:
+    """A file to which whole records are appended. What the disk refuses waits, and a record that it cut off is removed.
+
+    If the file is no longer at its path, it is made again there, with its folder.
+    """
+
+    def __init__(self, run: Path, name: str) -> None:
+        """`name`: of a file in this run folder, or in a folder of it. Raises OSError."""
+        self._run, self._path = run, run / name
+        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
+        self._bytes = 0
+        self._cut = 0  # bytes at the end of the file that the first record that waits replaces
+        self._open()
+
+    @property
+    def gone(self) -> bool:
+        """Whether its path names another file now, or none."""
+        try:
+            return not os.path.samestat(os.stat(self._path), os.fstat(self._number))
+        except OSError:
+            return True
+
+    def append(self, record: bytes) -> None:
+        """Add a record. It waits for `flush`."""
+        self._waiting.append(record)
+
+    def replace(self, newest: bytes, record: bytes) -> None:
+        """Add a record in place of the newest one."""
+        if self._waiting:
+            self._waiting.pop()
+        else:
+            self._cut = len(newest)
+        self._waiting.append(record)
+
+    def flush(self) -> None:
+        """Write the records that wait. Raises `RunError`."""
+        try:
+            if self.gone:
+                gone = self._file
+                self._open()
+                gone.close()
+            if self._cut:
+                self._file.truncate(self._bytes - self._cut)
+                self._bytes, self._cut = self._bytes - self._cut, 0
+            while self._waiting:
+                rest = self._waiting[0]
+                while rest:  # a disk that takes a part says why with the next
+                    rest = rest[self._file.write(rest) :]
+                self._bytes += len(self._waiting.popleft())
+        except OSError as error:
+            with suppress(OSError):
+                self._file.truncate(self._bytes)
+            raise RunError(f"{self._path}: rows are not written yet: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Close it. What waits is not written."""
+        self._file.close()
+
+    def _open(self) -> None:
+        if self._path.parent == self._run:
+            self._run.mkdir(parents=True, exist_ok=True)
+        else:
+            subfolder(self._run, self._path.parent.name)
+        self._file = os.fdopen(open_regular(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab", buffering=0)
+        self._number = self._file.fileno()
+        self._bytes, self._cut = self._path.stat().st_size, 0

@@ -1,0 +1,44 @@
+"""`millrace list`: a line for each run."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from millrace.cli.status import table
+from millrace.flags.fields import Flag
+from millrace.flags.parse import parse_flags
+from millrace.learner.run_folder.sentences import per_second
+from millrace.learner.run_lines import RunLine, algorithm_label, find_runs, read_line
+
+
+class ListFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """List runs: state, return, progress and speed of each, the newest first."""
+
+    folders: Annotated[tuple[Path, ...], Flag("[FOLDER ...]", positional=True)] = ()
+    """folders of runs, or run folders; if none is given, runs"""
+
+
+def list_runs(argv: list[str]) -> int:
+    """Print a line for each run. Returns the exit code."""
+    flags = parse_flags(ListFlags, argv, "list")
+    rows = [_cells(read_line(run, time.time())) for run in find_runs(flags.folders or (Path("runs"),))]
+    print(*table(rows, ("run", "state", "environment", "algorithm", "started"), "no run is here"), sep="\n")
+    return 0
+
+
+def _cells(line: RunLine) -> dict[str, str]:
+    return {
+        "run": line.name,
+        "state": line.state,
+        "environment": line.env,
+        "algorithm": algorithm_label(line.algo),
+        "return": "-" if line.return_mean is None else f"{line.return_mean:,.1f}",
+        "env steps": "-" if line.begins else f"{line.env_steps:,.0f}",
+        "done": line.done,
+        "steps/s": "-" if line.begins else per_second(line.steps_per_s),
+        "started": line.started,
+    }

@@ -1,0 +1,133 @@
+"""The runs that the dashboard shows, read from their folders again and again.
+
+Rule: what has not changed is not read again, and of a long metrics.jsonl a bounded number of rows is kept. A run has a key,
+which stands in addresses instead of its path.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from millrace.extras.monitoring.report.metrics_tail import MetricsTail
+from millrace.extras.monitoring.report.reported_runs import ReportedRun, read_run
+from millrace.learner.run_folder.json_log import RUN_LOG_FILE
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files
+from millrace.learner.run_folder.results import SUMMARY_FILE
+from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
+from millrace.learner.run_folder.run_lock import LOCK_FILE
+from millrace.learner.run_lines import RunLine, find_runs, read_line
+from millrace.protocol.bounds import escaped
+from millrace.protocol.errors import UsageError
+
+CHANGES = ("", CONFIG_FILE, RUN_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
+MOST_KEPT = 64  # runs whose rows are in memory
+MOST_LOGS, LOG_BYTES = 4, 4_096
+
+
+class RunContent(NamedTuple):
+    """A run with its rows."""
+
+    report: ReportedRun
+    rows: list[dict[str, Any]]
+
+
+class KnownRuns:
+    """Finds and reads runs. Used by one thread."""
+
+    def __init__(self, folders: Sequence[Path], clock: Callable[[], float]) -> None:
+        """`clock`: wall-clock time."""
+        self._folders, self._clock = folders, clock
+        self._tails: dict[Path, MetricsTail] = {}
+        self._read: dict[Path, tuple[object, RunContent]] = {}
+        self._lines: dict[Path, tuple[object, RunLine]] = {}
+
+    @property
+    def only(self) -> Path | None:
+        """The run folder, if the dashboard is of this one alone."""
+        return self._folders[0] if len(self._folders) == 1 and is_run_folder(self._folders[0]) else None
+
+    def find(self) -> dict[str, Path]:
+        """The runs by their keys, the newest first. Folders that are not there any more hold none."""
+        runs: list[Path] = []
+        for folder in self._folders:
+            try:
+                runs += find_runs([folder])
+            except UsageError:
+                continue
+        return {key_of(run): run for run in runs}
+
+    def line(self, run: Path) -> RunLine:
+        """What one line says about it."""
+        now, changed = self._clock(), _changes(run)
+        before, line = self._lines.get(run, (None, None))
+        if line is None or before != changed or line.owner is not None or (run / LOCK_FILE).exists():
+            line = read_line(run, now)
+            self._lines[run] = changed, line
+        return line
+
+    def content(self, run: Path) -> RunContent:
+        """All that its page shows of its folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+        changed = _changes(run)
+        before, content = self._read.pop(run, (None, None))
+        if content is None or before != changed:
+            tail = self._tails.setdefault(run, MetricsTail(run))
+            try:
+                tail.read()
+            except FileNotFoundError:
+                tail = MetricsTail(run)
+            except OSError as error:
+                raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
+            rows = tail.rows
+            content = RunContent(read_run(run, rows), rows)
+        self._read[run] = changed, content  # last in the table: the run that was not asked for longest stands first
+        while len(self._read) > MOST_KEPT:
+            oldest = next(iter(self._read))
+            del self._read[oldest]
+            self._tails.pop(oldest, None)
+        return content
+
+
+def key_of(run: Path) -> str:
+    """What stands for a run in addresses."""
+    return blake2b(os.fsencode(run.absolute()), digest_size=6).hexdigest()
+
+
+def newest_logs(run: Path) -> list[tuple[str, str]]:
+    """Name and last lines of the logs of local workers that were written last."""
+    logs = regular_files(run, "workers/*.log")
+    found = []
+    for path in sorted(logs, key=_written, reverse=True)[:MOST_LOGS]:
+        try:
+            with os.fdopen(open_regular(path), "rb") as file:
+                file.seek(max(0, os.fstat(file.fileno()).st_size - LOG_BYTES))
+                content = file.read(LOG_BYTES)
+        except OSError:
+            continue
+        *_, lines = content.partition(b"\n") if len(content) == LOG_BYTES else (content,)
+        if lines.strip():
+            found.append((path.name, escaped(lines.decode(errors="replace")).rstrip()))
+    return found
+
+
+def _written(path: Path) -> int:
+    try:
+        return path.lstat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def _changes(run: Path) -> tuple[object, ...]:
+    """What is different whenever one of its files was written."""
+    found: list[object] = []
+    for name in CHANGES:
+        try:
+            stat = (run / name).lstat()
+            found.append((stat.st_ino, stat.st_size, stat.st_mtime_ns))
+        except OSError:
+            found.append(None)
+    return tuple(found)

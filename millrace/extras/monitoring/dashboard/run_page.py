@@ -1,0 +1,325 @@
+"""The parts of the page of one run that a report does not have: what it does now, its workers, a curve of any metric. Pure.
+
+Rule: text from run folders and from learners is escaped. What stands on the page are words that a person would write; the
+names of fields stand beside them where a reader may look for them elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from millrace.extras.monitoring.dashboard.live import LaneSample, Seen
+from millrace.extras.monitoring.metric_names import METRICS, NONE, described, label
+from millrace.extras.monitoring.report.charts import DOT_KEY, Segment, Series, bar, chart_for_all_widths
+from millrace.extras.monitoring.report.curve import points
+from millrace.extras.monitoring.report.history import clock_time
+from millrace.extras.monitoring.report.html_parts import return_text, section
+from millrace.extras.monitoring.report.reported_runs import ReportedRun, RunResults
+from millrace.learner.members.held_up import in_words
+from millrace.learner.run_folder.json_log import LoggedLine
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
+from millrace.learner.run_folder.sentences import bottleneck, per_second, went_wrong
+from millrace.learner.run_lines import RunLine, algorithm_label, duration, headline
+from millrace.protocol.arrays import Doubles
+from millrace.protocol.bounds import escaped
+from millrace.protocol.messages import Status, WorkerStatus
+
+WIDE = 1080, 360
+SHOWN_S, LEAST_SHOWN_S = 180.0, 30.0  # of who waits for whom
+COLORS = {
+    "collecting": "b1",
+    "updating": "b0",
+    "resetting": "b2",
+    "evaluating": "b4",
+    "starting": "b6",
+    "waiting": "wait",
+    "no worker": "gone",
+}
+"""Class in the style sheet of what a lane or the learner does"""
+COLUMNS = {"Worker": "", "Process": "late", "Doing": "", "Lanes": "", "Steps/s": "number", "Weights": "",
+           "Heard": "number", "Memory": "number"}  # fmt: skip
+"""Of the table of workers, with their classes in the style sheet"""
+MOST_SMOOTHED = 100
+MOST_LINES = 10  # of evaluations
+MIB = 2**20
+
+
+class Choice(NamedTuple):
+    """Which curve the reader has chosen."""
+
+    metric: str = RETURN_KEY
+    over_time: bool = False
+    smooth: int = 1
+    """number of rows over which a moving mean is taken"""
+
+    @staticmethod
+    def of(query: Mapping[str, Sequence[str]]) -> Choice:
+        """What the query of an address chooses; what it does not say, or not rightly, is as by default."""
+
+        def first(name: str, default: str) -> str:
+            return query.get(name, [default])[0]
+
+        smooth = first("smooth", "1")
+        rows = int(smooth) if smooth.isascii() and smooth.isdecimal() and len(smooth) < 4 else 1
+        return Choice(first("metric", RETURN_KEY), first("over", "") == "time", min(max(rows, 1), MOST_SMOOTHED))
+
+
+def as_of_now(line: RunLine, seen: Seen) -> RunLine:
+    """The line with what the learner says: its folder knows the last update alone, and nothing before the first."""
+    status = seen.status
+    if status is None or status.env_steps < line.env_steps:
+        return line
+    learner_s = sum(status.stages.get(f"learner_{stage}", 0.0) for stage in ("wait", "update", "other"))
+    return line._replace(
+        env_steps=status.env_steps,
+        steps_per_s=status.steps_per_s or line.steps_per_s,
+        updates=max(line.updates, status.version),
+        wall_s=line.wall_s or learner_s,
+    )
+
+
+def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
+    """Which run it is, in one sentence what it does, or how it ended, and its newest warning.
+
+    `home`: the page of all runs, if it shows others.
+    """
+    results, warned = (report.results, last_warning(report.log)) if report is not None else (None, "")
+    kicker = f'<a href="{home}">millrace: all runs</a>' if home else "millrace"
+    title = f"{escape(line.env or line.name)} <small>{escape(algorithm_label(line.algo))}, seed {line.seed}</small>"
+    return (
+        f'<header><p class="kicker">{kicker}</p><h1>{title}</h1>'
+        f'<p class="now {line.state}">{escape(now_sentence(line, seen, results))}</p>{warned}'
+        f'<p class="kicker">{escape(line.name)}</p></header>'
+    )
+
+
+def now_sentence(line: RunLine, seen: Seen, results: RunResults | None) -> str:
+    """What the run does now, and what holds it up or is wrong with it."""
+    if line.state != "training":
+        return headline(line)
+    text = [headline(line)]
+    if seen.problem:
+        text.append(f"Who waits for whom is not known: {seen.problem}.")
+    elif results is not None:
+        status = seen.status or Status("", ())
+        text.append(bottleneck(status.waiting, status.stages or results.stages))
+    if results is not None and (wrong := went_wrong(results.ledger)):
+        text.append(f"{wrong}.")
+    return " ".join(filter(None, text))
+
+
+def last_warning(log: Sequence[LoggedLine]) -> str:
+    """The newest warning; empty if there was none."""
+    warnings = [line for line in log if line.level != "info"]
+    if not warnings:
+        return ""
+    newest, count = warnings[-1], f"newest of {len(warnings)} warnings" if len(warnings) > 1 else "warning"
+    said = escape(escaped(newest.message).partition("\n")[0])
+    return f'<p class="warned"><a href="#history">{count.capitalize()}</a>, {clock_time(newest)}: {said}</p>'
+
+
+def facts(line: RunLine) -> str:
+    """The most important numbers."""
+    evaluation = line.summary.evaluation if line.summary else None
+    cells = {
+        "Return, last 100 episodes": "none yet" if line.return_mean is None else return_text(line.return_mean),
+        f"Env steps of {line.total_steps:,.0f}": f"{line.env_steps:,.0f}",
+        "Env steps per second": per_second(line.steps_per_s),
+        "Updates": f"{line.updates:,.0f}",
+        "Time of training": duration(line.wall_s),
+        "Started": line.started,
+    }
+    if evaluation is not None:
+        spread = f"{return_text(evaluation.return_mean)} ± {evaluation.return_std:,.1f}"
+        cells = {f"Final policy, {evaluation.episodes} greedy episodes": spread} | cells
+    items = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in cells.items())
+    return f'<section id="facts"><dl class="facts">{items}</dl></section>'
+
+
+def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
+    """The curve of one metric, and a form to choose another."""
+    names = dict.fromkeys(name for row in rows for name in row if name != ENV_STEPS_KEY)
+    if not names:
+        return section("Curves", "The first update has not been made yet.", "", "curve")
+    metric = choice.metric if choice.metric in names else RETURN_KEY
+    meaning = described(metric)[1]
+    x, y = _points(rows, metric, choice.over_time)
+    series = [Series("thin" if choice.smooth > 1 else "line", 0, x, y, "")] if x.size else []
+    if choice.smooth > 1 and x.size:
+        series.append(Series("line", 0, x, smoothed(y, choice.smooth), ""))
+    if metric == RETURN_KEY:
+        at, returns = _points(rows, EVALUATION_KEY, choice.over_time)
+        series += [Series("dots", 1, at, returns, "greedy evaluations")] if at.size else []
+    x_label = "minutes of training" if choice.over_time else "env steps"
+    what = f"{meaning.label} over {x_label}"
+    drawn = chart_for_all_widths(series, WIDE, x_label, what) if series else "<p>No value yet.</p>"
+    has_dots = any(each.kind == "dots" for each in series)
+    legend = f'<ul class="legend"><li>{DOT_KEY}greedy evaluations</li></ul>' if has_dots else ""
+    about = meaning.text + f" Unit: {meaning.unit}." * (meaning.unit != NONE)
+    form = _form(names, metric, choice)
+    figure = f'<div class="panels"><figure>{legend}{drawn}</figure></div>'
+    return section(meaning.label.capitalize(), about, form + figure, "curve")
+
+
+def smoothed(y: Doubles, rows: int) -> Doubles:
+    """The mean of each value and of those before it, of so many rows at most."""
+    sums = np.concatenate([[0.0], np.cumsum(y / rows)])
+    ends = np.arange(1, len(y) + 1)
+    begins = np.maximum(0, ends - rows)
+    return np.asarray((sums[ends] - sums[begins]) * (rows / (ends - begins)))
+
+
+def _points(rows: Sequence[Mapping[str, Any]], metric: str, over_time: bool) -> tuple[Doubles, Doubles]:
+    x, y = points(rows, metric, over_time=over_time).T
+    return x / (60.0 if over_time else 1.0), y
+
+
+def _form(names: Mapping[str, None], metric: str, choice: Choice) -> str:
+    groups = dict.fromkeys(METRICS, "")
+    for name in sorted(names, key=label):
+        groups[described(name)[0]] += _option(name, label(name), metric)
+    options = "".join(f'<optgroup label="{escape(title)}">{inner}</optgroup>' for title, inner in groups.items() if inner)
+
+    def choose(name: str, chosen: str, values: Mapping[str, str]) -> str:
+        return f'<select name="{name}">{"".join(_option(value, text, chosen) for value, text in values.items())}</select>'
+
+    over = choose("over", "time" if choice.over_time else "steps", {"steps": "env steps", "time": "time of training"})
+    kinds = {"1": "not smoothed", "10": "10 rows", "30": "30 rows", "100": "100 rows"}
+    smooth = choose("smooth", str(choice.smooth), kinds)
+    return (
+        f'<form class="choose" method="get"><label>Show <select name="metric">{options}</select></label>'
+        f"<label>over {over}</label><label>mean over {smooth}</label><button>Show</button></form>"
+    )
+
+
+def _option(value: str, text: str, chosen: str) -> str:
+    return f'<option value="{escape(value)}"{" selected" * (value == chosen)}>{escape(text)}</option>'
+
+
+def workers(seen: Seen) -> str:
+    """The workers by machine."""
+    if seen.status is None:
+        return ""
+    hosts: dict[str, list[WorkerStatus]] = {}
+    for worker in seen.status.workers:
+        hosts.setdefault(worker.host, []).append(worker)
+    heads = "".join(f'<th scope="col" class="{css}">{name}</th>' for name, css in COLUMNS.items())
+    bodies = []
+    for host, members in hosts.items():
+        speed = sum(worker.steps_per_s for worker in members)
+        count = f"{len(members)} worker{'s' * (len(members) > 1)}"
+        title = f"<b>{escape(host)}</b><span>{count}, {per_second(speed)} env steps per second</span>"
+        rows = "".join(_worker(worker, seen.status) for worker in members)
+        bodies.append(
+            f'<tbody><tr class="line"><th scope="rowgroup" colspan="{len(COLUMNS)}">{title}</th></tr>{rows}</tbody>'
+        )
+    here, wanted = len(seen.status.workers) + seen.status.workers_left_out, seen.status.workers_wanted
+    about = f"{here} here; {wanted} can have a lane each." if wanted else f"{here} here."
+    table = f'<table class="runs workers"><thead><tr>{heads}</tr></thead>{"".join(bodies)}</table>'
+    return section("Workers", about, f'<div class="scroll">{table}</div>', "workers")
+
+
+def _worker(worker: WorkerStatus, status: Status) -> str:
+    behind = status.version - worker.version
+    strikes = f' <span class="bad">{worker.strikes} bad messages</span>' if worker.strikes else ""
+    name = f'<th scope="row">{escape(worker.worker)}{strikes}</th>'
+    slow = worker.doing_s >= 10 and worker.doing != "waiting"
+    doing = f"<td{' class=bad' * slow}>{escape(in_words(worker.doing, worker.doing_s))}</td>"
+    lanes = ", ".join(map(str, worker.lanes)) if worker.state == "active" else worker.state
+    weights = "none yet" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind"
+    numbers = (
+        per_second(worker.steps_per_s),
+        f"{worker.silent_s:.0f} s ago",
+        f"{worker.resident_bytes / MIB:,.0f} MB" if worker.resident_bytes else "–",
+    )
+    speed, heard, memory = (f'<td class="number">{text}</td>' for text in numbers)
+    name += f'<td class="late">{worker.pid}</td>'
+    return f"<tr>{name}{doing}<td>{escape(lanes)}</td>{speed}<td>{weights}</td>{heard}{memory}</tr>"
+
+
+def who_waits(seen: Seen) -> str:
+    """A row for the learner and for each lane: what each did in the last minutes."""
+    if not seen.samples:
+        return ""
+    end_s = seen.samples[-1].at_s
+    samples = [each for each in seen.samples if end_s - each.at_s <= SHOWN_S]
+    lanes = sorted({lane for each in samples for lane in each.lanes})
+    rows = {"learner": _segments(samples, [each.learner for each in samples])}
+    rows |= {f"lane {lane}": _segments(samples, [each.lanes.get(lane, "") for each in samples]) for lane in lanes}
+    kinds = [kind for kind in COLORS if any(kind in (each.learner, *each.lanes.values()) for each in samples)]
+    legend = "".join(f'<li><i class="{COLORS[kind]}"></i>{kind}</li>' for kind in kinds)
+    bars = "".join(f'<span class="who">{name}</span>{bar(segments)}<span></span>' for name, segments in rows.items())
+    about = "Looked at twice a second since you opened this page, for the last three minutes at most. Now is at the right."
+    content = f'<div class="stages lanes"><ul class="legend">{legend}</ul><div class="rows">{bars}</div></div>'
+    return section("Who waits for whom", about, content, "lanes")
+
+
+def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
+    """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
+    end_s, found = samples[-1].at_s + 1.0, list[Segment]()
+    span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)
+    for i, (at_s, kind) in enumerate(zip((each.at_s for each in samples), kinds, strict=True)):
+        until_s = min(samples[i + 1].at_s if i + 1 < len(samples) else end_s, at_s + 2.0)
+        begin, share = 1 - (end_s - at_s) / span_s, (until_s - at_s) / span_s
+        if kind not in COLORS:
+            continue
+        if found and found[-1].tooltip == kind and math.isclose(found[-1].begin + found[-1].share, begin, abs_tol=1e-6):
+            found[-1] = found[-1]._replace(share=found[-1].share + share)
+        else:
+            found.append(Segment(begin, share, COLORS[kind], kind))
+    return found
+
+
+def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> str:
+    """The newest evaluations, and which was the best of all.
+
+    `kept`: that of a run that has ended, as its results have it. It may be of the final policy, which has no row here.
+    """
+    returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
+    if not len(returns):
+        return ""
+    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # of equally good ones the newest, as the run keeps it
+    at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
+    length_at = dict(lengths.tolist())
+    which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"
+    about = f"{which} was at {at:,.0f} env steps, with a mean return of {return_text(highest)}."
+    lines = [
+        f'<tr><th scope="row" class="number">{steps:,.0f}</th><td class="number">{return_text(value)}</td>'
+        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td><td>{"the best" if steps == at else ""}</td></tr>'
+        for steps, value in returns
+    ]
+    heads = "".join(f'<th scope="col" class="number">{name}</th>' for name in ("Env steps", "Return", "Episode length"))
+    table = f"<table><thead><tr>{heads}<th></th></tr></thead><tbody>{''.join(lines[: -MOST_LINES - 1 : -1])}</tbody></table>"
+    return section("Evaluations", about, f'<div class="scroll">{table}</div>', "evaluations")
+
+
+def logs(newest: Sequence[tuple[str, str]]) -> str:
+    """The last lines of the logs of local workers."""
+    blocks = "".join(f"<details><summary>{escape(name)}</summary>{_typed(text)}</details>" for name, text in newest)
+    return section("Logs of the workers", "The last lines of each.", f"<div>{blocks}</div>", "logs") if blocks else ""
+
+
+def join(line: RunLine) -> str:
+    """The command by which one more worker joins from another machine."""
+    if line.owner is None:
+        return ""
+    if not line.owner.address.startswith("tcp://"):
+        about = "Only its own machine reaches this learner. With --bind tcp://0.0.0.0:5555, workers of others can join."
+        return section("One more worker", about, "", "join")
+    token = " --token default.token" if line.owner.keys else " --insecure"
+    command = f"millrace worker {shlex.quote(line.owner.address)}{token}"
+    about = "Type this on another machine."
+    if line.owner.keys:
+        about += f" It needs a join token from {line.owner.keys} of {line.owner.host}."
+    return section("One more worker", about, f"<div>{_typed(command)}</div>", "join")
+
+
+def _typed(text: str) -> str:
+    return f'<pre class="log" tabindex="0">{escape(text)}</pre>'

@@ -1,0 +1,73 @@
+"""Serves the dashboard. As a program, it serves one for the program that started it, until that ends or closes its input.
+
+`python -m millrace.extras.monitoring.dashboard.serve RUNS ...` prints the address of the first page, or why there is none.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from millrace.extras.monitoring.dashboard.known_runs import KnownRuns
+from millrace.extras.monitoring.dashboard.live import Lookout
+from millrace.extras.monitoring.dashboard.server import DashboardServer
+from millrace.extras.monitoring.dashboard.site import Site
+from millrace.learner.interrupts import Interrupts, Stopped
+from millrace.protocol.errors import UserFacingError
+
+LOOK_FOR_SIGNALS_S = 0.1
+LINGER_S = 2.5  # so that pages which are open show the end
+
+
+def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:
+    """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`.
+
+    What trains on this machine goes first: the process is nicer than any other.
+    """
+    os.nice(19)
+    with Lookout() as lookout, Interrupts() as interrupts:
+        site = Site(KnownRuns(folders, time.time), lookout.look)
+        asyncio.run(_until_stopped(DashboardServer(site.answer).serve(host, port, listening), interrupts))
+    if interrupts.received:
+        raise Stopped
+
+
+async def _until_stopped(serving: Coroutine[None, None, None], interrupts: Interrupts) -> None:
+    """Serve until a signal has come. It is looked for: an exception in a handler would end whatever runs at that moment."""
+    task = asyncio.ensure_future(serving)
+    while not interrupts.received and not task.done():
+        await asyncio.wait([task], timeout=LOOK_FOR_SIGNALS_S)
+    if not task.done():
+        task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
+
+
+def _end_with_input() -> None:
+    sys.stdin.buffer.read()
+    time.sleep(LINGER_S)
+    os._exit(0)  # nothing of it is kept
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """Serve at a free port of this machine."""
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    try:
+        serve([Path(folder) for folder in sys.argv[1:]], "127.0.0.1", 0, _say)
+    except UserFacingError as error:
+        _say(str(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""A section of the page, as HTML text: what the runs warned of. Pure."""
+
+from __future__ import annotations
+
+from html import escape
+
+from millrace.extras.monitoring.report.html_parts import section
+from millrace.extras.monitoring.report.reported_runs import ReportData
+from millrace.learner.run_folder.json_log import LoggedLine
+from millrace.protocol.bounds import escaped
+
+MOST_HISTORY, AT_ONCE = 30, 8  # lines; those after the first are in a block that is closed at first
+
+
+def history(report: ReportData) -> str:
+    """What the runs warned of, the newest first."""
+    names = report.short_names() if len(report.runs) > 1 else [""]
+    lines = [(line, name) for name, (_, run) in zip(names, report.runs, strict=True) for line in reversed(run.log)]
+    lines.sort(key=lambda each: each[0].time, reverse=True)
+    items = [_logged(line, name) for line, name in lines[:MOST_HISTORY]]
+    about = "What the learner warned of or gave notice of, the newest first." if lines else "There was nothing to warn of."
+    if len(lines) > MOST_HISTORY:
+        about += f" {len(lines) - MOST_HISTORY} earlier lines are in log.jsonl of the run folder."
+    first, more = (f'<ol class="history">{"".join(part)}</ol>' * bool(part) for part in (items[:AT_ONCE], items[AT_ONCE:]))
+    folded = f"<details><summary>{len(items) - AT_ONCE} before these</summary>{more}</details>" * bool(more)
+    return section("What happened", about, first + folded, "history")
+
+
+def clock_time(line: LoggedLine) -> str:
+    """When it was said, by the clock here."""
+    return f"{line.time:%Y-%m-%d %H:%M:%S}"
+
+
+def _logged(line: LoggedLine, run: str) -> str:
+    text, _, more = escaped(line.message).partition("\n")
+    when = ", ".join(filter(None, (clock_time(line), run)))
+    said = f"<small>{escape(when)}</small> {escape(text)}"
+    if more:
+        said = f'<details><summary>{said}</summary><pre class="log" tabindex="0">{escape(more)}</pre></details>'
+    return f'<li class="{"notice" if line.level == "info" else "warning"}">{said}</li>'

@@ -1,0 +1,300 @@
+"""The data of the page: the runs, read from their folders, and the groups of runs.
+
+Rule: of a run that has not finished, the page shows what its metrics contain. Runs with other keyword arguments of the
+environment are runs of another environment. Runs form a group if they differ only in their seeds and in settings on which it
+does not depend what is learned from an env step. A run that an error or an interrupt ended is in its group, and in no mean.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from millrace.extras.monitoring.report.curve import Curve, points, read_run_files
+from millrace.learner.run_folder.json_log import LoggedLine, newest_lines
+from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
+from millrace.learner.run_folder.regular_files import regular_files
+from millrace.learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_lines import algorithm_label
+from millrace.protocol.arrays import Doubles
+from millrace.protocol.bounds import Natural, Real, Seconds
+from millrace.protocol.errors import UsageError
+
+MAY_DIFFER_IN_A_GROUP = frozenset({
+    # what a group is for
+    "seed",
+    # when training ends, and how often and how long it is evaluated; what is evaluated (eval_env_kwargs) may not differ
+    "steps", "target_return", "target_mean_return",
+    "eval_episodes", "eval_every", "eval_workers", "eval_copies", "eval_max_steps",
+    # who collects and computes, and where: the same rollouts and updates, but for rounding
+    "workers", "min_workers", "launched_workers", "max_env_copies", "inference", "device", "torch_threads",
+    "transport", "bind", "advertise", "keys", "insecure",
+    # what is done about failures
+    "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
+    # what is written, and where
+    "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind", "dashboard",
+})  # fmt: skip
+"""Settings on which it does not depend what is learned from an env step"""
+MOST_IMAGES = 16  # of one observation
+MOST_DIFFERENCES = 3  # settings that are listed after the name of a group, if no more are needed to tell groups apart
+ELSEWHERE = "started elsewhere"
+"""What is shown as the number of workers if the learner started none."""
+
+
+class RunResults(NamedTuple):
+    """The numbers of one run."""
+
+    env_steps: Natural
+    updates: Natural
+    wall_s: Seconds
+    env_steps_per_s: Real
+    return_mean_100: Real | None
+    """mean return of the last 100 training episodes"""
+    evaluation: Evaluation | None
+    stop_reason: str
+    """why the run stopped, or that it has not stopped"""
+    cut_short: bool
+    """whether an error or an interrupt ended it"""
+    ledger: dict[str, Natural]
+    stages: dict[str, Seconds]
+    facts: dict[str, FactMean] = {}
+    """of each name in `info_keys`: mean over the last training episodes"""
+
+
+@dataclass(frozen=True)
+class ReportedRun:
+    """One run."""
+
+    path: Path
+    env: str
+    algo: str
+    seed: int
+    settings: dict[str, str]
+    """All settings of config.toml, as text."""
+    algorithm_settings: frozenset[str]
+    """Names of the settings that belong to the algorithm."""
+    results: RunResults
+    curve: Curve | None
+    """None before the first episode has ended"""
+    evaluations: Doubles  # [K, 2] env steps and mean return of the evaluations during training
+    videos: tuple[Path, ...]
+    images: tuple[Path, ...]
+    """pictures of what the policy sees, one for each image of an observation"""
+    log: tuple[LoggedLine, ...] = ()
+    """its newest warnings and notices, the oldest first"""
+
+    @property
+    def of_group(self) -> dict[str, str]:
+        """The settings that all runs of its group share: `steps` too, if something falls or grows until they are done."""
+        schedules = [self.settings.get(name) for name in ("learning_rate_schedule", "clip_range_schedule")]
+        until_done = "linear" in schedules or self.settings.get("priority_alpha", "0") != "0" or ":" in self.algo
+        may_differ = MAY_DIFFER_IN_A_GROUP - {"steps"} if until_done else MAY_DIFFER_IN_A_GROUP
+        return {name: value for name, value in self.settings.items() if name not in may_differ}
+
+
+@dataclass(frozen=True)
+class RunGroup:
+    """Runs of one environment of which a mean makes sense. One color on the page."""
+
+    env: str
+    name: str
+    """Name of the algorithm, and a letter if the environment has several groups of that algorithm."""
+    differences: str
+    """Settings that distinguish this group from those groups; empty if there are none."""
+    color: int
+    """number of its color; groups of the same environment have different ones"""
+    runs: tuple[ReportedRun, ...]
+
+    @property
+    def curves(self) -> list[Curve]:
+        """The curves of the runs in which an episode has ended."""
+        return [run.curve for run in self.runs if run.curve is not None]
+
+    @property
+    def averaged(self) -> list[Curve]:
+        """The curves of which mean and band are drawn; empty if there is no mean. Runs that were cut short are left out."""
+        whole = [run.curve for run in self.runs if run.curve is not None and not run.results.cut_short]
+        return whole if len(whole) > 1 else []
+
+    @property
+    def label(self) -> str:
+        """Its name and its differences."""
+        return f"{self.name} ({self.differences})" if self.differences else self.name
+
+    def legend(self) -> str:
+        """Which runs a color of the learning curves stands for."""
+        label, curves = self.label, self.curves
+        if not curves:
+            return f"{label}: no episode has ended yet"
+        one_each = len({curve.seed for curve in curves}) == len(curves)
+        ended = [run.seed for run in self.runs if run.curve is not None and run.results.cut_short]
+        early = f"seed {', '.join(map(str, ended))} ended early" if one_each else f"{len(ended)} of them ended early"
+        if mean := self.averaged:
+            kind = "seeds" if one_each else "runs"
+            return f"{label}, mean of {len(mean)} {kind}" + (f"; {early}, not in the mean" if ended else "")
+        if len(curves) == 1:
+            return f"{label}, seed {curves[0].seed}" + (", ended early" if ended else "")
+        return f"{label}, {len(curves)} {'seeds' if one_each else 'runs'}" + (f"; {early}" if ended else "")
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All runs of the page, in groups."""
+
+    groups: tuple[RunGroup, ...]
+    """groups of the same environment follow each other"""
+
+    @property
+    def runs(self) -> list[tuple[RunGroup, ReportedRun]]:
+        """Every run with its group."""
+        return [(group, run) for group in self.groups for run in group.runs]
+
+    @property
+    def envs(self) -> list[str]:
+        """Every environment once."""
+        return list(dict.fromkeys(group.env for group in self.groups))
+
+    def short_names(self) -> list[str]:
+        """A unique name for each run. It contains the environment and the group only if there are several."""
+        groups_of_env = Counter(group.env for group in self.groups)
+        names = []
+        for group, run in self.runs:
+            parts = [group.env] if len(groups_of_env) > 1 else []
+            parts += [group.name] if groups_of_env[group.env] > 1 else []
+            names.append(", ".join([*parts, f"seed {run.seed}"]))
+        return [f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name for i, name in enumerate(names)]
+
+
+def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRun:
+    """Read a run folder. `rows`: of its metrics, if they are read already. Raises `UsageError`, with a one-line message."""
+    files = read_run_files(path, rows)
+    of_algorithm = files.config.get(files.algo)
+    return ReportedRun(
+        path=path,
+        env=files.env,
+        algo=files.algo,
+        seed=files.seed,
+        settings=_flatten(files.config, files.algo) | ({"workers": ELSEWHERE} if files.workers_elsewhere else {}),
+        algorithm_settings=frozenset(of_algorithm if isinstance(of_algorithm, dict) else ()),
+        results=_results(path, files.rows),
+        curve=files.curve(),
+        evaluations=points(files.rows, EVALUATION_KEY),
+        videos=tuple(regular_files(path, "videos/*.mp4")),
+        images=tuple(regular_files(path, "observation*.png")[:MOST_IMAGES]),
+        log=tuple(newest_lines(path)),
+    )
+
+
+def group_runs(runs: Sequence[ReportedRun]) -> ReportData:
+    """Put runs into groups. Environments stay in the order of their first run; the runs of a group are sorted by seed."""
+    groups = []
+    for env in dict.fromkeys(run.env for run in runs):
+        by_settings: dict[frozenset[tuple[str, str]], list[ReportedRun]] = {}
+        for run in runs:
+            if run.env == env:
+                by_settings.setdefault(frozenset(run.of_group.items()), []).append(run)
+        names: dict[Path, tuple[str, str]] = {}
+        for algo in dict.fromkeys(members[0].algo for members in by_settings.values()):
+            names |= _names([members[0] for members in by_settings.values() if members[0].algo == algo])
+        for color, members in enumerate(by_settings.values()):
+            name, differences = names[members[0].path]
+            groups.append(RunGroup(env, name, differences, color, tuple(sorted(members, key=lambda run: run.seed))))
+    return ReportData(tuple(groups))
+
+
+def differing_settings(settings: Sequence[Mapping[str, str]]) -> list[str]:
+    """Names of the settings that are not the same in all of these, in the order of the configuration."""
+    names = dict.fromkeys(name for each in settings for name in each)
+    return [name for name in names if len({each.get(name) for each in settings}) > 1]
+
+
+def _names(firsts: Sequence[ReportedRun]) -> Iterator[tuple[Path, tuple[str, str]]]:
+    """Name and differences of all groups of an algorithm, by the path of the first run of each."""
+    label = algorithm_label(firsts[0].algo)
+    if len(firsts) == 1:
+        yield firsts[0].path, (label, "")
+        return
+    differing = differing_settings([run.of_group for run in firsts])
+    differing.sort(key=lambda name: name not in firsts[0].algorithm_settings)  # these first, because they say most
+    needed = _distinguishing(firsts, differing)
+    names = [*needed, *(name for name in differing if name not in needed)]
+    shown = names[: max(len(needed), MOST_DIFFERENCES)]
+    for i, run in enumerate(firsts):
+        texts = [f"{name} {run.settings[name]}" if name in run.settings else f"no {name}" for name in shown]
+        texts += [f"{len(names) - len(shown)} more"] if len(names) > len(shown) else []
+        yield run.path, (f"{label} {_letters(i)}", ", ".join(texts))
+
+
+def _distinguishing(runs: Sequence[ReportedRun], names: Sequence[str]) -> list[str]:
+    """A few of these settings, the earliest that will do, whose values together differ between any two of the runs."""
+    chosen: list[str] = []
+
+    def kinds(more: str) -> int:
+        return len({tuple(run.settings.get(name) for name in (*chosen, more)) for run in runs})
+
+    while names and (not chosen or kinds(chosen[-1]) < len(runs)):
+        chosen.append(max(names, key=kinds))
+    return chosen
+
+
+def _letters(i: int) -> str:
+    """A to Z, then AA, AB and so on."""
+    return (_letters(i // 26 - 1) if i >= 26 else "") + chr(ord("A") + i % 26)
+
+
+def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
+    """The results from summary.json, or from the newest row of metrics if the run has not finished."""
+    summary = RunFolder(path).summary()
+    if summary is not None:
+        return RunResults(
+            summary.env_steps, summary.updates, summary.wall_s, summary.env_steps_per_s, summary.return_mean_100,
+            summary.evaluation, summary.stop_reason, summary.cut_short, summary.ledger, summary.stages, summary.facts_100,
+        )  # fmt: skip
+    last = rows[-1] if rows else {}
+    env_steps, wall_s = last.get(ENV_STEPS_KEY, 0), last.get("time/time_elapsed") or 0.0
+    results = RunResults(
+        env_steps=env_steps,
+        updates=last.get(UPDATES_KEY) or 0,
+        wall_s=wall_s,
+        env_steps_per_s=steps_per_second(env_steps, wall_s),
+        return_mean_100=last.get(RETURN_KEY),
+        evaluation=None,
+        stop_reason="not finished",
+        cut_short=False,
+        ledger={name.removeprefix("ledger/"): last[name] for name in last if name.startswith("ledger/")},
+        stages={name.removeprefix("stage/"): last[name] for name in last if name.startswith("stage/")},
+    )
+    try:
+        return msgspec.convert(tuple(results), RunResults)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"run {path}: the last row of {METRICS_FILE} is damaged: {error}; remove it") from error
+
+
+def _flatten(config: dict[str, Any], algo: str) -> dict[str, str]:
+    """All settings as text. Those of a table other than the algorithm's carry the name of the table, as env_kwargs.g."""
+    settings: dict[str, str] = {}
+    for name, value in config.items():
+        if isinstance(value, dict):
+            settings |= {key if name == algo else f"{name}.{key}": _text(inner) for key, inner in value.items()}
+        else:
+            settings[name] = _text(value)
+    return settings
+
+
+def _text(value: Any) -> str:
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case list():
+            return " ".join(map(_text, value)) or "none"
+        case float():
+            return f"{value:g}" if float(f"{value:g}") == value else repr(value)
+        case _:
+            return str(value)
