@@ -7,27 +7,47 @@ RUNS ?= 200
 # list of tests, and who has finished takes some of another's: so tests that wait run beside tests that compute.
 TEST_PROCESSES ?= $(shell expr $$(nproc) + 1)
 BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs site dist bench bench-peers test-learning packages test-cluster test-clients test-model test-processors \
-	test-versions test-kill soak clean
+.PHONY: train check test test-rest test-all lint type type-all pure unit unit-rest docs site dist bench bench-peers test-learning \
+	packages test-cluster test-clients test-model test-processors test-versions test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
 
-test: .venv/installed-dev  ## everything that CI runs: the types are checked while the tests begin
+check: .venv/installed-dev  ## ruff, the product's types, and the tests that start no process; one minute
+	@$(MAKE) --no-print-directory --jobs 2 lint type pure
+
+test: .venv/installed-dev  ## also one whole run for each fault, command and feature, and what is between; four minutes
 	@$(MAKE) --no-print-directory --jobs 2 lint type unit
+
+test-rest: .venv/installed-dev  ## what `make test` leaves out: variants, extras, every example of a property, the tests' types
+	@$(MAKE) --no-print-directory --jobs 2 type-all unit-rest
+
+test-all: .venv/installed-dev  ## both: all tests that need neither root nor more packages; twelve minutes
+	@$(MAKE) --no-print-directory test
+	@$(MAKE) --no-print-directory test-rest
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
 type: .venv/installed-dev
+	$(BIN)/mypy protocol workers learner millrace
+
+type-all: .venv/installed-dev
 	$(BIN)/mypy
 
+pure: .venv/installed-dev
+	$(PYTEST) --layer check
+
 unit: .venv/installed-dev
-	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
+	$(PYTEST) --layer test
+
+unit-rest: .venv/installed-dev
+	$(PYTEST) --layer rest
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning

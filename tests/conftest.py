@@ -29,19 +29,49 @@ from collections.abc import Generator, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import hypothesis
 import psutil
 import pytest
 
 from millrace.workers import copy_slots, slots
 from millrace.workers.slots import FILE_VARIABLE
 from millrace.workers.supervise import worker_process
+from tests.layers import SELECTED, layer_of, may_hold, short_name
+from tests.support.examples import ALL, FEW
 from tests.system.stage import preloaded
+from tests.whole_runs import WHOLE_RUNS
 
 worker_process.popen = preloaded.start_worker  # type: ignore[assignment]
 
 LEAVE_WITHIN_S = 5.0
 LONG_IN_CI = ("clients", "cluster", "model")
+STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn"}
 SOAK_TIMEOUT_S = 1200  # of a test of that mark: it takes minutes, and longer on a busy machine
+
+hypothesis.settings.register_profile("few", max_examples=FEW)
+hypothesis.settings.register_profile("all", max_examples=ALL)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--layer", choices=SELECTED, default="all", help="which part of the tests runs (tests/layers.py)")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    layer = config.getoption("layer")
+    hypothesis.settings.load_profile("few" if layer in ("check", "test") else "all")
+    if layer == "check":
+        sys.addaudithook(no_process)
+
+
+def no_process(event: str, arguments: tuple[object, ...]) -> None:
+    """What hears the interpreter's events in `make check`."""
+    if event in STARTS_A_PROCESS and "PYTEST_CURRENT_TEST" in os.environ:
+        raise AssertionError(f"{event}: expected a test that starts no process, or the mark `process`")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    path = collection_path.relative_to(config.rootpath).as_posix()
+    return True if path.endswith(".py") and not may_hold(path, config.getoption("layer")) else None
 
 
 @pytest.hookimpl(wrapper=True)
@@ -55,11 +85,35 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items[:] = spread(items)
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not any("::" in argument for argument in config.args):
+        every_whole_run_is_there({short_name(item.nodeid) for item in items})
+    layer = config.getoption("layer")
+    chosen: list[pytest.Item] = []
+    others: list[pytest.Item] = []
+    for item in items:
+        (chosen if is_in(item, layer) else others).append(item)
+    config.hook.pytest_deselected(items=others)
+    items[:] = spread(chosen)
     for item in items:
         if item.get_closest_marker("soak") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SOAK_TIMEOUT_S))
+
+
+def every_whole_run_is_there(names: set[str]) -> None:
+    """Of those whose function was collected. `tests/test_layers.py` looks for the others."""
+    functions = {name.partition("[")[0] for name in names}
+    gone = [run for run in WHOLE_RUNS - names if run.partition("[")[0] in functions]
+    if gone:
+        raise pytest.UsageError(f"tests/whole_runs.py names tests that are not there: {', '.join(sorted(gone))}")
+
+
+def is_in(item: pytest.Item, layer: str) -> bool:
+    """Whether a value of `--layer` selects a test."""
+    own = layer_of(item.nodeid, {mark.name for mark in item.iter_markers()})
+    has_more_examples = hypothesis.is_hypothesis_test(getattr(item, "obj", None))
+    return own in SELECTED[layer] or (layer == "rest" and has_more_examples)
 
 
 def spread(items: list[pytest.Item]) -> list[pytest.Item]:

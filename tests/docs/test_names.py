@@ -17,9 +17,9 @@ from website.pages import ROOT
 FLAGS_OF_OTHERS = {
     "--build", "--scale", "--constraint", "--editable", "--gpus", "--rm", "--network", "--no-deps", "--processes",
     "--without-pip", "--runs", "--minutes", "--rounds", "--peers", "--seconds", "--numprocesses", "--quick", "--account",
-    "--mem-per-cpu", "--gres", "--requeue", "--save",
+    "--mem-per-cpu", "--gres", "--requeue", "--save", "--layer",
 }  # fmt: skip
-"""Flags of pip, Docker, Slurm, the examples and the benchmarks that pages name"""
+"""Flags of pip, pytest, Docker, Slurm, the examples and the benchmarks that pages name"""
 NAMES_OF_OTHERS = "docs/how-to/moving_from"
 """Pages that set flags of other libraries beside ours"""
 OWN_METRICS = {"is_success", "distance", "is_success_missing", "success", "NAME"}

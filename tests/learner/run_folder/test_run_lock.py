@@ -99,6 +99,7 @@ def test_a_second_one_is_refused_and_named_and_a_released_lock_leaves_nothing(tm
     assert "run-lock" not in [thread.name for thread in threading.enumerate()]
 
 
+@pytest.mark.process
 def test_the_lock_of_a_process_that_was_killed_is_taken_over_and_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -123,6 +124,7 @@ def test_the_lock_of_a_process_that_was_killed_is_taken_over_and_said(
     assert "held its lock and is gone; this process takes over" in caplog.text
 
 
+@pytest.mark.process
 def test_a_lock_that_a_stranger_holds_is_not_said_to_be_that_of_a_process_that_is_gone(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", "pass"]) as other:
         other.wait()
@@ -317,6 +319,7 @@ def test_a_learner_of_this_machine_is_asked_at_its_own_address(tmp_path: Path) -
         learner_of_run(tmp_path)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("address", ["", "ipc:///tmp/x", "tcp://127.0.0.1:5555"])
 def test_a_process_that_is_gone_trains_nothing(tmp_path: Path, address: str) -> None:
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:

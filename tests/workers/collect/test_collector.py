@@ -362,6 +362,7 @@ def test_steps_are_counted_while_a_rollout_is_under_way(
     assert len(set(reported)) > 3 * run.rollout_steps  # more than one count in a row
 
 
+@pytest.mark.process
 def test_collecting_imports_no_torch_for_an_mlp() -> None:
     program = "import sys, millrace.workers.collect.collector; sys.exit('torch' in sys.modules or 'learner' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0
