@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.extras.envs.vector_copies import VectorCopies
@@ -18,6 +18,7 @@ from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import OpenEnvCopies
 from tests.support.envs.toy import Scripted
+from tests.support.examples import examples
 from tests.support.in_process.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
 
 SCRIPTED = run_of(f"{TOY}Scripted-v0")
@@ -59,7 +60,7 @@ class ExpectedRows:
 
 
 @pytest.mark.parametrize("over", [loop_over, sync_vector_env_over])
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(scripts=st.lists(st.text(".tub", min_size=1, max_size=6), min_size=1, max_size=4), T=st.integers(1, 7))
 def test_rows_and_episodes_are_those_of_the_script(over: Any, scripts: list[str], T: int) -> None:
     K, N = 3, len(scripts)

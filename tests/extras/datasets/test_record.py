@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.extras.datasets import minari as dataset_module
@@ -41,6 +41,7 @@ from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import PolicySpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
+from tests.support.examples import examples
 from tests.support.in_process.collectors import TOY, no_pulse, random_policy, run_of
 from tests.support.in_process.described import described
 from tests.support.in_process.saved_policies import load_policy, policy_run
@@ -117,7 +118,7 @@ def taken(action: Array) -> Array:
     return action + 100
 
 
-@settings(deadline=None)  # a busy machine takes longer for an example
+@examples(100)
 @given(rollouts())
 def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tuple[int, Rollout]]) -> None:
     assembler = EpisodeAssembler(taken)
@@ -152,7 +153,7 @@ def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tup
                 assert np.array_equal(np.concatenate([e.truncated for e in mine]), truncated[kept, n])
 
 
-@settings(deadline=None)
+@examples(100)
 @given(rollouts(), st.data())
 def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[int, Rollout]], data: st.DataObject) -> None:
     came = data.draw(st.lists(st.sampled_from(range(len(stream))), max_size=len(stream), unique=True))
@@ -171,7 +172,7 @@ def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[i
     assert sum(episode.length for episode in episodes) + assembler.waiting + assembler.left_out == steps
 
 
-@settings(deadline=None)
+@examples(100)
 @given(rollouts(), st.data())
 def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(
     stream: list[tuple[int, Rollout]], data: st.DataObject

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.extras.envs.envpool import envpool_spec
@@ -27,6 +27,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seeds
 from tests.support.envs.toy import Countdown
+from tests.support.examples import examples
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from tests.support.in_process.described import run_spec
 
@@ -97,7 +98,7 @@ def test_an_episode_that_fails_in_the_step_of_its_time_limit_is_terminated_too(l
 
 
 @here
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(N=st.integers(1, 5), limit=st.integers(1, 12), seed=st.integers(0, 2**31 - 6), T=st.integers(1, 40))
 def test_every_row_keeps_the_law_whatever_is_done(N: int, limit: int, seed: int, T: int) -> None:
     copies = cartpoles(N, limit)

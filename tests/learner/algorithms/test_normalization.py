@@ -10,7 +10,7 @@ import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.algorithms.normalization import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
@@ -19,6 +19,7 @@ from millrace.protocol.policy.layout import buffer_size
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.support.examples import examples
 
 GAMMA = 0.9
 
@@ -32,7 +33,7 @@ def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
 
 
 @given(hnp.arrays(np.float64, (20, 2), elements=st.floats(-1e3, 1e3)), st.lists(st.integers(0, 20), max_size=4))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_moments_do_not_depend_on_the_division_into_batches(rows: Array, cuts: list[int]) -> None:
     moments = RunningMoments((2,))
     for batch in np.split(rows, sorted(cuts)):

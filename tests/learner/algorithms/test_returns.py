@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.algorithms.returns import EpisodeEnds, discounted_return, gae
 from millrace.protocol.arrays import Array
+from tests.support.examples import examples
 from tests.support.numbers.rounding import UNIT, assert_within
 
 GAMMA, LAMBDA = 0.9, 0.8
@@ -95,7 +96,7 @@ def gae_tolerance(r: Rows, gamma: float, gae_lambda: float) -> Array:
 
 
 @given(rows(), st.floats(0, 1), st.floats(0, 1))
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_gae_is_the_papers_sum(r: Rows, gamma: float, gae_lambda: float) -> None:
     found = r.gae(gamma, gae_lambda)
     assert found.dtype == np.float32
@@ -103,7 +104,7 @@ def test_gae_is_the_papers_sum(r: Rows, gamma: float, gae_lambda: float) -> None
 
 
 @given(rows(), st.floats(0, 1))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_lambda_1_is_the_monte_carlo_return_less_the_value(r: Rows, gamma: float) -> None:
     T, N = r.reward.shape
     expected = np.zeros((T, N))
@@ -124,7 +125,7 @@ def test_lambda_1_is_the_monte_carlo_return_less_the_value(r: Rows, gamma: float
 
 
 @given(rows(), st.floats(0, 1))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_discounted_return_is_the_sum_of_past_rewards(r: Rows, gamma: float) -> None:
     T, N = r.reward.shape
     start = np.arange(1.0, N + 1)

@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.algorithms.returns import complete, vtrace
 from millrace.protocol.arrays import Array
 from tests.learner.algorithms.test_returns import GAMMA, Rows, lawful, rows, sum_tolerance
+from tests.support.examples import examples
 from tests.support.numbers.rounding import ELEMENTWISE, assert_within
 
 BARS = st.floats(0.1, 1.5)
@@ -95,7 +96,7 @@ def vtrace_tolerances(
 
 
 @given(off_policy(), st.floats(0, 1), st.sampled_from([0.0, 0.7, 1.0]), BARS, BARS)
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_vtrace_is_the_papers_sum(o: OffPolicy, gamma: float, lam: float, rho_bar: float, c_bar: float) -> None:
     found = o.vtrace(gamma, lam, rho_bar, c_bar)
     exact, allowed = (each(o, gamma, lam, rho_bar, c_bar) for each in (slow_vtrace, vtrace_tolerances))
@@ -105,7 +106,7 @@ def test_vtrace_is_the_papers_sum(o: OffPolicy, gamma: float, lam: float, rho_ba
 
 
 @given(rows(), st.floats(0, 1))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_on_policy_the_targets_are_the_return(r: Rows, gamma: float) -> None:
     """ρ = c = 1: the λ-return with λ = 1, which is all the reward to come, and a value where the sum is cut."""
     T = len(r.reward)
@@ -124,7 +125,7 @@ def test_on_policy_the_targets_are_the_return(r: Rows, gamma: float) -> None:
 
 
 @given(rows(), st.floats(0, 1), st.floats(0, 1))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_on_policy_advantages_are_those_of_gae_for_any_lambda(r: Rows, gamma: float, lam: float) -> None:
     target, advantage = on_policy(r).vtrace(gamma, lam)
     of_target, of_advantage = vtrace_tolerances(on_policy(r), gamma, lam)
@@ -144,7 +145,7 @@ BOTH = pytest.mark.parametrize("estimate", [gae_of, OffPolicy.vtrace])
 
 @BOTH
 @given(o=off_policy())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_a_batch_with_boundaries_is_its_episodes_put_together(estimate: Estimate, o: OffPolicy) -> None:
     r = o.rows
     T, N = r.reward.shape
@@ -163,7 +164,7 @@ def test_a_batch_with_boundaries_is_its_episodes_put_together(estimate: Estimate
 
 @BOTH
 @given(o=off_policy(), rubbish=st.sampled_from([0.0, 1e30, np.nan]))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_a_row_that_is_not_valid_changes_nothing(estimate: Estimate, o: OffPolicy, rubbish: float) -> None:
     r = o.rows
     reward, values, log_ratio = r.reward.copy(), r.values.copy(), o.log_ratio.copy()
@@ -236,7 +237,7 @@ def test_ratios_beyond_all_floats_do_no_harm(log_ratio: float) -> None:
 
 
 @given(rows())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_complete_rows_are_those_whose_episode_ends_in_the_rollout(r: Rows) -> None:
     ended = r.terminated | r.truncated
     found = complete(r.ends)

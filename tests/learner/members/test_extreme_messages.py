@@ -16,7 +16,7 @@ from typing import cast
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.cli.status import as_table
@@ -54,6 +54,7 @@ from tests.support.conversation.extreme_messages import MARK, SESSION, extremes,
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.conversation.hostile_messages import hostile, real
+from tests.support.examples import examples
 from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 HOSTILE = "spare"
@@ -299,7 +300,7 @@ FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
 ]
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     st.lists(
         st.tuples(

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.rollouts.opponent_pool import FIRST_RATING, OpponentPool, PoolSettings, PoolState, Snapshot
 from millrace.protocol.rollout import Episode
+from tests.support.examples import examples
 
 DRAWS = 2_000
 CONFIDENCE = 4.5  # standard deviations; a fair draw is farther off once in 150,000 cases
@@ -83,7 +84,7 @@ def test_evaluations_are_played_against_the_programs_or_else_against_the_first_s
 # ------------------------------------------------------------------------------------------------------------- matches
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(
     window=st.integers(1, 4),
     max_lag=st.integers(0, 4),
@@ -188,7 +189,7 @@ def ratings(pool: OpponentPool) -> list[float]:
     return [pool.state.rating, *(each.rating for each in pool.state.snapshots), *pool.state.scripted]
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(results=RESULTS, cut=st.integers(0, 60))
 def test_ratings_add_up_to_the_same_and_do_not_depend_on_which_update_used_the_episodes(
     results: list[tuple[int, float]], cut: int
@@ -222,7 +223,7 @@ def test_episodes_without_an_opponent_of_the_pool_change_no_rating() -> None:
 # --------------------------------------------------------------------------------------------------------------- state
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(results=RESULTS, later=RESULTS)
 def test_a_run_that_goes_on_has_the_same_opponents_and_ratings(
     results: list[tuple[int, float]], later: list[tuple[int, float]]

@@ -26,6 +26,7 @@ from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UsageError, W
 from millrace.protocol.messages import LaneIncarnation, Reset, Step
 from millrace.protocol.wire.plain_values import unpack
 from millrace.protocol.wire.wake_up import WakeReason
+from tests.support.examples import examples
 from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
 from tests.support.numbers.bit_equality import bit_equal
@@ -102,7 +103,7 @@ def rows_apart(env: ZmqVectorEnv, actions: Sequence[Any], draw: Any) -> list[lis
     return found
 
 
-@settings(max_examples=40, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink))
+@settings(examples(40), phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink))
 @given(
     st.sampled_from(list(AutoresetMode)), st.booleans(), st.sampled_from([(3, 3), (3, 1), (2, 2)]), st.integers(2, 12),
     st.data(),

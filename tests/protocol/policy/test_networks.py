@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -24,6 +24,7 @@ from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.support.examples import examples
 from tests.support.numbers.rounding import in_double, in_float64, sampled
 
 BOX = Leaf("x", "box", (2, 3), "float32")
@@ -81,7 +82,7 @@ def random_weights(spec: PolicySpec, net: ActorCriticNetwork, generator: np.rand
     st.booleans(),
     st.integers(0, 2**32),
 )
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_numpy_and_torch_agree(
     observation: str, action: str, activation: Any, net: list[int], normal: bool, seed: int
 ) -> None:

@@ -15,7 +15,7 @@ import msgpack
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -39,6 +39,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
 from millrace.protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
+from tests.support.examples import examples
 
 KINDS = [*typing.get_args(ToLearner), *typing.get_args(ToWorker)]
 BY_NAME = (Hello, Refuse)
@@ -110,7 +111,7 @@ def plainly(message: Any) -> object:
     return msgspec.to_builtins(message, enc_hook=spelled)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(messages)
 def test_every_message_comes_back_as_it_went(message: Any) -> None:
     back = decode(sent(message), type(message))
@@ -152,6 +153,7 @@ for _ in range(20):
 """
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="starts copies of a process that has decoded nothing yet")
 def test_threads_may_decode_their_first_welcome_at_the_same_moment() -> None:
     (frame,) = sent(Welcome(session=1, attempt=1, run=run_spec()))
@@ -163,7 +165,7 @@ def test_threads_may_decode_their_first_welcome_at_the_same_moment() -> None:
 # ------------------------------------------------------------------------------------------------ the head's form
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(messages)
 def test_what_goes_by_position_does_not_go_by_name_nor_the_other_way_about(message: Any) -> None:
     first, *rest = sent(message)
@@ -180,7 +182,7 @@ def test_what_goes_by_position_does_not_go_by_name_nor_the_other_way_about(messa
         decode(head({name: by_name[name] for name in message.__struct_encode_fields__}, *rest), type(message))
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.one_of([values(kind) for kind in KINDS if kind not in BY_NAME]), st.data())
 def test_a_head_of_another_length_is_refused(message: Any, data: st.DataObject) -> None:
     first, *rest = sent(message)
@@ -298,7 +300,7 @@ def arrays_in(message: object) -> list[np.ndarray[Any, Any]]:
     return [each for each in found if not isinstance(each, PickledCallable)]
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(messages, st.data())
 def test_damaged_messages(message: Any, data: st.DataObject) -> None:
     frames = sent(message)
@@ -312,7 +314,7 @@ def test_damaged_messages(message: Any, data: st.DataObject) -> None:
     survives([*frames[:which], frame, *frames[which + 1 :]])
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.lists(st.binary(max_size=50), max_size=4))
 def test_random_bytes(frames: Frames) -> None:
     survives(frames)
@@ -325,7 +327,7 @@ Json = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(messages, st.data(), Json)
 def test_a_field_of_another_kind(message: Any, data: st.DataObject, nonsense: Any) -> None:
     frames = sent(message)

@@ -15,7 +15,7 @@ import pytest
 import zstandard
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.protocol.arrays import Bytes
@@ -26,6 +26,7 @@ from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, Ru
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from millrace.protocol.wire.compression import Packing, has_zstd, pack_stack, unpack_array, unpack_stack
 from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from tests.support.examples import examples
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around, run_of
 
 U1 = np.dtype(np.uint8)
@@ -42,7 +43,7 @@ def frame_stacks(steps: int, copies: int, k: int, frame: tuple[int, ...], resets
     return obs
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(
     st.integers(1, 40),
     st.integers(1, 5),
@@ -434,7 +435,7 @@ def test_a_learner_that_cannot_decompress_says_so(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("zstd", [False, True])
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(st.data())
 def test_damaged_packed_rollouts(zstd: bool, data: st.DataObject) -> None:
     """Each is taken for a rollout, of what its bits say, or refused; nothing else is raised."""

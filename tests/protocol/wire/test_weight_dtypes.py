@@ -7,12 +7,13 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import RunError
 from millrace.protocol.wire.weight_dtypes import BOUND, ActingDtype, to_float32, to_wire_dtype
+from tests.support.examples import examples
 
 
 def of_bits(bits: Any) -> Floats:
@@ -42,7 +43,7 @@ def test_rounding_is_torchs_to_the_bit() -> None:
     assert same_bits(to_float32(travelling), as_torch_rounds(parameters))
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False)))
 def test_what_was_rounded_once_is_rounded(values: list[float]) -> None:
     parameters = fitting(np.array(values, np.float32))

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -22,6 +22,7 @@ from millrace.protocol.policy import networks
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from millrace.protocol.specs import ActionSpec, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
+from tests.support.examples import examples
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN, IMAGE, recurrent, shared
 from tests.support.numbers.finite_differences import is_the_slope
 from tests.support.numbers.rounding import assert_within, flat_gradient, in_double, in_float64, sampled
@@ -129,7 +130,7 @@ def is_the_same_in_chunks(spec: PolicySpec, rows: int, seed: int, chunk: int, by
     st.integers(1, 40),
     *ROUNDS.values(),
 )
-@settings(max_examples=120, deadline=None)
+@examples(120)
 def test_an_actor_and_a_critic(
     action: str, activation: Any, net: list[int], shared_net: bool, rows: int, chunk: int, by_torch: bool, seed: int
 ) -> None:
@@ -145,7 +146,7 @@ def test_an_actor_and_a_critic(
     st.integers(1, 40),
     *ROUNDS.values(),
 )
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_action_values(
     activation: Any, net: list[int], dueling: bool, rows: int, chunk: int, by_torch: bool, seed: int
 ) -> None:
@@ -235,7 +236,7 @@ def everything_of(net: ActorAndCritics, seed: int, rows: int) -> list[Tensor]:
     st.integers(1, 1100),
     st.integers(0, 999),
 )
-@settings(max_examples=30, deadline=None)
+@examples(30)
 def test_an_actor_and_two_critics(net: list[int], activation: Any, head: Any, rows: int, seed: int) -> None:
     """Weights are large, so that the logarithms of many standard deviations leave their bounds."""
     spec = PolicySpec((BOX,), BOUNDED, tuple(net), activation, head=head)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.algorithms.replay import replay_buffer as module
@@ -23,6 +23,7 @@ from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.protocol.errors import UsageError
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import Leaf
+from tests.support.examples import examples
 
 OBS = (Leaf("", "box", (1,), "float64"),)
 GAMMA = 0.9
@@ -170,7 +171,7 @@ def check(sample: Sample, lanes: Lanes, n_step: int) -> set[float]:
     return set(began)
 
 
-@settings(deadline=None, max_examples=80)
+@examples(80)
 @given(
     seed=st.integers(0, 2**32),
     T=st.integers(1, 6),
@@ -203,7 +204,7 @@ def test_n_steps_are_the_slow_sum(
         assert check(kept.sample(count), lanes, n_step) == set(lanes.rows)
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(
     seed=st.integers(0, 2**32),
     n_step=st.integers(1, 5),
@@ -370,7 +371,7 @@ def test_uniform_draws_are_uniform() -> None:
     assert (drawn.weight == 1).all()
 
 
-@settings(deadline=None)
+@examples(100)
 @given(data=st.data(), size=st.integers(1, 40))
 def test_a_sum_tree_is_the_sum_of_its_leaves_and_finds_each_by_its_weight(data: st.DataObject, size: int) -> None:
     tree, expected = SumTree(size), np.zeros(max(size, 2))
