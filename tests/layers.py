@@ -3,8 +3,8 @@
 Rule: a test is in the first of these layers that holds it.
 
 * `test`: a whole run that is named in `tests/whole_runs.py`.
-* `rest`: other tests with real processes, tests of an extra, and tests that are marked `rest` because another test holds
-  their fact in the default run, for another case.
+* `rest`: other tests with real processes, tests of an extra or of the benchmarks, and tests that are marked `rest` because
+  another test holds their fact in the default run, for another case.
 * `check`: files that start no process (`NO_PROCESS`), but for a test that is marked `process` because it starts one.
 * `test`: everything else.
 
@@ -60,6 +60,8 @@ EXTRAS = {
 """Tests of extras that are not yet in the folder of their extra."""
 OF_EXTRAS = ("tests/extras/", *chain(*EXTRAS.values()))
 REAL_PROCESSES = "tests/system/"
+OF_TOOLS = "tests/benchmarks/"
+"""Tests of what users do not install."""
 NO_PROCESS = (
     "tests/learner/algorithms/replay/",
     "tests/learner/algorithms/test_a2c.py",
@@ -104,7 +106,7 @@ def may_hold(path: str, selected: str) -> bool:
             return path.startswith(NO_PROCESS)
         case "test":
             holds_whole_run = any(run.startswith(f"{path.rpartition('/')[2]}::") for run in WHOLE_RUNS)
-            return holds_whole_run or not path.startswith((REAL_PROCESSES, *OF_EXTRAS))
+            return holds_whole_run or not path.startswith((REAL_PROCESSES, OF_TOOLS, *OF_EXTRAS))
         case _:
             return True
 
@@ -120,6 +122,6 @@ def layer_of(nodeid: str, marks: Collection[str]) -> Layer:
     if short_name(nodeid) in WHOLE_RUNS:
         return Layer.TEST
     path = nodeid.partition("::")[0]
-    if "rest" in marks or path.startswith((REAL_PROCESSES, *OF_EXTRAS)):
+    if "rest" in marks or path.startswith((REAL_PROCESSES, OF_TOOLS, *OF_EXTRAS)):
         return Layer.REST
     return Layer.CHECK if path.startswith(NO_PROCESS) and "process" not in marks else Layer.TEST

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from examples.ppo_vector_env import Settings, advantages, evaluate, train
@@ -17,6 +18,7 @@ def test_advantages_bootstrap_at_truncation_and_not_at_termination() -> None:
     assert result[0].tolist() == [-4 + 0.25 * -9, -4 + 0.25 * -4]
 
 
+@pytest.mark.rest
 def test_it_learns_a_little_in_a_short_run() -> None:
     settings = Settings(env_steps=10_240, minibatch=64, epochs=5)
     agent, recent = train(settings, quiet=True)

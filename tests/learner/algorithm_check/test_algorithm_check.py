@@ -32,6 +32,7 @@ from millrace.learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import MillraceError, RunError
 from millrace.testing import AlgorithmMistakes, check_algorithm
+from tests.support.variants import variants
 
 Pulse = Callable[[], None]
 Metrics = dict[str, float]
@@ -307,7 +308,7 @@ LEARNS_SOON: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", variants(ALGORITHMS, default=["ppo", "dqn"]))
 def test_the_algorithms_of_ours_pass(name: str) -> None:
     """With one kind of policy. All others: `test_every_algorithm`."""
     check_algorithm(algorithm_class(name), net=(16,), **LEARNS_SOON[name])

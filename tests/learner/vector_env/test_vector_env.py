@@ -27,6 +27,7 @@ from millrace.protocol.wire.worker_link import WorkerLink
 from tests.support.gymnasium_versions import TAXI, needs_listed_episodes
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
 from tests.support.numbers.bit_equality import bit_equal
+from tests.support.variants import variants
 
 MODES = tuple(AutoresetMode)
 TRANSPORTS: dict[str, dict[str, Any]] = {
@@ -76,14 +77,14 @@ def play(ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], steps: int, mode: 
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@pytest.mark.parametrize("env", CASES)
+@pytest.mark.parametrize("env", variants(CASES, default=["millrace.workers.envs.toy:Informs-v0"]))
 def test_results_through_shared_memory_equal_those_of_sync_vector_env(env: str, mode: AutoresetMode) -> None:
     with both(env, 5, mode, "shared", **CASES[env]) as (ours, theirs):
         play(ours, theirs, 500 if env == "CartPole-v1" else 200, mode)
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@pytest.mark.parametrize("transport", ["ipc", pytest.param("tcp", marks=pytest.mark.soak), "inproc"])
+@pytest.mark.parametrize("transport", variants(["ipc", "tcp", "inproc"], default=["inproc"]))
 def test_results_by_messages_equal_those_of_sync_vector_env(transport: str, mode: AutoresetMode) -> None:
     with both("tests.support.envs.toy:Informs-v0", 5, mode, transport) as (ours, theirs):
         play(ours, theirs, 150, mode)

@@ -14,6 +14,7 @@ from gymnasium.wrappers import vector as wrappers
 import millrace
 from tests.support.gymnasium_versions import needs_listed_episodes
 from tests.support.numbers.bit_equality import bit_equal
+from tests.support.variants import variants
 
 Env = VectorEnv[Any, Any, Any]
 
@@ -46,8 +47,15 @@ WRAPPERS: dict[str, tuple[str, Callable[[Env], Env]]] = {
 }
 
 
+IN_MAKE_TEST = ("RecordEpisodeStatistics", "DictInfoToList", "RescaleAction")  # of episodes, of infos, of actions
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=needs_listed_episodes if name == "DictInfoToList" else ()) for name in WRAPPERS]
+    "name",
+    [
+        pytest.param(name, marks=needs_listed_episodes) if name == "DictInfoToList" else name
+        for name in variants(WRAPPERS, default=IN_MAKE_TEST)
+    ],
 )
 def test_a_wrapper_gives_the_same_results(name: str) -> None:
     env_id, wrap = WRAPPERS[name]

@@ -26,6 +26,7 @@ from tests.support.examples import examples
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN, IMAGE, recurrent, shared
 from tests.support.numbers.finite_differences import is_the_slope
 from tests.support.numbers.rounding import assert_within, flat_gradient, in_double, in_float64, sampled
+from tests.support.variants import variants
 
 BOUNDED = ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2)
 RELATIVE = 1e-7  # float64 has 1e-16; a few thousand additions, gradients that cancel, and 1 − tanh² near 0
@@ -190,7 +191,7 @@ def test_the_tolerance_of_values_is_exceeded_if_a_single_term_is_lost() -> None:
 
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("action", sorted(ACTIONS))
-@pytest.mark.parametrize("shared_net", [False, True])
+@pytest.mark.parametrize("shared_net", variants([False, True], default=[True]))
 @pytest.mark.parametrize(("activation", "chunk", "by_torch"), [("tanh", 512, False), ("relu", 4, True)])
 def test_the_gradient_of_an_actor_and_a_critic_is_the_slope(
     action: str, activation: Any, shared_net: bool, chunk: int, by_torch: bool, monkeypatch: pytest.MonkeyPatch
