@@ -35,7 +35,7 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 
 type: .venv/installed-dev
-	$(BIN)/mypy protocol workers learner millrace
+	$(BIN)/mypy millrace
 
 type-all: .venv/installed-dev
 	$(BIN)/mypy

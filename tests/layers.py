@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from enum import StrEnum
-from itertools import chain
 
 from tests.whole_runs import WHOLE_RUNS
 
@@ -37,28 +36,7 @@ SELECTED: dict[str, frozenset[Layer]] = {
 }
 """What each value of `--layer` runs."""
 
-EXTRAS = {
-    "conformance": ("tests/millrace/conformance/",),
-    "launchers": ("tests/millrace/launch/test_launch.py", "tests/millrace/launch/test_docker.py"),
-    "monitoring": (
-        "tests/learner/report/",
-        "tests/learner/run_folder/test_added_numbers.py",
-        "tests/learner/test_prometheus.py",
-        "tests/millrace/dashboard/",
-        "tests/millrace/integrations/",
-    ),
-    "datasets": (
-        "tests/learner/recording/",
-        "tests/learner/algorithms/cloning/",
-        "tests/learner/algorithms/replay/test_mixed_replay.py",
-    ),
-    "envs": (
-        "tests/workers/envs/",
-        "tests/protocol/envs/test_stepped_at_once.py",
-    ),
-}
-"""Tests of extras that are not yet in the folder of their extra."""
-OF_EXTRAS = ("tests/extras/", *chain(*EXTRAS.values()))
+OF_EXTRAS = "tests/extras/"
 REAL_PROCESSES = "tests/system/"
 OF_TOOLS = "tests/benchmarks/"
 """Tests of what users do not install."""
@@ -106,7 +84,7 @@ def may_hold(path: str, selected: str) -> bool:
             return path.startswith(NO_PROCESS)
         case "test":
             holds_whole_run = any(run.startswith(f"{path.rpartition('/')[2]}::") for run in WHOLE_RUNS)
-            return holds_whole_run or not path.startswith((REAL_PROCESSES, OF_TOOLS, *OF_EXTRAS))
+            return holds_whole_run or not path.startswith((REAL_PROCESSES, OF_TOOLS, OF_EXTRAS))
         case _:
             return True
 
@@ -122,6 +100,6 @@ def layer_of(nodeid: str, marks: Collection[str]) -> Layer:
     if short_name(nodeid) in WHOLE_RUNS:
         return Layer.TEST
     path = nodeid.partition("::")[0]
-    if "rest" in marks or path.startswith((REAL_PROCESSES, OF_TOOLS, *OF_EXTRAS)):
+    if "rest" in marks or path.startswith((REAL_PROCESSES, OF_TOOLS, OF_EXTRAS)):
         return Layer.REST
     return Layer.CHECK if path.startswith(NO_PROCESS) and "process" not in marks else Layer.TEST

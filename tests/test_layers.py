@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.layers import EXTRAS, NO_PROCESS, SELECTED, Layer, layer_of
+from tests.layers import NO_PROCESS, OF_EXTRAS, OF_TOOLS, REAL_PROCESSES, SELECTED, Layer, layer_of
 from tests.whole_runs import COMMANDS, FAULTS, FEATURES, WHOLE_RUNS
 
 ROOT = Path(__file__).parents[1]
@@ -25,7 +25,7 @@ def test_a_whole_run_is_named_once_and_is_the_only_test_of_its_name() -> None:
         assert len(found) == 1, (run, found)
 
 
-@pytest.mark.parametrize("place", [*NO_PROCESS, *(place for places in EXTRAS.values() for place in places)])
+@pytest.mark.parametrize("place", [*NO_PROCESS, OF_EXTRAS, OF_TOOLS, REAL_PROCESSES])
 def test_the_folders_of_the_rule_exist(place: str) -> None:
     assert (ROOT / place).exists()
 
