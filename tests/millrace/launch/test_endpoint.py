@@ -35,7 +35,7 @@ def test_a_worker_process_waits_for_its_learner_as_long_as_that_does_not_listen(
         endpoint = open_endpoint(BindSettings(), "ipc", stack)
         stack.enter_context(endpoint.workers(2, no_flags, evaluating=1))
     for command, evaluates in zip(commands, (False, True), strict=True):
-        flags = parse_flags(WorkerFlags, command[command.index("workers") + 1 :], "worker")
+        flags = parse_flags(WorkerFlags, command[command.index("millrace.workers") + 1 :], "worker")
         assert wait_limits_s(flags.join_timeout_s, stay=flags.stay) == (math.inf, math.inf)
         assert flags.evaluate == evaluates
 

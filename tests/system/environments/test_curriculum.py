@@ -175,7 +175,7 @@ def test_copies_that_replace_lost_ones_get_the_attributes(tmp_path: Path) -> Non
         def on_update(self, progress: Progress) -> None:
             self.seen += [(progress.updates, episode.facts[0]) for episode in progress.episodes if episode.length]
             if progress.updates == 3:
-                workers = [child for child in psutil.Process().children() if "workers" in command_line(child)]
+                workers = [child for child in psutil.Process().children() if "millrace.workers" in command_line(child)]
                 workers[0].kill()
                 self.killed = True
 

@@ -118,7 +118,7 @@ def test_a_local_run_ends_at_once_when_its_last_worker_has_left(stage: Stage) ->
 
 def test_a_local_run_whose_workers_cannot_start_ends_with_what_they_wrote(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(
-        "import sys\nif 'workers' in sys.orig_argv:\n    raise SystemExit('no licence')\n"
+        "import sys\nif 'millrace.workers' in sys.orig_argv:\n    raise SystemExit('no licence')\n"
     )
     command = [sys.executable, "-m", "millrace", "train", TOY, "--workers", "1", "--run-dir", str(tmp_path / "runs")]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}

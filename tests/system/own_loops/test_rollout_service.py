@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {"envs": 4, "lanes": 2, "rollout_steps": 16}
 
 def children() -> list[psutil.Process]:
     """The worker processes of this process that run."""
-    return [child for child in psutil.Process().children() if "workers" in command_line(child)]
+    return [child for child in psutil.Process().children() if "millrace.workers" in command_line(child)]
 
 
 def test_a_long_computation_loses_no_worker() -> None:

@@ -29,7 +29,7 @@ def run(
 def worker_processes() -> list[psutil.Process]:
     """The worker processes of this process."""
     children = psutil.Process().children(recursive=True)
-    return [child for child in children if "workers" in preloaded.command_line(child)]
+    return [child for child in children if "millrace.workers" in preloaded.command_line(child)]
 
 
 def start(tmp_path: Path, *flags: str) -> subprocess.Popen[bytes] | preloaded.ForkedProcess:

@@ -182,7 +182,7 @@ def test_workers_of_a_forked_supervisor_are_its_children_and_end_with_it(stage: 
     supervisor = stage.worker(f"ipc://{stage.tmp_path}/nobody", "some", "--processes", "2")
     workers = wait_for(lambda: len(found := workers_of(supervisor.pid)) == 2 and found, WITHIN_S, "two workers")
     assert workers
-    assert not any("workers" in command_line(worker) for worker in workers), "they were executed"
+    assert not any("millrace.workers" in command_line(worker) for worker in workers), "they were executed"
     family = psutil.Process(supervisor.pid).children(recursive=True)
     assert len(family) == 3
     supervisor.process.kill()
