@@ -1,7 +1,8 @@
-"""The commands of `millrace`: their groups, and the function that runs each. Extras have theirs in the same table.
+"""The commands of `millrace`: their groups, and the function that runs each. Our extras have theirs in the same table.
 
 Rule: a command's module is imported when the command runs, so that `--help` answers at once, and a machine that has only a
-worker's packages can run the commands that need no others.
+worker's packages can run the commands that need no others. Other packages install commands as entry points of the group
+`millrace.commands`, which are read for `--help` and for a name that isn't ours.
 """
 # ruff: noqa: E501
 
@@ -9,6 +10,11 @@ from __future__ import annotations
 
 from importlib import import_module
 from typing import NamedTuple
+
+from millrace.protocol.errors import MillraceError
+from millrace.protocol.own_module import own_callable, own_code_failed
+
+GROUP = "millrace.commands"
 
 
 class Command(NamedTuple):
@@ -52,8 +58,33 @@ GROUPS = {  # one line a command
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
+def installed_commands() -> dict[str, Command]:
+    """The commands that other packages install, by name. Imports none of these packages."""
+    from importlib import metadata
+
+    points = metadata.entry_points(group=GROUP)
+    packages = {point.name: point.dist.name if point.dist is not None else "another package" for point in points}
+    return {
+        point.name: Command(point.value, "…", f"from {packages[point.name]}")
+        for point in sorted(points)
+        if point.name not in COMMANDS
+    }
+
+
 def run_command(name: str, argv: list[str]) -> int:
-    """Run a command with these arguments. Returns the exit code."""
+    """Run one of our commands with these arguments. Returns the exit code."""
     module, function = COMMANDS[name].runs.split(":")
     code: int = getattr(import_module(module), function)(argv)
     return code
+
+
+def run_installed(name: str, command: Command, argv: list[str]) -> int:
+    """Run a command of another package. Returns the exit code. Raises `UsageError` for whatever that package does wrong."""
+    what = f"command {name} {command.about}"
+    function = own_callable(command.runs, what, "mine:run")
+    try:
+        return int(function(argv) or 0)
+    except (MillraceError, BrokenPipeError):
+        raise
+    except Exception as error:
+        raise own_code_failed(what, error) from error

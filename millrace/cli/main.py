@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import millrace
-from millrace.cli.commands import COMMANDS, GROUPS, run_command
+from millrace.cli.commands import COMMANDS, GROUPS, installed_commands, run_command, run_installed
 from millrace.learner.run_folder.last_line import last_line
 from millrace.learner.run_folder.run_format import is_run_folder
 from millrace.learner.standard_streams import prepare_streams, unfailing
@@ -98,16 +98,21 @@ def _dispatch(argv: list[str]) -> int:
         print(f"millrace {millrace.__version__}")
         return 0
     name, *rest = argv
-    if name not in COMMANDS:
-        raise UsageError(f"unknown command {name}{did_you_mean(name, COMMANDS) or '; millrace --help lists them'}")
-    return run_command(name, rest)
+    if name in COMMANDS:
+        return run_command(name, rest)
+    installed = installed_commands()
+    if name in installed:
+        return run_installed(name, installed[name], rest)
+    hint = did_you_mean(name, [*COMMANDS, *installed]) or "; millrace --help lists them"
+    raise UsageError(f"unknown command {name}{hint}")
 
 
 def _overview() -> str:
     """The groups of commands, a line for each command."""
-    width = max(len(f"{name} {command.arguments}") for name, command in COMMANDS.items())
+    groups = GROUPS | {"From other packages": installed} if (installed := installed_commands()) else GROUPS
+    width = max(len(f"{name} {command.arguments}") for commands in groups.values() for name, command in commands.items())
     lines = ["usage: millrace COMMAND [arguments]", "", ABOUT]
-    for title, commands in GROUPS.items():
+    for title, commands in groups.items():
         lines += ["", f"{title}:"]
         lines += [f"  millrace {f'{name} {one.arguments}':{width}}  {one.about}" for name, one in commands.items()]
     return "\n".join([*lines, "", "millrace COMMAND --help lists the flags; --debug shows tracebacks; --version."])

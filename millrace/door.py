@@ -1,0 +1,53 @@
+"""What a package of somebody else's may build on: an extra of your own, with callbacks, commands or kinds of env copies.
+
+Rule: an extra imports names of `millrace`, `millrace.algorithms` and this file, and nothing else of millrace, so that the
+rest may change. These are functions and classes, at most forty; no modules.
+
+    commands            `Flag`, `parse_flags`, `one_line`; a command is an entry point of the group `millrace.commands`
+    runs on the disk    `find_runs`, `read_line`, `RunLine`, `read_rows`, `read_summary`
+    what a run tells    `Rollout`, `Batch`, `Episode`, `AcceptedRollout`, beside `millrace.Callback` and `millrace.Progress`
+    kinds of env copies `CopiesKind`, `EnvCopies`, `StepResult`, `CopyFailed`, `EnvSpec`, `RunSpec`; a kind is an entry point
+                        of the group `millrace.copies`
+    other data          `PriorData`, from which an algorithm learns besides its own rollouts
+
+Imports no torch.
+"""
+
+from __future__ import annotations
+
+from millrace.flags.fields import Flag
+from millrace.flags.parse import parse_flags
+from millrace.learner.algorithms.prior_data import PriorData
+from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.results import read_summary
+from millrace.learner.run_lines import RunLine, find_runs, read_line
+from millrace.protocol.bounds import one_line
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.kinds_of_copies import CopiesKind
+from millrace.protocol.rollout import Batch, Episode, Rollout
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import EnvCopies, StepResult
+from millrace.workers.copies.env_errors import CopyFailed
+
+__all__ = [
+    "AcceptedRollout",
+    "Batch",
+    "CopiesKind",
+    "CopyFailed",
+    "EnvCopies",
+    "EnvSpec",
+    "Episode",
+    "Flag",
+    "PriorData",
+    "Rollout",
+    "RunLine",
+    "RunSpec",
+    "StepResult",
+    "find_runs",
+    "one_line",
+    "parse_flags",
+    "read_line",
+    "read_rows",
+    "read_summary",
+]
