@@ -21,6 +21,7 @@ from millrace.learner.policy_player import SavedPolicy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.protocol.errors import EnvironmentFailed, UserFacingError
+from tests.support.gymnasium_versions import CLIFF
 from tests.support.in_process.collectors import TOY, random_weights, run_of
 from tests.system.stage.processes import START_S, Stage, crowding, wait_for
 from tests.system.stage.run_folders import policy_of
@@ -162,8 +163,8 @@ def test_an_environment_that_raises_ends_the_evaluation_with_its_traceback() -> 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.soak), signal.SIGTERM])
 def test_a_signal_during_an_evaluation_ends_the_run_at_once_with_its_checkpoint(stage: Stage, number: int) -> None:
-    """CliffWalking-v1 has no time limit: the greedy policy may walk on for ever."""
-    command = [sys.executable, "-m", "millrace", "train", "CliffWalking-v1", "--steps", "1200", "--rollout-steps", "32"]
+    """The environment has no time limit: the greedy policy may walk on for ever."""
+    command = [sys.executable, "-m", "millrace", "train", CLIFF, "--steps", "1200", "--rollout-steps", "32"]
     command += ["--run-dir", str(stage.runs), "--eval-max-steps", "1000000000", "--eval-episodes", "100"]
     run = stage.start(command, "train")
     run.hears("evaluating for ", START_S)
@@ -204,9 +205,7 @@ def test_an_evaluation_that_was_cut_off_is_made_when_the_run_is_resumed(stage: S
 
 
 def test_an_episode_that_never_ends_is_cut_and_the_result_says_so(tmp_path: Path) -> None:
-    config = resolve(
-        "CliffWalking-v1", run_dir=str(tmp_path), steps=600, rollout_steps=32, eval_episodes=5, eval_max_steps=500
-    )
+    config = resolve(CLIFF, run_dir=str(tmp_path), steps=600, rollout_steps=32, eval_episodes=5, eval_max_steps=500)
     folder = train(config, None, lambda progress: None)
     evaluation = json.loads((folder / "summary.json").read_text())["evaluation"]
     assert evaluation["cut"] == 5
