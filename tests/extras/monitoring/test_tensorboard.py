@@ -21,7 +21,7 @@ from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.errors import RunError
 
-ENV = "millrace.workers.envs.toy:Identity-v0"
+ENV = "tests.support.envs.toy:Identity-v0"
 SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 1, "net": (8,),
     "steps": 200, "eval_episodes": 2, "progress": False,

@@ -77,7 +77,7 @@ def play(ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], steps: int, mode: 
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@pytest.mark.parametrize("env", variants(CASES, default=["millrace.workers.envs.toy:Informs-v0"]))
+@pytest.mark.parametrize("env", variants(CASES, default=["tests.support.envs.toy:Informs-v0"]))
 def test_results_through_shared_memory_equal_those_of_sync_vector_env(env: str, mode: AutoresetMode) -> None:
     with both(env, 5, mode, "shared", **CASES[env]) as (ours, theirs):
         play(ours, theirs, 500 if env == "CartPole-v1" else 200, mode)

@@ -56,7 +56,7 @@ WORKER = (
     "millrace.workers.__main__",
     "millrace.workers.program",
 )
-START_WORKERS = (["workers"], *(["millrace", command] for command in ("evaluate", "record", "train", "worker")))
+START_WORKERS = (["millrace.workers"], *(["millrace", command] for command in ("evaluate", "record", "train", "worker")))
 
 
 def import_ahead(modules: tuple[str, ...]) -> None:

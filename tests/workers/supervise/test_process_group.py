@@ -116,7 +116,7 @@ def test_what_a_dead_worker_started_is_killed_also_in_a_process_group_of_its_own
 @pytest.mark.parametrize("start", [SIMULATOR, RANK], ids=["of its group", "of another group"])
 def test_a_worker_whose_supervisor_was_killed_ends_after_its_simulators(start: str) -> None:
     program = (
-        "from workers import program; members = program.live_members; "
+        "from millrace.workers import program; members = program.live_members; "
         "program.live_members = lambda leader: print(*(found := members(leader)), flush=True) or found"
     )
     with session(f"{program}; {start}; print(simulator.pid, flush=True); program._kill_own_session()") as (
