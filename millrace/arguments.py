@@ -27,6 +27,7 @@ WORDS: dict[Any, str] = {
     type(None): "None",
     Callable: "a function",
     os.PathLike: "a path",
+    tuple: "a tuple",
     Sequence: "a list",
     dict: "a dict",
 }

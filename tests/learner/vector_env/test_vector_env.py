@@ -268,7 +268,7 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
         ({"timeout": -1.0}, "^timeout: expected a number of seconds above 0, got -1.0$"),
         ({"timeout": float("nan")}, "^timeout: expected a number of seconds above 0, got nan$"),
         ({"env": "NoSuchEnv-v7"}, "is not registered"),
-        ({"env": "FrozenLake-v1", "desc": ["SF", "FG"]}, "FrozenLake-v1: argument desc: expected .*, got list .'SF', 'FG'."),
+        ({"env": "FrozenLake-v1", "desc": ["SF", "FG"]}, r"make_vec: desc: expected .*, got \['SF', 'FG'\]"),
         ({"env": "tests.support.envs.toy:Spaces-v0", "observation": "text"}, "is not supported"),
     ],
 )
