@@ -18,6 +18,7 @@ from typing import Any
 
 import millrace
 from benchmarks.writing import write
+from millrace.extras.monitoring.dashboard import Dashboard
 
 READER = """
 import sys, time, urllib.request
@@ -47,7 +48,7 @@ def rate(name: str, seed: int, *, page: bool) -> float:
             nonlocal to_open
             if to_open:
                 to_open = False
-                address = stack.enter_context(millrace.Dashboard(progress.run)).address
+                address = stack.enter_context(Dashboard(progress.run)).address
                 reader = subprocess.Popen([sys.executable, "-c", READER, address], stderr=subprocess.DEVNULL)
                 stack.callback(reader.wait)
                 stack.callback(reader.kill)

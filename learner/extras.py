@@ -1,6 +1,6 @@
 """What a setting starts of an extra. The core imports no extra before somebody asks for it, and names it only here.
 
-(Besides, an extra may give a command, in `millrace/cli/commands.py`, and a public name, in `millrace/__init__.py`.)
+(Besides, an extra may give a command, in `millrace/cli/commands.py`.)
 
 Rule: each entry is `module:name`. The caller says which type of the core the object has.
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 STARTED_BY = {
     "clone_epochs": "millrace.extras.datasets.cloning:clone",
-    "Run.record": "millrace.extras.datasets.record:record",
+    "millrace.record": "millrace.extras.datasets.record:write_dataset",
     "prior": "millrace.extras.datasets.prior_dataset:PriorDataset",
     "record": "millrace.extras.datasets.training_recorder:TrainingRecorder",
     "video": "millrace.extras.datasets.video:prepare_videos",
@@ -21,7 +21,7 @@ STARTED_BY = {
     "metrics_bind": "millrace.extras.monitoring.prometheus:metrics_server",
     "tensorboard": "millrace.extras.monitoring.tensorboard:TensorBoardCallback",
 }
-"""setting, or public method -> `module:name`"""
+"""setting, or public function -> `module:name`"""
 
 
 def started_by(setting: str) -> Any:

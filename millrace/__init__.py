@@ -33,8 +33,6 @@ from millrace.protocol.errors import (  # noqa: E402
 )
 
 if TYPE_CHECKING:
-    from millrace.extras.datasets.record import record
-    from millrace.extras.monitoring.dashboard.page_beside import Dashboard
     from millrace.launch.vector import make_vec
     from millrace.learner.algorithms.normalizer import Normalizer
     from millrace.learner.callbacks.callback import Callback
@@ -42,7 +40,7 @@ if TYPE_CHECKING:
     from millrace.learner.run_folder.results import Evaluation, RecordedDataset, Summary
     from millrace.loaded_policy import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
-    from millrace.playing import evaluate
+    from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.protocol.envs.which_copy import EnvCopy
     from millrace.rollout_service import RolloutBatch, RolloutService
@@ -55,7 +53,6 @@ __all__ = [
     "MLP",
     "Callback",
     "CheckpointError",
-    "Dashboard",
     "EnvCopy",
     "EnvironmentFailed",
     "Evaluation",
@@ -95,7 +92,6 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "millrace.learner.callbacks.callback",
-    "Dashboard": "millrace.extras.monitoring.dashboard.page_beside",
     "EnvCopy": "millrace.protocol.envs.which_copy",
     "Evaluation": "millrace.learner.run_folder.results",
     "LoadedPolicy": "millrace.loaded_policy",
@@ -117,7 +113,7 @@ _IMPORTED_WHEN_USED = {
     "evaluate": "millrace.playing",
     "load": "millrace.loaded_policy",
     "make_vec": "millrace.launch.vector",
-    "record": "millrace.extras.datasets.record",
+    "record": "millrace.playing",
     "train": "millrace.runs",
 }
 """Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""

@@ -20,9 +20,9 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.extras import started_by
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy, useful_workers
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from millrace.learner.run_folder.results import Evaluation
+from millrace.learner.run_folder.results import Evaluation, RecordedDataset
 from millrace.learner.run_folder.run_folder import RunFolder, Which
-from millrace.play_flags import EvaluateFlags, PlayFlags
+from millrace.play_flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
@@ -41,6 +41,9 @@ class Given(NamedTuple):
 
     env: EnvLike | None = None
     wrappers: Sequence[WrapperLike] | None = None
+
+
+WriteDataset = Callable[[RecordFlags, ShowPlayed, Given], RecordedDataset]
 
 
 class ShownKeywords(TypedDict, total=False):
@@ -94,6 +97,43 @@ def evaluate(
     flags = flags_of(EvaluateFlags, "evaluate", run=Path(run), episodes=episodes, **keywords)
     with count_line("evaluating", show=progress) as watch:
         return play(flags, watch, Given(env, wrappers))[0]
+
+
+@checked
+def record(
+    run: str | os.PathLike[str],
+    out: str,
+    steps: int = 50_000,
+    *,
+    env: EnvLike | None = None,
+    wrappers: Sequence[WrapperLike] | None = None,
+    progress: bool = True,
+    **keywords: Unpack[RecordKeywords],
+) -> RecordedDataset:
+    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. It needs the extra `record`.
+
+    Arguments:
+        run: A `Run`, or a run folder.
+        out: Id of the dataset, as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets.
+        steps: Number of env steps. The last episode is finished, unless that would take more than twice as many.
+        env: The environment that the run was started with, if it is not found by its name: it was made in another script or
+            notebook. (`Run.record` of the `Run` that `train` returned knows it.)
+        wrappers: Likewise the wrappers.
+        progress: Show how far it is.
+        **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
+            and action; `seed`, `best`, `workers`, `transport`, `bind`, `inference` and `max_env_failures`.
+
+    Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
+    on the number of workers. Raises `UserFacingError` with a message of one line; then it leaves no files.
+
+    >>> import millrace
+    >>> millrace.record(run, "cartpole/example-v0", steps=20, workers=1).dataset_id
+    'cartpole/example-v0'
+    """
+    flags = flags_of(RecordFlags, "record", run=Path(run), out=out, steps=steps, **keywords)
+    with count_line("recording", show=progress) as watch:
+        write: WriteDataset = started_by("millrace.record")
+        return write(flags, watch, Given(env, wrappers))
 
 
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:

@@ -6,7 +6,7 @@ Rule: what a run folder lacks is None or empty, and what cannot be read is said 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from html import escape
 from pathlib import Path
@@ -26,7 +26,7 @@ from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from millrace.learner.run_folder.results import Evaluation, RecordedDataset, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_folder.run_format import read_config
-from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate
+from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
@@ -171,7 +171,6 @@ class Run(os.PathLike[str]):
         >>> millrace.Run(run).record("cartpole/of-a-run-v0", steps=20).dataset_id
         'cartpole/of-a-run-v0'
         """
-        record: Callable[..., RecordedDataset] = started_by("Run.record")
         return record(self, out, steps, **self._with_given(keywords))
 
     @checked

@@ -6,15 +6,12 @@ command an extra gives, as text (`learner/extras.py`, `millrace/cli/commands.py`
 
 from __future__ import annotations
 
-import ast
 from functools import cache
 
 import pytest
 
-from tests.test_architecture import PACKAGES, imports_in_functions, module, modules_imported, sources, tree
+from tests.test_architecture import PACKAGES, module, modules_imported, sources
 
-FACE = "millrace/__init__.py"
-"""The public names, some of them of extras: a type checker sees where each is from; a program imports it when it is used."""
 FOLDER = "millrace/extras/"
 EXTRAS = ("conformance", "datasets", "envs", "launchers", "monitoring")
 
@@ -41,13 +38,8 @@ def test_these_are_the_extras() -> None:
 
 
 def test_the_core_imports_no_extra() -> None:
-    core = [source for source in sources(*PACKAGES) if extra_of(source) is None and source != FACE]
+    core = [source for source in sources(*PACKAGES) if extra_of(source) is None]
     assert {source: extras for source in core if (extras := extras_imported(source))} == {}
-
-
-def test_a_program_that_imports_the_face_imports_no_extra() -> None:
-    at_the_top = {ast.unparse(node) for node in tree(FACE).body if isinstance(node, ast.Import | ast.ImportFrom)}
-    assert not [line for line in at_the_top | imports_in_functions(FACE) if "extras" in line]
 
 
 @pytest.mark.parametrize("extra", EXTRAS)

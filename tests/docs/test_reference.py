@@ -38,6 +38,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "self-play": {"env": "tests.support.users_code.seat_envs:RockPaperScissors", "algo": "ppo", "self_play": 1},
     "td3": {"env": "Pendulum-v1", "algo": "td3", "learning_starts": 0, "batch_size": 8, "net": (8,)},
 }
+OF_MONITORING = ("dashboard.Dashboard", "wandb.WandbCallback", "mlflow.MlflowCallback")
+"""What users import of that extra"""
 
 
 def general(name: str) -> str:
@@ -130,7 +132,7 @@ def test_every_public_name_is_on_one_python_page() -> None:
     public = {f"millrace.{name}" for name in set(millrace.__all__) - modules - {"__version__"}}
     for module in modules:
         public |= {f"millrace.{module}.{name}" for name in getattr(millrace, module).__all__}
-    public |= {"millrace.extras.monitoring.wandb.WandbCallback", "millrace.extras.monitoring.mlflow.MlflowCallback"}
+    public |= {f"millrace.extras.monitoring.{name}" for name in OF_MONITORING}
     text = "".join(make() for make in python_page.pages().values())
     shown = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
     assert {name for name in shown if not name.startswith("millrace.sb3.")} == public

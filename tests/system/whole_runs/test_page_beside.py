@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
-import millrace
+from millrace.extras.monitoring.dashboard import Dashboard
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.errors import RunError
 from tests.system.stage.local_runs import SMALL, run
@@ -63,7 +63,7 @@ def test_its_address_is_said_and_it_shows_the_end_of_the_run(
 
 def test_it_is_of_all_runs_and_ends_when_it_is_closed(tmp_path: Path) -> None:
     folder = run(tmp_path, "CartPole-v1", **SHORT, **SMALL)
-    with millrace.Dashboard(folder.parent) as dashboard:
+    with Dashboard(folder.parent) as dashboard:
         assert folder.name in said(dashboard.address)
         assert f'<iframe src="{dashboard.address}"' in dashboard._repr_html_()
         with pytest.raises(urllib.error.HTTPError):
@@ -77,6 +77,6 @@ def test_a_run_goes_on_if_it_does_not_start(tmp_path: Path, monkeypatch: pytest.
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
     with pytest.raises(RunError, match="it did not start: no port is free"):
-        millrace.Dashboard(tmp_path)
+        Dashboard(tmp_path)
     folder = run(tmp_path, "CartPole-v1", dashboard=True, transport="inproc", **SHORT, **SMALL)
     assert (folder / "summary.json").exists()

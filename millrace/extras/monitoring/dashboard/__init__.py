@@ -1,1 +1,5 @@
 """A web page over run folders and running learners."""
+
+from millrace.extras.monitoring.dashboard.page_beside import Dashboard
+
+__all__ = ["Dashboard"]

@@ -31,8 +31,8 @@ class Dashboard:
     Its `address` is one of this machine; whoever has it sees all that is in these runs. Raises `RunError` if it does not
     start.
 
-    >>> import millrace
-    >>> with millrace.Dashboard("runs") as dashboard:
+    >>> from millrace.extras.monitoring.dashboard import Dashboard
+    >>> with Dashboard("runs") as dashboard:
     ...     address = dashboard.address
     """
 
