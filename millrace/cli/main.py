@@ -23,6 +23,8 @@ from millrace.protocol.bounds import escaped, indented
 from millrace.protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
+INSTALLED_IN = Path(__file__).parents[2]
+"""The folder that holds `millrace`"""
 NOT_IN_WORKERS = {
     "prometheus_client",
     "resvg_py",
@@ -47,10 +49,20 @@ def main(argv: list[str] | None = None) -> int:
         if any(map(is_run_folder, (here, *here.parents))):
             sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # nothing is imported from there
         elif str(here) not in sys.path:
-            sys.path.append(str(here))  # last, so that a user's module is found but hides no installed module
+            sys.path.insert(_end_of_installed(), str(here))  # so a user's module is found but hides no installed module
     prepare_streams()
     with unfailing("stderr"):
         return _exit_code(argv)
+
+
+def _end_of_installed() -> int:
+    """Where in `sys.path` the installed modules end: before a clone that millrace is installed from, else at the end.
+
+    A clone has more folders than `millrace`. A `learner.py` or `tests` of the user's must not be taken for one of them.
+    """
+    if (INSTALLED_IN / "millrace" / "learner").is_symlink() and str(INSTALLED_IN) in sys.path:
+        return len(sys.path) - 1 - sys.path[::-1].index(str(INSTALLED_IN))
+    return len(sys.path)
 
 
 def _exit_code(argv: list[str]) -> int:

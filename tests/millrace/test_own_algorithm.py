@@ -132,7 +132,27 @@ def test_a_folder_with_some_files_of_such_names_is_the_user_s_own(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     main(["--version"])
-    assert sys.path[-1] == str(tmp_path)
+    assert str(tmp_path) in sys.path
+
+
+def test_the_current_folder_comes_after_installed_modules_and_before_the_clone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    clone = str(Path(millrace.__file__).parents[1])
+    monkeypatch.setattr(sys, "path", ["site-packages", clone, "others"])
+    main(["--version"])
+    assert sys.path == ["site-packages", str(tmp_path), clone, "others"]
+
+
+def test_the_current_folder_is_last_if_millrace_is_installed_from_a_wheel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("millrace.cli.main.INSTALLED_IN", tmp_path / "site-packages")
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "site-packages"), "others"])
+    main(["--version"])
+    assert sys.path == [str(tmp_path / "site-packages"), "others", str(tmp_path)]
 
 
 def test_an_error_in_its_code_names_the_place_and_keeps_the_run(
