@@ -33,6 +33,7 @@ from millrace.protocol.errors import (  # noqa: E402
 )
 
 if TYPE_CHECKING:
+    from millrace import algorithms, testing
     from millrace.launch.vector import make_vec
     from millrace.learner.algorithms.normalizer import Normalizer
     from millrace.learner.callbacks.callback import Callback
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from millrace.runs import Metrics, Run, train
     from millrace.workers.copies.reset_ahead import ResetAhead
     from millrace.workers.copy_slots import env_copy
+
+    __version__: str
 
 __all__ = [
     "CNN",
