@@ -1,1 +1,1 @@
-"""Who may connect: keys, tokens, the CURVE handshake."""
+"""Who may connect: keys, tokens, the handshake."""

@@ -1,141 +1,185 @@
-"""Explains failed handshakes, from the events of libzmq's monitor. Pure, except for `peer_host`.
+"""The handshake: a worker proves that it holds its token's key (CURVE), and the learner looks the key up in its list (ZAP).
 
-Rule: the learner knows what was wrong with a client. A worker learns from libzmq only whether its key was refused, the
-one problem that a retry cannot solve. It sees every other problem as a connection that was closed, so its log names the
-likely causes, and it tries again.
+A token is never sent. `handshake_failures.py` says why a handshake failed.
+
+Rule: fail closed. A CURVE server without a ZAP handler accepts every client that knows its public key, unless the server
+sets a domain *and* enforces it. We do both, and start the handler before the port is bound. The answer to a request is a
+pure function that cannot raise: it refuses what it does not understand. libzmq asks ZAP only at the handshake; the link
+checks for every message that its key is still allowed.
+
+The authenticator has its own thread, because the learner does not serve its sockets during an update or an evaluation, and
+a handshake that is not answered within two seconds fails. Without the thread, a worker that joins or reconnects would wait,
+and would not learn what is wrong. (pyzmq's own authenticator thread ends silently when a callback raises, does not notice
+that files change, and cannot report clients that do not speak CURVE.) If the thread ends, the link ends the run: no worker
+could join any more, and no revocation would be noticed.
 """
 
 from __future__ import annotations
 
-import errno
-import socket
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+import logging
+import os
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
 
 import zmq
 
-from millrace.protocol.keys.keys import Token, fingerprint
+from millrace.protocol.errors import UsageError
+from millrace.protocol.keys.handshake_failures import LEARNER_EVENTS, PendingHandshakes
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.keys.keys import KEY_BYTES, Key, Token
+from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 
-FAILED = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
-LEARNER_EVENTS = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
-WORKER_EVENTS = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
-HANDSHAKE_MS = 2000
-NOT_ALLOWED = 400  # ZAP's status code for a key that is not allowed
+log = logging.getLogger("millrace.authenticator")
 
+DOMAIN = b"millrace"
+ZAP = "inproc://zeromq.zap.01"
+LIST_CHECK_INTERVAL_S = 1.0  # the list of clients is read again if its file has changed
+MAX_BATCH = 100  # requests, or events, that are handled before the other sockets get their turn
 
-# ---------------------------------------------------------------- the worker's side
-
-
-@dataclass(frozen=True)
-class ConnectionProblem:
-    """Why a worker is not connected."""
-
-    line: str
-    final: bool = False
-    """a retry cannot solve it: the learner has refused this key"""
+Socket = zmq.Socket[bytes]
 
 
-def connection_problem(event: int, value: int, address: str, token: Token | None) -> ConnectionProblem:
-    """The likely cause of a failed handshake, for a worker."""
-    if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH and value == NOT_ALLOWED:
-        key = fingerprint(token.client.public) if token else "none"
-        advice = (
-            "on the learner's machine: `millrace keys show` lists those that may, `millrace keys new NAME` makes another"
-        )
-        return ConnectionProblem(
-            f"the learner at {address} refused this worker's key {key}: not allowed there, or revoked; {advice}", True
-        )
-    if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL and value in (errno.EAGAIN, errno.ETIMEDOUT):
-        return ConnectionProblem(
-            f"{address} answers, but did not finish the handshake within {HANDSHAKE_MS // 1000} s; is it a millrace learner?"
-        )
-    if token is None:
-        why = "perhaps it asks for a key: give this worker --token FILE (`millrace keys new NAME` on its machine makes one)"
-    else:
-        why = "perhaps this token is of another learner, or the learner was started without keys; then leave the token out"
-    return ConnectionProblem(f"{address} breaks off the handshake; {why}")
+def serve_with(socket: Socket, key: Key) -> None:
+    """Make this socket a CURVE server that asks ZAP about each client, and refuses all while ZAP does not answer."""
+    socket.curve_server = True
+    socket.curve_secretkey = key.secret
+    socket.zap_domain = DOMAIN
+    socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
 
-# ---------------------------------------------------------------- the learner's side
+def connect_with(socket: Socket, token: Token) -> None:
+    """Make this socket a CURVE client that connects only to the holder of the token's server key."""
+    socket.curve_serverkey = token.server
+    socket.curve_publickey = token.client.public
+    socket.curve_secretkey = token.client.secret
 
 
-def handshake_failure(event: int, value: int, keys: bool) -> str:
-    """Why a client's handshake failed, for a learner with or without keys."""
-    match event, value:
-        case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC:
-            return "its token is for another learner: it expects another server key"
-        case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH if keys:
-            return "it shows no key; a worker needs --token"
-        case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
-            return "it shows a key, and this learner has none: leave its token out, or start the learner with --keys"
-        case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, _:
-            return f"it violates the protocol of the handshake ({value:#x})"
-        case _, errno.EAGAIN | errno.ETIMEDOUT:
-            return f"it did not finish the handshake within {HANDSHAKE_MS // 1000} s"
-        case _, errno.EPIPE | errno.ECONNRESET:
-            perhaps = "it has no token" if keys else "it has a token, and this learner no keys"
-            return f"it broke off the handshake; perhaps {perhaps}"
-        case _:
-            return f"its handshake failed ({errno.errorcode.get(value, value)})"
-
-
-NO_ZEROMQ = "it does not speak ZeroMQ, or left before it had said who it is"
-
-
-class PendingHandshakes:
-    """Connections whose handshake is not finished. Finds out which client's handshake failed, for the log only.
-
-    libzmq gives a connection's descriptor when it is accepted and when it ends, but not in between. A failure is followed by
-    the end of the same connection. Which handshake succeeded is guessed from the addresses that ZAP approved.
-    """
-
-    def __init__(self, keys: bool, host_of: Callable[[int], str] | None = None) -> None:
-        self._keys, self._host_of = keys, host_of or peer_host
-        self._pending: dict[int, str] = {}
-        self._failed: tuple[int, int] | None = None
-        self._approved: deque[str] = deque(maxlen=100)
-
-    def add_approved(self, host: str) -> None:
-        """ZAP approved a client at this address: its handshake will succeed."""
-        self._approved.append(host)
-
-    def handle_event(self, event: int, value: int) -> tuple[str, str] | None:
-        """Handle an event of the monitor. Returns the host and the reason of a failed handshake, once they are known.
-
-        For a refused key it returns None: the ZAP handler reports that.
-        """
-        match event:
-            case zmq.EVENT_ACCEPTED:
-                self._pending[value] = self._host_of(value)
-            case zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                host = self._approved.popleft() if self._approved else None
-                if self._pending:
-                    del self._pending[
-                        next((one for one, at in self._pending.items() if at == host), next(iter(self._pending)))
-                    ]
-            case zmq.EVENT_DISCONNECTED:
-                host, failed = self._pending.pop(value, None), self._failed
-                self._failed = None
-                if failed is not None and failed[0] != zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                    return host or "", handshake_failure(*failed, self._keys)
-                if failed is None and host is not None:
-                    return host, NO_ZEROMQ
-            case _:
-                self._failed = event, value
-        return None
-
-
-def peer_host(descriptor: int) -> str:
-    """The address of the peer; empty if the connection has ended. The descriptor still belongs to libzmq afterwards."""
+def answer(request: Sequence[bytes], keyring: Keyring) -> tuple[list[bytes], str]:
+    """The reply to a ZAP request (RFC 27, without the envelope), and the reason if it is a refusal, else ''."""
+    number = request[1] if len(request) > 1 else b""
+    refused = [b"1.0", number, b"400", b"refused", b"", b""]
+    if len(request) != 7 or request[0] != b"1.0":
+        return refused, "the question was not understood"
+    _, _, domain, _, _, mechanism, key = request
+    if domain != DOMAIN or mechanism != b"CURVE" or len(key) != KEY_BYTES:
+        return refused, f"expected CURVE, got {mechanism[:20]!r}"
     try:
-        borrowed = socket.socket(fileno=descriptor)
-    except OSError:
-        return ""
-    try:
-        name = borrowed.getpeername()
-        return str(name[0]) if isinstance(name, tuple) else ""
-    except OSError:
-        return ""
-    finally:
-        borrowed.detach()
+        why = keyring.rejection_reason(key)
+    except Exception as error:  # whatever the error is, the client is refused
+        why = f"its key cannot be looked up: {error}"
+    return ([b"1.0", number, b"200", b"OK", key.hex().encode(), b""], "") if not why else (refused, why)
+
+
+class AuthenticatorThread(threading.Thread):
+    """Answers ZAP requests if there are keys; counts failed handshakes at a learner's tcp port and logs their reasons."""
+
+    def __init__(self, socket: Socket, keyring: Keyring | None) -> None:
+        """`socket` must not be bound yet. Raises `UsageError` if the context has a ZAP handler already."""
+        super().__init__(name="millrace-authenticator", daemon=True)
+        context = socket.context
+        self.refused = 0
+        """handshakes that failed"""
+        self.keyring = keyring
+        self._log_limiter = LogRateLimiter()
+        self._pending = PendingHandshakes(keys=keyring is not None)
+        self._zap: Socket | None = None
+        if keyring is not None:
+            self._zap = context.socket(zmq.ROUTER)
+            self._zap.linger = 0
+            try:
+                self._zap.bind(ZAP)
+            except zmq.ZMQError as error:
+                self._zap.close()
+                raise UsageError(
+                    "a second learner with keys needs a ZeroMQ context of its own: ZAP has one in each"
+                ) from error
+            serve_with(socket, keyring.key)
+        name = f"inproc://millrace-authenticator-{os.urandom(6).hex()}"
+        socket.monitor(name, LEARNER_EVENTS)
+        self._events: Socket = _pair(context, name, bind=False)
+        self._end_receiver: Socket = _pair(context, f"{name}-end", bind=True)
+        self._end_sender: Socket = _pair(context, f"{name}-end", bind=False)
+        self.start()
+
+    def run(self) -> None:
+        """Answer until `close`. An error with one client does not affect the next."""
+        try:
+            poller = zmq.Poller()
+            for one in filter(None, (self._zap, self._events, self._end_receiver)):
+                poller.register(one, zmq.POLLIN)
+            while True:
+                ready = dict(poller.poll(int(LIST_CHECK_INTERVAL_S * 1000)))
+                if self._end_receiver in ready:
+                    return
+                if self.keyring is not None:
+                    self.keyring.refresh()
+                try:
+                    if self._events in ready:
+                        self._read_events()
+                    if self._zap in ready:
+                        self._answer()
+                except zmq.ContextTerminated:
+                    return
+                except Exception:
+                    log.exception("a client caused an error, and was not let in")
+        except zmq.ContextTerminated:
+            return
+        finally:
+            if self._zap is not None:
+                with suppress(zmq.ZMQError):
+                    self._zap.unbind(ZAP)  # frees the name now; closing alone frees it later
+                self._zap.close()
+
+    def close(self) -> None:
+        """Stop the thread. The socket's monitor must have been disabled: libzmq blocks while nobody reads its events."""
+        with suppress(zmq.ZMQError):  # closed already, or the thread has ended
+            self._end_sender.send(b"", zmq.NOBLOCK)
+        self.join(5.0)
+        self._events.close(linger=0)
+        self._end_receiver.close(linger=0)
+        self._end_sender.close(linger=0)
+
+    def _answer(self) -> None:
+        assert self._zap is not None
+        assert self.keyring is not None
+        for _ in range(MAX_BATCH):
+            try:
+                peer, empty, *request = self._zap.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            except ValueError:
+                continue
+            reply, why = answer(request, self.keyring)
+            host = request[3].decode(errors="replace")[:64] if len(request) > 3 else ""
+            if why:
+                self._refuse(host, why)
+            else:
+                self._pending.add_approved(host)
+            self._zap.send_multipart([peer, empty, *reply])
+
+    def _read_events(self) -> None:
+        for _ in range(MAX_BATCH):
+            try:
+                event, value = struct.unpack("=HI", self._events.recv_multipart(zmq.NOBLOCK)[0])
+            except zmq.Again:
+                return
+            found = self._pending.handle_event(event, value)
+            if found is not None:
+                self._refuse(*found)
+
+    def _refuse(self, host: str, why: str) -> None:
+        self.refused += 1
+        kept_back = self._log_limiter.due(f"{host} {why}", time.monotonic())
+        if kept_back is not None:
+            log.warning("%s was not let in: %s%s", host or "somebody", why, suppressed_note(kept_back))
+
+
+def _pair(context: zmq.Context[Socket], name: str, *, bind: bool) -> Socket:
+    socket = context.socket(zmq.PAIR)
+    socket.linger = 0
+    socket.rcvhwm = 0  # no limit: libzmq's own thread would block while this one does not read
+    (socket.bind if bind else socket.connect)(name)
+    return socket

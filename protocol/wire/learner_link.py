@@ -20,8 +20,8 @@ import zmq
 
 from millrace.protocol.address import check_address, name_for_people
 from millrace.protocol.errors import BadMessage, RunError, UsageError
+from millrace.protocol.keys.handshake import AuthenticatorThread
 from millrace.protocol.keys.key_folder import Keyring
-from millrace.protocol.keys.zap import AuthenticatorThread
 from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from millrace.protocol.messages import Inquire, Refuse, ToLearner
 from millrace.protocol.wire.codec import Buffer, decode_to_learner, encode

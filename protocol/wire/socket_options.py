@@ -14,7 +14,7 @@ from typing import NamedTuple
 import zmq
 
 from millrace.protocol.address import needs_ipv6
-from millrace.protocol.keys.handshake import HANDSHAKE_MS
+from millrace.protocol.keys.handshake_failures import HANDSHAKE_MS
 from millrace.protocol.keys.keys import Token
 
 LINGER_MS = 2000

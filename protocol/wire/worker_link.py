@@ -14,9 +14,9 @@ import zmq
 
 from millrace.protocol.address import check_address, check_worker_name, is_local, resolves
 from millrace.protocol.errors import BadMessage, UsageError
-from millrace.protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
+from millrace.protocol.keys.handshake import connect_with
+from millrace.protocol.keys.handshake_failures import WORKER_EVENTS, ConnectionProblem, connection_problem
 from millrace.protocol.keys.keys import Token
-from millrace.protocol.keys.zap import connect_with
 from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from millrace.protocol.messages import ToObserver, ToWorker
 from millrace.protocol.wire.codec import MAX_HEAD_BYTES, Buffer, decode_to_observer, decode_to_worker

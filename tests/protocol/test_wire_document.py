@@ -24,7 +24,7 @@ from millrace.learner.members import join_limiter, membership
 from millrace.learner.members import member_states as standing
 from millrace.learner.rollouts import ticket_coordinator
 from millrace.protocol import alive, bounds, env_spec, messages, rollout, space_spec, specs
-from millrace.protocol.keys import handshake
+from millrace.protocol.keys import handshake_failures
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
@@ -179,7 +179,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (membership, "MAX_MEMBERS"): "workers of one learner",
     (join_limiter, "AT_ONCE"): "times that the workers of one key may say Hello at once; more are not answered",
     (join_limiter, "PER_S"): "of them in each second, after that",
-    (handshake, "HANDSHAKE_MS"): "milliseconds that a handshake may take",
+    (handshake_failures, "HANDSHAKE_MS"): "milliseconds that a handshake may take",
     (socket_options, "LINGER_MS"): "milliseconds for which a closing socket still sends queued messages",
 }
 

@@ -24,8 +24,8 @@ import zmq
 
 from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
 from millrace.protocol.bounds import INVALID, MAX_NAME, MAX_WORKERS
+from millrace.protocol.keys.handshake import connect_with
 from millrace.protocol.keys.keys import Token
-from millrace.protocol.keys.zap import connect_with
 from millrace.protocol.wire.socket_options import RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
 from millrace.workers.shared_weights import SharedWeights
 

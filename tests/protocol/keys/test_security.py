@@ -19,7 +19,8 @@ from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.address import worker_name
 from millrace.protocol.errors import BadMessage, RunError, UsageError
-from millrace.protocol.keys.handshake import (
+from millrace.protocol.keys.handshake import DOMAIN, ZAP, answer
+from millrace.protocol.keys.handshake_failures import (
     NO_ZEROMQ,
     ConnectionProblem,
     PendingHandshakes,
@@ -28,7 +29,6 @@ from millrace.protocol.keys.handshake import (
 )
 from millrace.protocol.keys.key_folder import KeyFolder, Keyring
 from millrace.protocol.keys.keys import ClientList, Key, Token
-from millrace.protocol.keys.zap import DOMAIN, ZAP, answer
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
@@ -410,7 +410,7 @@ def test_whatever_goes_wrong_with_one_visitor_the_next_is_answered(net: Net, mon
             raise RuntimeError("a fault of ours")
         return answer(request, keyring)
 
-    monkeypatch.setattr("millrace.protocol.keys.zap.answer", once)
+    monkeypatch.setattr("millrace.protocol.keys.handshake.answer", once)
     learner = net.keyed()
     net.worker(learner, token(), "first")
     until(lambda: len(calls) == 1)
