@@ -1,5 +1,7 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
+n-step returns aren't here: the replay buffer sums them when it draws a transition (`replay/replay_buffer.py`).
+
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
 `obs[t+1]`, which is the true final observation of a truncated episode. No function adds rewards or values across the end of
 an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: what is carried passes

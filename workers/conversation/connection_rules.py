@@ -1,6 +1,7 @@
-"""To which learner a worker connects, with which token, and how long it waits. Pure; imports no numpy or gymnasium.
+"""To which learner a worker connects, with which token, and how long it waits: after that, `Session.tick` leaves.
 
-Rule: over TCP to another machine, a worker connects without a token only with --insecure.
+Rule: over TCP to another machine, a worker connects without a token only with --insecure. Pure; imports neither numpy nor
+gymnasium.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The replay buffer: a ring of preallocated numpy arrays. No sockets, no files; seeded.
+"""The replay buffer: keeps rows, and draws n-step transitions, uniformly or by priority. No sockets, no files; seeded.
 
-A slot holds a raw observation. If a valid row began with it, the slot also holds that row: action, reward, whether it
-terminated, and the slot of the next observation. So each observation is stored once, and n-step returns follow the rows
-from slot to slot when they are drawn. A slot without a row holds the final observation of a truncated episode, or the
-newest observation of an env copy, whose row comes with its next rollout.
+It is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row began with it, the slot also holds
+that row: action, reward, whether it terminated, and the slot of the next observation. So each observation is stored once,
+and n-step returns follow the rows from slot to slot when they are drawn. A slot without a row holds the final observation of
+a truncated episode, or the newest observation of an env copy, whose row comes with its next rollout.
 
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
 the oldest slot first. So a row that is still stored always finds the rows that follow it: those of the same seat, however
