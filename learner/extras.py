@@ -1,8 +1,8 @@
-"""What a setting starts of an extra. The core imports no extra before somebody asks for it, and names it only here.
+"""What a setting or a public function starts of an extra. The core imports an extra only when somebody asks for it.
 
-(Besides, an extra may give a command, in `millrace/cli/commands.py`.)
-
-Rule: each entry is `module:name`. The caller says which type of the core the object has.
+Rule: each entry is `module:name`, and the caller says which type of the core the object has. The core has such tables for
+what else extras give: commands (`millrace/cli/commands.py`), kinds of env copies (`protocol/envs/kinds_of_copies.py`) and
+environments (`protocol/env_spec.py`). It names extras nowhere else.
 """
 
 from __future__ import annotations
