@@ -1,9 +1,14 @@
-"""Every command, flag, file, exit code and metric that a page names exists."""
+"""Every command, flag, file, exit code and metric that a page names exists.
+
+In the two pages about the code, every file exists that is named without its folder, and every name between backticks.
+"""
 
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Iterator
+from functools import cache
 
 import pytest
 
@@ -31,6 +36,12 @@ MADE_BY_COMMANDS = {"benchmarks/results", "benchmarks/results/", "benchmarks/pee
 COMMANDS_OF_EXTRAS = {"csv": "docs/how-to/extras.md writes it"}
 MODULE = re.compile(r"^python3? -m (\w[\w.]*)")
 EXIT_CODE = re.compile(r"exit codes? (\d+)|exits? with (?:code )?(\d+)\b")
+ABOUT_THE_CODE = ("CONTRIBUTING.md", "docs/explanation/architecture.md")
+FILE_OR_FOLDER = re.compile(r"[\w./-]+\.(?:py|md|toml|txt|yml|yaml|cff)|[\w./-]+/|[\w-]+(?:/[\w-]+)+")
+NAME = re.compile(r"[A-Za-z]\w*")
+MADE_BY_MAKE = {"site/", "dist/"}
+PICTURES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "images").glob("*.svg"))
+TEXT_IN_A_PICTURE = re.compile(r">([^<>]+)<")
 METRIC = re.compile(r"^(rollout|eval|time|lag|drop|ledger|stage|train|replay)/\w+$")
 PROMETHEUS = re.compile(r"^millrace_[a-z_]+$")
 
@@ -77,6 +88,37 @@ def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
             yield f"{path}:{text.count(chr(10), 0, match.start()) + 1}: there is no exit code {number}"
 
 
+@cache
+def files() -> tuple[str, ...]:
+    """The paths of the repository's files, new ones too. Those of the parts of millrace are at the top, not behind links."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    return tuple(path for path in listed if (ROOT / path).exists())
+
+
+@cache
+def words_of_the_code() -> frozenset[str]:
+    """Every word in the product, the tests and the settings of their tools."""
+    texts = [(ROOT / path).read_text() for path in files() if path.endswith((".py", ".toml")) or path == "Makefile"]
+    return frozenset(re.findall(r"\w+", "\n".join(texts)))
+
+
+def is_in_the_repository(named: str) -> bool:
+    """Whether there is a file or folder whose path is this, or ends so."""
+    end = f"/{named.rstrip('/')}"
+    return any(f"/{path}".endswith(end) or f"{end}/" in f"/{path}" for path in files())
+
+
+def wrong_names_of_the_code(text: str) -> Iterator[str]:
+    """Files, folders and names between backticks that are not in the repository."""
+    for line, code in pages.code_spans(text):
+        if FILE_OR_FOLDER.fullmatch(code):
+            if code not in MADE_BY_MAKE and not is_in_the_repository(code):
+                yield f"line {line}: there is no {code}"
+        elif NAME.fullmatch(code) and code not in words_of_the_code():
+            yield f"line {line}: nothing is called {code}"
+
+
 @pytest.fixture(scope="module")
 def flags() -> set[str]:
     return all_flags()
@@ -92,6 +134,25 @@ def test_its_commands_parse(path: str) -> None:
 def test_what_it_names_exists(path: str, flags: set[str]) -> None:
     wrong = list(wrong_names(path, pages.manuals()[path], flags))
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("path", ABOUT_THE_CODE)
+def test_a_page_about_the_code_names_what_is_there(path: str) -> None:
+    wrong = list(wrong_names_of_the_code(pages.manuals()[path]))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("path", PICTURES)
+def test_the_files_in_a_picture_exist(path: str) -> None:
+    texts = TEXT_IN_A_PICTURE.findall((ROOT / path).read_text())
+    assert not [text for text in texts if text.endswith(".py") and not (ROOT / text).is_file()]
+
+
+def test_a_wrong_name_of_the_code_is_found() -> None:
+    wrong = ("no_such_file.py", "replay/no_such.py", "learner/no_such", "no_such_folder/", "NoSuch" + "Class")
+    for code in wrong:
+        assert len(list(wrong_names_of_the_code(f"See `{code}`."))) == 1, code
+    assert not list(wrong_names_of_the_code("`replay/`, `replay_buffer.py`, `tests/learner`, `ReplayBuffer`, `_s`, `a b`"))
 
 
 @pytest.mark.parametrize(
