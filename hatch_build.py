@@ -1,4 +1,4 @@
-"""Refuses to build millrace where its links are lost: without them, a wheel would lack three of its packages."""
+"""Refuses to build millrace where its symbolic links are lost: a wheel would lack three of its packages."""
 
 from __future__ import annotations
 

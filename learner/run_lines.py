@@ -1,4 +1,4 @@
-"""What one line says about a run: its state, how far it is, how well it does. Reads little of a run folder.
+"""The line that sums up a run: its state, its progress, its return. Reads little of a run folder.
 
 Rule: a folder that cannot be read is a line too, which says why. Nobody writes down that a run died, so it is what is left:
 no process trains it, and it has no results.

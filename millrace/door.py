@@ -1,4 +1,4 @@
-"""What a package of somebody else's may build on: an extra of your own, with callbacks, commands or kinds of env copies.
+"""What an extra in a package of your own may import: for callbacks, commands and kinds of env copies.
 
 Rule: an extra imports names of `millrace`, `millrace.algorithms` and this file, and nothing else of millrace, so that the
 rest may change. These are functions and classes, at most forty; no modules.

@@ -1,4 +1,4 @@
-"""Finds out, when `millrace` is imported, whether an installed package is too old for it. Nothing is imported for it."""
+"""Checks, when `millrace` is imported, that no installed package is too old for it, without importing any."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an algorithm needs of the data that it learns from besides the rollouts of its run (`--prior`)."""
+"""The data that an algorithm can learn from besides the rollouts of its run (`--prior`): what it must offer."""
 
 from __future__ import annotations
 

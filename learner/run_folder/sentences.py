@@ -1,4 +1,4 @@
-"""What holds a run up, what went wrong in it, and how it ended, in sentences for people. Pure.
+"""Sentences for people: what slows a run down, what went wrong in it, and how it ended. Pure.
 
 Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
 the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits. If they add up

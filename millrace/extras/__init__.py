@@ -1,1 +1,1 @@
-"""What is built on the core, a folder each. The core imports no extra, and no extra imports another."""
+"""The extras, a folder each: what is built on the core. The core imports no extra, and no extra imports another."""

@@ -1,1 +1,1 @@
-"""A command line is made of a record: each field is a flag, its type is the check, and the text under it is the help."""
+"""Makes a command line from a record: a field is a flag, its type is the check, the text under it is the help."""

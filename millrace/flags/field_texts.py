@@ -1,4 +1,4 @@
-"""The text under each field of a record, which is the help of its flag."""
+"""Reads the text under each field of a record, which is the help of its flag."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fields of a record, as flags.
+"""Turns the fields of a record into flags.
 
 Rule: a field is a flag of the same name, with dashes. Its type says which values are allowed. `Annotated[..., Flag(...)]`
 says what neither name nor type can. A field that is a record of its own is no flag.

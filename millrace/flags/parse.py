@@ -1,4 +1,4 @@
-"""A command line -> the values that it gives.
+"""Parses a command line: its words become the values of its flags.
 
 Rules: a word that begins with a dash and is no number is a flag; other words are values of the flag before them, as many as
 it takes, or arguments. A value that begins with a dash is written behind a sign: `--name=-x`. Of a flag that is given twice

@@ -1,4 +1,4 @@
-"""A word of `NAME VALUE ...` as a value, and a value as such a word.
+"""Turns a word of `NAME VALUE ...` into a value, and a value into such a word.
 
 Rule: a word in which TOML reads a value is that value, as in a config file. Any other word is text. But a word in which
 another language reads a value (`None`, `True`, `.5`) is refused, because as text it would be a value that nobody meant: the

@@ -1,4 +1,4 @@
-"""Words of a command line, or a keyword argument, as the value of a field; and why a value is refused: expected, got.
+"""Turns words of a command line, or a keyword argument, into the value of a field, or says why that is impossible.
 
 Rules: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64. The values of a table are written as
 in TOML (toml_words.py); those of any other field are read as its type.

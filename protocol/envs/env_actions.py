@@ -1,4 +1,4 @@
-"""From the actions that a policy chooses, as rollouts store them, to those of the environment, and back. Pure.
+"""Turns actions as the policy chooses them and rollouts store them into the environment's, and back. Pure.
 
 Rule: what is stored is what was chosen; what the environment gets is shifted by `start`, or scaled, and clipped to the Box.
 """

@@ -1,4 +1,4 @@
-"""What `import millrace` takes from the folders of others: no module of the user's, and no package that is too old."""
+"""`import millrace` refuses a package that is too old, and a module of the user's own is never taken for one of ours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kind of env copies that a run has if it asks for no other: a loop over single copies, with one agent or several."""
+"""The default kind of env copies: a loop over single copies, with one agent or several."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The checks of the collector profile: the client acts, by the flat weights, and sends rollouts.
+"""The checks of the collector profile: the client chooses actions with the weights, and sends rollouts.
 
 Each function is one check (`script.py`). The watch recomputes what it can of every rollout (`lane_rows.py`).
 """

@@ -1,4 +1,4 @@
-"""`millrace conform`: the flags of the check of a client, and its report."""
+"""`millrace conform`: its flags, and the report that it prints."""
 
 from __future__ import annotations
 

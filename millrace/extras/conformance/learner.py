@@ -1,7 +1,8 @@
-"""The learner that a check plays. Pure: events and `now` in, effects out; the check decides what is said and what is lost.
+"""The learner that a check plays for the client. Pure: events and `now` in, effects out.
 
-It keeps the books that every check needs: the client's newest Hello, the session, the watch over its messages. Unless the
-check says otherwise, it answers each Heartbeat, and a repeated Hello by the same Welcome again.
+Each check decides what the learner says and which messages are lost. The learner keeps the books that every check needs: the
+client's newest Hello, the session, the watch over its messages. Unless the check says otherwise, it answers each Heartbeat,
+and a repeated Hello by the same Welcome again.
 """
 
 from __future__ import annotations

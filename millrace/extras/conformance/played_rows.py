@@ -1,4 +1,4 @@
-"""What must hold of an evaluation: rows that fit together and fit the answer, actions of the weights that it names. Pure.
+"""What must hold for an evaluation: its rows fit each other and the answer, its actions fit the weights. Pure.
 
 It recomputes what a learner can: the most probable actions, by the numpy policy, and returns and lengths from the rows.
 """

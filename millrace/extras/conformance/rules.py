@@ -1,4 +1,4 @@
-"""The rules of the wire document that a client is checked against, in its words, and what a client's author does next.
+"""The rules of the wire document that a client is checked against, and what to do about each that is broken.
 
 Rule: every failure names one of these. The words of each stand in its section of protocol/README.md, which a test holds.
 """

@@ -1,4 +1,4 @@
-"""Groups and arrays of an HDF5 file that may come from a stranger.
+"""Reads groups and arrays of an HDF5 file that may come from a stranger, and of no other file.
 
 Rule: nothing leads out of the file. A link is not followed, wherever it leads, and the numbers of an array are all in the
 file, compressed only by what h5py brings with it. So memory is bounded by the size of the file: an array has at most

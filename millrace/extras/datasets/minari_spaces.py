@@ -1,4 +1,4 @@
-"""Spaces as Minari writes them, in JSON, as gymnasium's. Pure.
+"""Makes gymnasium's spaces from the JSON in which Minari writes them. Pure.
 
 Rule: as in `millrace.protocol.space_spec`, sizes are checked before anything of that size is allocated.
 """

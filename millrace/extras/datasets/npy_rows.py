@@ -1,4 +1,4 @@
-"""Writes a .npy file with a row [observation, action] for each step: float32, flattened, as the teaching notebooks read it.
+"""Writes a .npy file with a row [observation, action] for each step: float32, flattened.
 
 Rule: the file is complete, or there is none.
 """

@@ -1,4 +1,4 @@
-"""Episodes of a run's policy as a Minari dataset, and if wanted as a .npy file of rows.
+"""Writes episodes of a run's policy as a Minari dataset and, if you ask, as a .npy file of rows.
 
 Rule: a dataset consists of whole episodes with raw rewards. It is complete, or there is none. Episodes are played one after
 another on one env copy, so that short episodes are not favored. Each has its own reset seed, which is stored with it. The

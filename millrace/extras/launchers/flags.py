@@ -1,4 +1,4 @@
-"""The flags of each launcher, and those that all have."""
+"""The flags that all launchers share, and those of each."""
 
 from __future__ import annotations
 

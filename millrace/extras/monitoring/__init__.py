@@ -1,1 +1,1 @@
-"""Monitoring: what shows runs to people and to other programs. All of it reads what the core tells, and changes nothing."""
+"""Monitoring: shows runs to people and to other programs. It only reads what the core reports."""

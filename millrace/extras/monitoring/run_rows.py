@@ -1,4 +1,4 @@
-"""What a callback sends of a run to another program: settings, flat, and numbers, at most one row in `every_s` seconds.
+"""What callbacks send of a run to other programs: flattened settings, and a row of numbers every `every_s` seconds at most.
 
 Rule: a row with an evaluation and the last row are always sent, with what callbacks before this one logged for them. Numbers
 that are missing are left out.

@@ -1,4 +1,4 @@
-"""Episodes kept: whole, in order, as they were; and the dataset that Minari reads back."""
+"""Recorded episodes are whole, in order and unchanged, and Minari reads their dataset."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Films of games: which episodes are played together, and what the files are called."""
+"""Videos of games: which episodes are played together, and what the files are called."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Atari games: one copy, the emulator's own vectorized form and envpool show the same screens, pay and end alike."""
+"""Atari games: a single copy, ALE's vectorized form and envpool give the same screens, rewards and ends of episodes."""
 
 from __future__ import annotations
 

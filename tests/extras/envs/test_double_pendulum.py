@@ -1,4 +1,4 @@
-"""The cart with two links: its equations against sympy's, its energy, LQR, and its manners as a gymnasium environment.
+"""The double pendulum on a cart: its equations against sympy's, its energy, LQR, and gymnasium's interface.
 
 sympy and pygame are no dependencies of millrace: without them the tests that need them are skipped.
 """

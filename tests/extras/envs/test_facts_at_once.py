@@ -1,4 +1,4 @@
-"""Facts of episodes whose copies are stepped at once: by envpool, also at its time limit, and by an own vectorized form."""
+"""Facts of episodes whose copies are stepped at once: by envpool, and by an environment's own vectorized form."""
 
 from __future__ import annotations
 

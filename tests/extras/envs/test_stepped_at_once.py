@@ -1,4 +1,4 @@
-"""Copies that are stepped at once, by an own vectorized form or by envpool: step for step as the loop; refusals."""
+"""Copies that are stepped at once give what a loop gives, step for step; what they can't do is refused."""
 
 from __future__ import annotations
 

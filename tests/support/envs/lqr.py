@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator of the cart with two links, as a reference for learned policies. Pure; numpy only."""
+"""The linear-quadratic regulator of the double pendulum, as a reference for learned policies. Pure; numpy only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A dashboard beside a program or a run: served by a process of its own, so that it takes no time of the program."""
+"""Starts a dashboard beside a program or a run, in a process of its own, so that neither has to wait for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A section of the page, as HTML text: what the runs warned of. Pure."""
+"""The section of the page that lists the runs' warnings, as HTML text. Pure."""
 
 from __future__ import annotations
 
