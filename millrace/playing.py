@@ -110,7 +110,7 @@ def record(
     progress: bool = True,
     **keywords: Unpack[RecordKeywords],
 ) -> RecordedDataset:
-    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. It needs the extra `record`.
+    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. It needs the pip extra `record`.
 
     Arguments:
         run: A `Run`, or a run folder.

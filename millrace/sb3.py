@@ -1,4 +1,4 @@
-"""A Stable-Baselines3 `VecEnv` whose env copies live in worker processes. It needs the extra `peers`.
+"""A Stable-Baselines3 `VecEnv` whose env copies live in worker processes. It needs the pip extra `peers`.
 
 It replaces `SubprocVecEnv`: a process steps many env copies, and it may run on another machine.
 
