@@ -275,6 +275,7 @@ def test_an_id_is_remembered_with_its_module_if_it_is_given_with_it(
     assert type(made_elsewhere(EnvSpec.of("Game-v0")).unwrapped).__name__ == "Game"
 
 
+@pytest.mark.process
 def test_gymnasiums_own_ids_are_those_of_a_process_that_has_imported_nothing_else() -> None:
     ask = "import gymnasium; print(*gymnasium.registry)"
     fresh = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=60, check=True)
