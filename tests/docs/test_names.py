@@ -9,7 +9,9 @@ import re
 import subprocess
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 
+import gymnasium
 import pytest
 
 from millrace.cli.commands import COMMANDS
@@ -35,6 +37,7 @@ ENVIRONMENT = re.compile(r"-v\d+$")
 MADE_BY_COMMANDS = {"benchmarks/results", "benchmarks/results/", "benchmarks/peers/envs"}
 COMMANDS_OF_EXTRAS = {"csv": "docs/how-to/extras.md writes it"}
 MODULE = re.compile(r"^python3? -m (\w[\w.]*)")
+OBJECT = re.compile(r"\b(millrace(?:\.\w+)+):(\w[\w-]*)")
 EXIT_CODE = re.compile(r"exit codes? (\d+)|exits? with (?:code )?(\d+)\b")
 ABOUT_THE_CODE = ("CONTRIBUTING.md", "docs/explanation/architecture.md")
 FILE_OR_FOLDER = re.compile(r"[\w./-]+\.(?:py|md|toml|txt|yml|yaml|cff)|[\w./-]+/|[\w-]+(?:/[\w-]+)+")
@@ -52,6 +55,14 @@ def wrong_commands(path: str, text: str) -> Iterator[str]:
         for shown in shown_in(block):
             if shown.words and (complaint := mistake(shown.words)):
                 yield f"{path}:{shown.line}: millrace {' '.join(shown.words)}: {complaint}"
+
+
+def is_there(module: str, name: str) -> bool:
+    """Does a module have this class or function, or register this environment?"""
+    try:
+        return hasattr(import_module(module), name) or name in gymnasium.registry
+    except ModuleNotFoundError:
+        return False
 
 
 def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
@@ -79,6 +90,9 @@ def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
             file = ROOT / module[1].replace(".", "/")
             if not (file.with_suffix(".py").is_file() or (file / "__main__.py").is_file()):
                 yield f"{path}:{line}: there is no module {module[1]}"
+        for where, name in OBJECT.findall(code):
+            if not is_there(where, name):
+                yield f"{path}:{line}: there is no {where}:{name}"
         if METRIC.match(code) and code not in metrics and code.partition("/")[2] not in OWN_METRICS:
             yield f"{path}:{line}: there is no metric {code}"
         if PROMETHEUS.match(code) and not any(name.startswith(code) for name in of_prometheus):
@@ -211,6 +225,7 @@ millrace trian
     "text",
     [
         "`--eval-evry 3`", "`millrace train --stepz`", "`millrace trian x`", "`learner/no_such.py`", "`docs/how-to/no.md`",
+        "`--callbacks millrace.no_such:Callback`", "`millrace.policies:CMM`",
         "`python -m benchmarks.no_such`", "`train/value_los`", "`stage/learner_sleep`", "`millrace_env_stepz`",
         "It ends with exit code 3.", "It exits with 4.",
     ],
