@@ -85,7 +85,7 @@ class Picture(Protocol):
         """What a notebook shows."""
 
     def png(self) -> bytes:
-        """The picture as a PNG."""
+        """The picture as a PNG. Raises `UsageError` if its packages are not installed."""
 
     def save(self, out: str | os.PathLike[str]) -> Path:
         """Write it to a file, whose name ends in .svg or .png. Raises `UserFacingError`, with a one-line message."""
@@ -190,12 +190,13 @@ class Run(os.PathLike[str]):
     def plot(self, out: str | os.PathLike[str] | None = None) -> Picture:
         """Draw the learning curve, as `millrace plot` does. Returns a picture, which a notebook shows.
 
-        `out`: also write it to this file, whose name ends in .svg or .png. Raises `UsageError` if no episode has ended.
+        `out`: also write it to this file, whose name ends in .svg, or in .png (pip install pillow resvg_py). Raises
+        `UsageError` if no episode has ended.
 
         >>> import millrace
-        >>> picture = millrace.Run(run).plot("curve.png")
-        >>> picture.save("curve.svg").name
-        'curve.svg'
+        >>> picture = millrace.Run(run).plot("curve.svg")
+        >>> picture.save("curve.png").name
+        'curve.png'
         """
         picture: Picture = started_by("Run.plot")([self.path])
         if out is not None:

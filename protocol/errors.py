@@ -159,9 +159,9 @@ class RunError(UserFacingError):
     A training run has kept its newest whole checkpoint, from which `millrace.train(resume=run)` continues.
 
     >>> import millrace
-    >>> millrace.Run(run).plot("no-such-folder/curve.png")
+    >>> millrace.Run(run).plot("no-such-folder/curve.svg")
     Traceback (most recent call last):
-    millrace.protocol.errors.RunError: no-such-folder/curve.png not written: No such file or directory
+    millrace.protocol.errors.RunError: no-such-folder/curve.svg not written: No such file or directory
     """
 
 

@@ -635,9 +635,10 @@ def test_plot_draws_into_the_run_folder_or_where_it_is_told(tmp_path: Path, caps
         log.write(Progress(env_steps=steps, return_mean=float(steps)), {})
     log.close()
     assert main(["plot", str(run)]) == 0
-    assert capsys.readouterr().out == f"{run}/curves.png\n"
-    assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert capsys.readouterr().out == f"{run}/curves.svg\n"
+    assert (run / "curves.svg").read_text().startswith("<svg ")
     assert main(["plot", str(run), str(run), "--out", str(tmp_path / "both.png")]) == 0
+    assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "both.png").stat().st_size > 10_000
 
 

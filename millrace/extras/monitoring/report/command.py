@@ -20,7 +20,7 @@ class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     runs: Annotated[tuple[Path, ...], Flag("RUN ...", positional=True)]
     """run folders"""
     out: Annotated[Path | None, Flag("PATH")] = None
-    """file to write, as SVG or PNG; if not given, curves.png in the first run folder"""
+    """file to write, as SVG or PNG (pip install pillow resvg_py); if not given, curves.svg in the first run folder"""
 
 
 class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
@@ -36,7 +36,7 @@ def plot(argv: list[str]) -> int:
     """Draw learning curves, and print the file's path. Returns the exit code."""
     flags = parse_flags(PlotFlags, argv, "plot")
     first = _first(flags.runs, "plot")
-    print(draw(flags.runs).save(flags.out or first / "curves.png"))
+    print(draw(flags.runs).save(flags.out or first / "curves.svg"))
     return 0
 
 

@@ -47,10 +47,13 @@ class Drawing:
         return self.svg
 
     def png(self) -> bytes:
-        """The picture as a PNG."""
-        from PIL import ImageFont
-        from resvg_py import svg_to_bytes
-
+        """The picture as a PNG. Raises `UsageError` if its packages are not installed."""
+        try:
+            from PIL import ImageFont
+            from resvg_py import svg_to_bytes
+        except ModuleNotFoundError as error:
+            install = "pip install pillow resvg_py, or write an .svg, which needs neither"
+            raise UsageError(f"a PNG needs {error.name}, which is not installed; {install}") from error
         font = ImageFont.load_default(size=12)
         assert isinstance(font, ImageFont.FreeTypeFont)
         with NamedTemporaryFile(suffix=".ttf") as file:

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,18 @@ def test_what_cannot_be_plotted_is_said_in_one_line(tmp_path: Path) -> None:
         picture.save(tmp_path / "nowhere" / "curves.png")
     with pytest.raises(UsageError, match=r"curves\.pdf: expected a file that ends in \.svg or \.png"):
         picture.save("curves.pdf")
+
+
+@pytest.mark.parametrize("module", ["PIL", "resvg_py"])
+def test_without_its_packages_a_png_is_refused_and_an_svg_is_not(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    picture = draw([a_run(tmp_path / "runs")])
+    with pytest.raises(UsageError, match=f"^a PNG needs {module}, which is not installed; pip install pillow resvg_py"):
+        picture.save(tmp_path / "curves.png")
+    assert not (tmp_path / "curves.png").exists()
+    assert picture.save(tmp_path / "curves.svg").read_text() == picture.svg
 
 
 def test_a_run_without_episodes_is_left_out_beside_others_and_named(
