@@ -203,7 +203,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     keep_checkpoints: int
     """Number of checkpoints to keep, the newest ones."""
     tensorboard: bool
-    """Write the metrics as TensorBoard events too, into the folder tensorboard of the run folder."""
+    """Write the metrics as TensorBoard events too, into the folder tensorboard of the run folder (pip install
+    tensorboard).
+    """
     record: str
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
     'minari[hdf5]').

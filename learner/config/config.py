@@ -129,8 +129,10 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""
-    tensorboard: Free[bool] = True
-    """Write the metrics as TensorBoard events too, into the folder tensorboard of the run folder."""
+    tensorboard: Free[bool] = False
+    """Write the metrics as TensorBoard events too, into the folder tensorboard of the run folder
+    (pip install tensorboard).
+    """
     record: Free[str] = ""
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0
     (pip install 'minari[hdf5]').

@@ -219,7 +219,7 @@ def test_a_run_stays_in_its_folder_whoever_changes_the_current_one(
     (tmp_path / "elsewhere").mkdir()
     given: dict[str, Any] = {"wrappers": [Wanders]} if who == "environment" else {}
     callbacks = [lambda progress: os.chdir(tmp_path / "elsewhere")] if who == "callback" else []
-    run = millrace.train("CartPole-v1", run_dir="runs", steps=200, callbacks=callbacks, **given, **SMALL)
+    run = millrace.train("CartPole-v1", run_dir="runs", steps=200, tensorboard=True, callbacks=callbacks, **given, **SMALL)
     assert Path.cwd() == tmp_path / "elsewhere"
     assert run.path.parent == tmp_path / "runs"
     files = {"policy.safetensors", "summary.json", "metrics.jsonl", "checkpoints", "tensorboard"}

@@ -128,7 +128,7 @@ def test_a_run_writes_the_numbers_of_its_rows(tmp_path: Path) -> None:
         def on_update(self, progress: Progress) -> None:
             progress.log("mine", 2 * progress.updates)
 
-    folder = millrace.train(ENV, run_dir=str(tmp_path), callbacks=[Logs()], **SMALL).path
+    folder = millrace.train(ENV, run_dir=str(tmp_path), tensorboard=True, callbacks=[Logs()], **SMALL).path
     *_, last = read_rows(folder / METRICS_FILE)
     for name in ("rollout/ep_rew_mean", "custom/mine", "train/value_loss"):
         steps, value = scalars(folder, name)[-1]
@@ -136,6 +136,6 @@ def test_a_run_writes_the_numbers_of_its_rows(tmp_path: Path) -> None:
         assert value == np.float32(last[name]), name
 
 
-def test_a_run_that_is_not_to_write_them_does_not(tmp_path: Path) -> None:
-    folder = millrace.train(ENV, run_dir=str(tmp_path), tensorboard=False, **SMALL).path
+def test_a_run_that_is_not_asked_to_write_them_does_not(tmp_path: Path) -> None:
+    folder = millrace.train(ENV, run_dir=str(tmp_path), **SMALL).path
     assert not (folder / "tensorboard").exists()

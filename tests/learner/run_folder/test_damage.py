@@ -57,6 +57,7 @@ ENV = "tests.support.envs.toy:Identity-v0"
 SETTINGS: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 1, "net": (4,),
     "steps": 200, "eval_episodes": 2, "eval_every": 60, "checkpoint_every_s": 0.0,
+    "tensorboard": True,
 }  # fmt: skip
 HEAD_BYTES = 200  # bytes of a large file of which each is a place to cut
 

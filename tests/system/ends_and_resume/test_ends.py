@@ -272,7 +272,7 @@ def test_a_part_of_the_folder_that_cannot_be_written_costs_warnings_and_then_the
 
     monkeypatch.setattr(atomic_write, "TRY_FOR_S", 0.0)
     with pytest.raises(RunError) as caught:
-        run(tmp_path, watch, checkpoint_every_s=0.0)
+        run(tmp_path, watch, checkpoint_every_s=0.0, tensorboard=True)
     (folder,) = (tmp_path / "runs").iterdir()
     said = [record.getMessage() for record in caplog.records]
     assert all("\n" not in line for line in (*said, str(caught.value)))

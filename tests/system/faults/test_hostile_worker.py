@@ -109,7 +109,7 @@ def learn(folder: Path, settings: Mapping[str, object], attack: Callable[[Hostil
         mallory = KeyFolder(keys).new("mallory", datetime.now(UTC).replace(microsecond=0))
         address, metrics = f"tcp://127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
         flags = {**SMALL, **SETTINGS, "keys": keys, "metrics-bind": metrics, **settings}
-        arguments = [TOY, "--bind", address, "--run-dir", str(stage.runs)]
+        arguments = [TOY, "--bind", address, "--run-dir", str(stage.runs), "--tensorboard"]
         for name, value in flags.items():
             arguments += [f"--{name}", *str(value).split()]
         if live:
