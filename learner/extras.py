@@ -8,7 +8,11 @@ environments (`protocol/env_spec.py`). It names extras nowhere else.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+from millrace.learner.config.config import Config
+from millrace.protocol.errors import UsageError
 
 STARTED_BY = {
     "clone_epochs": "millrace.extras.datasets.cloning:clone",
@@ -22,6 +26,33 @@ STARTED_BY = {
     "tensorboard": "millrace.extras.monitoring.tensorboard:TensorBoardCallback",
 }
 """setting, or public function -> `module:name`"""
+
+
+class Packages(NamedTuple):
+    """What a setting needs that `pip install .` does not install."""
+
+    modules: tuple[str, ...]
+    """as Python imports them"""
+    install: str
+    """as pip takes them"""
+
+
+MINARI = Packages(("minari", "h5py", "PIL"), "'minari[hdf5]' pillow")
+NEEDED_BY = {
+    "metrics_bind": Packages(("prometheus_client",), "prometheus-client"),
+    "prior": MINARI,
+    "record": MINARI,
+    "tensorboard": Packages(("tensorboard",), "tensorboard"),
+}
+
+
+def check_packages(config: Config) -> None:
+    """Raise `UsageError` if a setting needs a package that is not installed. Imports nothing, so it is quick."""
+    for setting, (modules, install) in NEEDED_BY.items():
+        missing = [module for module in modules if find_spec(module) is None]
+        if getattr(config, setting) and missing:
+            flag = setting.replace("_", "-")
+            raise UsageError(f"--{flag} needs {missing[0]}, which is not installed; pip install {install}")
 
 
 def started_by(setting: str) -> Any:

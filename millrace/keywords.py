@@ -88,8 +88,8 @@ class RolloutKeywords(TypedDict, total=False):
     insecure: bool
     """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
     metrics_bind: str
-    """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the
-    network can read them. Default: no metrics are served.
+    """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464 (pip install prometheus-client). With
+    0.0.0.0:9464 everybody in the network can read them. Default: no metrics are served.
     """
     dashboard: bool
     """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
@@ -208,12 +208,12 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     record: str
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
-    'minari[hdf5]').
+    'minari[hdf5]' pillow).
     """
     prior: str
-    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]'). clone_epochs starts
-    with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it, which
-    prior_share sets.
+    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). clone_epochs
+    starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it,
+    which prior_share sets.
     """
     rollout_steps: int
     """ppo, a2c, dqn, impala, sac, td3: T, the steps of each env copy in a rollout.

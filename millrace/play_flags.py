@@ -53,7 +53,7 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
 
 
 class RecordFlags(PlayFlags, frozen=True, kw_only=True):
-    """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'minari[hdf5]')."""
+    """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'minari[hdf5]' pillow)."""
 
     out: str
     """id of the dataset, such as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""

@@ -135,13 +135,13 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     record: Free[str] = ""
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0
-    (pip install 'minari[hdf5]').
+    (pip install 'minari[hdf5]' pillow).
     """
 
     prior: Fixed[str] = ""
-    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]'). clone_epochs
-    starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it, which
-    prior_share sets.
+    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow).
+    clone_epochs starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch
+    from it, which prior_share sets.
     """
 
     def to_toml(self) -> str:

@@ -118,8 +118,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     insecure: Free[bool] = False
     """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
     metrics_bind: Free[str] = ""
-    """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network
-    can read them. Default: no metrics are served.
+    """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464 (pip install prometheus-client). With
+    0.0.0.0:9464 everybody in the network can read them. Default: no metrics are served.
     """
     dashboard: Free[bool] = False
     """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""

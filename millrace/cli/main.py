@@ -26,11 +26,8 @@ ABOUT = "Worker processes step copies of a gymnasium environment; one learner tr
 INSTALLED_IN = Path(__file__).parents[2]
 """The folder that holds `millrace`"""
 NOT_IN_WORKERS = {
-    "prometheus_client",
-    "resvg_py",
     "rich",
     "safetensors",
-    "tensorboard",
     "threadpoolctl",
     "tomli_w",
     "torch",

@@ -14,6 +14,7 @@ from millrace.launch.local_worker_options import FlagsOfWorker, no_flags, stoppe
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
 from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
+from millrace.learner.extras import check_packages
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.bind_settings import BindSettings
 from millrace.learner.resume_checks import Resumption, unless_finished
@@ -43,6 +44,7 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
 
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None, *, elsewhere: bool) -> Path:
+    check_packages(config)
     env = env or named_environment(config)
     if not elsewhere:
         check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all copies of the run are on this machine

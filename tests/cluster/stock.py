@@ -42,7 +42,9 @@ def wheels() -> list[Path]:
     if not folder.exists():
         STOCK.mkdir(parents=True, exist_ok=True)
         wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())
-        needs = [*wanted["project"]["dependencies"], *wanted["build-system"]["requires"]]
+        extras = wanted["project"]["optional-dependencies"]
+        of_learner = [*wanted["project"]["dependencies"], *extras["prometheus"], *extras["tensorboard"]]
+        needs = [*of_learner, *wanted["build-system"]["requires"]]
         half = folder.with_suffix(".half")
         shutil.rmtree(half, ignore_errors=True)
         pip = [sys.executable, "-m", "pip", "download", "--quiet", "--only-binary=:all:", f"--python-version={PYTHON}"]

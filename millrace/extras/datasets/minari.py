@@ -35,10 +35,11 @@ class MinariDataset:
         """Raises `UsageError` if such a dataset cannot be made or Minari is not installed."""
         try:
             import h5py  # noqa: F401
+            import PIL  # noqa: F401  (for Minari, which does not ask for it)
             from minari.dataset.minari_dataset import parse_dataset_id
             from minari.storage import get_dataset_path
         except ImportError as error:
-            raise UsageError("recording needs minari; pip install 'minari[hdf5]'") from error
+            raise UsageError("recording needs minari; pip install 'minari[hdf5]' pillow") from error
         try:
             parse_dataset_id(dataset_id)
         except (ValueError, TypeError):  # TypeError: a name without a version

@@ -105,11 +105,8 @@ class PriorDataset(PriorData):
 
 
 def _open(dataset_id: str) -> DatasetFiles:
-    try:
-        import h5py  # noqa: F401
-        from minari.storage import get_dataset_path
-    except ImportError as error:
-        raise UsageError("--prior needs minari; pip install 'minari[hdf5]'") from error
+    from minari.storage import get_dataset_path
+
     folder = get_dataset_path(dataset_id) / "data"
     if not os.path.lexists(folder):
         have = ", ".join(sorted(_ids(get_dataset_path()))[:5]) or "none"

@@ -568,8 +568,10 @@ def test_what_cannot_be_kept_is_said_before_a_step_is_made(
     fails(run, "ns/box-v0", UsageError, "cannot be written: no such folder", npy=tmp_path / "no" / "rows.npy")
     slashed = a_run(tmp_path / "slashed", EnvSpec("millrace-tests/Box-v0", {"key": "a/b"}))
     fails(slashed, "ns/box-v0", UsageError, "Minari cannot keep an observation whose key has a slash, a/b")
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    fails(run, "ns/box-v0", UsageError, r"recording needs minari; pip install 'minari\[hdf5\]'")
+    for module in ("h5py", "PIL"):  # Minari's own storage imports Pillow
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, module, None)
+            fails(run, "ns/box-v0", UsageError, r"recording needs minari; pip install 'minari\[hdf5\]' pillow")
     assert everything(root) == set()
 
 

@@ -10,6 +10,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import tomllib
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +24,7 @@ from millrace.cli.main import NOT_IN_WORKERS
 from millrace.extras.monitoring.prometheus import MetricsCollector, MetricsSnapshot
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.config import Config
+from millrace.learner.extras import NEEDED_BY
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.keys.key_folder import KeyFolder
@@ -30,6 +32,7 @@ from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parents[3]
 DOCKER = ROOT / "docker"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Imported where they are used: for policies that process images; for compression; for --vector envpool.
 NOT_FOR_WORKERS = {"torch", "zstandard", "envpool"}
 
@@ -37,6 +40,11 @@ NOT_FOR_WORKERS = {"torch", "zstandard", "envpool"}
 def names(file: Path) -> set[str]:
     lines = (line.partition("#")[0].strip() for line in file.read_text().splitlines())
     return {line.partition("==")[0].lower().replace("_", "-") for line in lines if line}
+
+
+def distributions(requirements: list[str]) -> set[str]:
+    """The distributions that these requirements name."""
+    return {re.split(r"[\[<>=]", line)[0].lower().replace("_", "-") for line in requirements}
 
 
 def packages(modules: set[str]) -> set[str]:
@@ -68,13 +76,18 @@ sys.exit(main(["worker", "tcp://127.0.0.1:1", "--join-timeout-s", "0.01"]))
 
 
 def test_a_worker_starts_with_the_packages_of_its_image_alone() -> None:
-    missing = NOT_IN_WORKERS | {"zstandard"}
+    missing = NOT_IN_WORKERS | {"PIL", "prometheus_client", "resvg_py", "tensorboard", "zstandard"}
     done = subprocess.run(
         [sys.executable, "-c", IN_A_WORKER_IMAGE.format(missing=missing)],
         cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert "is the learner running, and is this its address?" in done.stderr
+
+
+def test_an_installation_holds_what_workers_need_and_the_learner_s_packages() -> None:
+    needed = PROJECT["dependencies"]
+    assert distributions(needed) == names(DOCKER / "worker.txt") | packages(NOT_IN_WORKERS)
 
 
 def test_the_build_backend_is_pinned_too() -> None:
@@ -109,6 +122,18 @@ def test_the_learner_is_started_with_flags_that_it_knows(compose: dict[str, Any]
     config, resume = read_config(command, [*flags, "--run-dir", str(tmp_path)])
     assert (command, config.env, resume) == ("learner", "CartPole-v1", None)
     assert "--resume auto" in " ".join(flags)
+
+
+def test_the_learner_image_holds_the_packages_that_its_flags_need(compose: dict[str, Any]) -> None:
+    script = re.sub(r"\\\n", "", (DOCKER / "Dockerfile").read_text())
+    prints = re.search(r'^RUN (python3 -c "[^"]+")', script, re.MULTILINE)
+    assert prints is not None
+    command = prints[1].replace("/src/", f"{ROOT}/")
+    done = subprocess.run(["sh", "-euc", command], capture_output=True, text=True, timeout=60, check=True)
+    _, *flags = shlex.split(compose["services"]["learner"]["command"])
+    needed = [needed.install for setting, needed in NEEDED_BY.items() if f"--{setting.replace('_', '-')}" in flags]
+    assert sorted(needed) == ["prometheus-client", "tensorboard"]
+    assert distributions(done.stdout.split("\n")[:-1]) == distributions([*PROJECT["dependencies"], *needed])
 
 
 def test_the_ports_of_the_parts_fit_each_other(compose: dict[str, Any]) -> None:
