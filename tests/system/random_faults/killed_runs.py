@@ -217,6 +217,7 @@ class OneRun:
         number = next(self._numbers)
         said, marks = self.folder / f"said-{number}.log", self.folder / f"marks-{number}"
         arguments = ["train", "CartPole-v1", "--preset", "none", "--resume", "auto", "--run-dir", str(self.folder / "runs")]
+        arguments += ["--tensorboard"]  # one more file that a kill may cut
         for name, value in self.flags.items():
             arguments += [f"--{name}", str(value)]
         (self.folder / "tmp").mkdir(exist_ok=True)

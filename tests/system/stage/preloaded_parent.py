@@ -33,7 +33,6 @@ MOST_BYTES, MOST_FILES = 1 << 18, 16
 ADOPTED_WITHIN_S = 10.0
 LEARNER = (
     "torch",
-    "torch.utils.tensorboard",
     "millrace.learner.config.command_line",
     "millrace.learner.imports_ahead",
     "millrace.learner.run",
