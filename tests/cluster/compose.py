@@ -86,7 +86,7 @@ class Cluster:
         for source in run(["git", "ls-files", "--cached", "--others", "--exclude-standard"], where=ROOT).splitlines():
             if (ROOT / source).exists():
                 (self.folder / source).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(ROOT / source, self.folder / source)
+                shutil.copy(ROOT / source, self.folder / source, follow_symlinks=False)  # links to folders among them
         for wheel in stock.wheels():
             shutil.copy(wheel, self.folder / "docker" / "wheels")
         self.docker_folder = self.folder / "docker"
