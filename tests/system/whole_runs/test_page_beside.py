@@ -71,6 +71,14 @@ def test_it_is_of_all_runs_and_ends_when_it_is_closed(tmp_path: Path) -> None:
     assert page_processes() == []
 
 
+def test_its_process_finds_modules_where_the_program_finds_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = tmp_path / "seen"
+    (tmp_path / "sitecustomize.py").write_text(f"open({str(seen)!r}, 'w').close()\n")  # Python imports it as it starts
+    monkeypatch.syspath_prepend(tmp_path)
+    with Dashboard(tmp_path):
+        assert seen.exists()
+
+
 def test_a_run_goes_on_if_it_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho no port is free\n")

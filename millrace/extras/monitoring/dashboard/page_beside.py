@@ -41,8 +41,17 @@ class Dashboard:
         folders = [os.fspath(run) for run in runs or ("runs",)]
         command = [sys.executable, "-P", "-m", "millrace.extras.monitoring.dashboard.serve", *folders]
         pipe = subprocess.PIPE
+        # It must find millrace where this program found it, perhaps in a clone that isn't installed.
+        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         # Only this program gets the Ctrl-C of the terminal, so that open pages show how the run ended.
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, start_new_session=True)
+        self._process = subprocess.Popen(
+            command,
+            env={**os.environ, "PYTHONPATH": path},
+            stdin=pipe,
+            stdout=pipe,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         assert self._process.stdout is not None
         said, _, _ = select.select([self._process.stdout], [], [], START_WITHIN_S)
         self.address = self._process.stdout.readline().decode().strip() if said else ""
