@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
+from pkgutil import resolve_name
 
 import gymnasium
 import pytest
@@ -38,6 +39,9 @@ MADE_BY_COMMANDS = {"benchmarks/results", "benchmarks/results/", "benchmarks/pee
 COMMANDS_OF_EXTRAS = {"csv": "docs/how-to/extras.md writes it"}
 MODULE = re.compile(r"^python3? -m (\w[\w.]*)")
 OBJECT = re.compile(r"\b(millrace(?:\.\w+)+):(\w[\w-]*)")
+PUBLIC_NAME = re.compile(r"^millrace(?:\.\w+)+")
+NO_MODULES = {"millrace.commands", "millrace.copies", "millrace.run"}
+"""Groups of entry points, and a tag of MLflow"""
 EXIT_CODE = re.compile(r"exit codes? (\d+)|exits? with (?:code )?(\d+)\b")
 ABOUT_THE_CODE = ("CONTRIBUTING.md", "docs/explanation/architecture.md")
 FILE_OR_FOLDER = re.compile(r"[\w./-]+\.(?:py|md|toml|txt|yml|yaml|cff)|[\w./-]+/|[\w-]+(?:/[\w-]+)+")
@@ -63,6 +67,15 @@ def is_there(module: str, name: str) -> bool:
         return hasattr(import_module(module), name) or name in gymnasium.registry
     except ModuleNotFoundError:
         return False
+
+
+def resolves(name: str) -> bool:
+    """Is there a module, class, function or attribute of this name?"""
+    try:
+        resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
 
 
 def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
@@ -93,6 +106,8 @@ def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
         for where, name in OBJECT.findall(code):
             if not is_there(where, name):
                 yield f"{path}:{line}: there is no {where}:{name}"
+        if (dotted := PUBLIC_NAME.match(code)) and dotted[0] not in NO_MODULES and not resolves(dotted[0]):
+            yield f"{path}:{line}: there is no {dotted[0]}"
         if METRIC.match(code) and code not in metrics and code.partition("/")[2] not in OWN_METRICS:
             yield f"{path}:{line}: there is no metric {code}"
         if PROMETHEUS.match(code) and not any(name.startswith(code) for name in of_prometheus):
@@ -225,7 +240,7 @@ millrace trian
     "text",
     [
         "`--eval-evry 3`", "`millrace train --stepz`", "`millrace trian x`", "`learner/no_such.py`", "`docs/how-to/no.md`",
-        "`--callbacks millrace.no_such:Callback`", "`millrace.policies:CMM`",
+        "`--callbacks millrace.no_such:Callback`", "`millrace.policies:CMM`", "`millrace.trian(1)`",
         "`python -m benchmarks.no_such`", "`train/value_los`", "`stage/learner_sleep`", "`millrace_env_stepz`",
         "It ends with exit code 3.", "It exits with 4.",
     ],
