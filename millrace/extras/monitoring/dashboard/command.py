@@ -18,7 +18,7 @@ from millrace.protocol.errors import UsageError
 class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Show runs in a browser: curves that grow while they train, workers, who waits for whom, what went wrong."""
 
-    folders: Annotated[tuple[Path, ...], Flag("[RUNS ...]", positional=True)] = ()
+    folders: Annotated[tuple[Path, ...], Flag("RUNS ...", positional=True)] = ()
     """folders of runs, or run folders; if none is given, runs"""
     bind: str = "127.0.0.1:0"
     """where the page is served, as HOST:PORT; port 0 is a free one"""
