@@ -116,11 +116,10 @@ def the_images_hold_what_they_need(cluster: Cluster) -> None:
     for name in ("worker", "learner"):
         asks = "id -u; for tool in gcc cc g++ make pip pip3; do command -v $tool && exit 1; done; exit 0"
         assert docker("run", "--rm", "--entrypoint=sh", images[name], "-c", asks) == str(USER)
-        finds = (
-            "import importlib.util as found; print([bool(found.find_spec(name)) for name in ('pip', 'torch', 'workers')])"
-        )
+        asked = ("pip", "torch", "workers", "millrace.workers")
+        finds = f"import importlib.util as found; print([bool(found.find_spec(name)) for name in {asked}])"
         held = docker("run", "--rm", "--entrypoint=python", images[name], "-c", finds)
-        assert held == str([False, name == "learner", True])
+        assert held == str([False, name == "learner", False, True])
 
 
 def a_worker_that_is_killed_comes_back(cluster: Cluster) -> None:
