@@ -1,7 +1,8 @@
-"""Counts what one run has made, and decides by the counts when it ends, and when an evaluation or a checkpoint is due.
+"""Counts what one run has made, and decides by the counts when it ends, and when an evaluation is due.
 
-Rule: no files and no sockets. A decision depends on counts alone, so that every run of these settings makes the same ones;
-only a checkpoint is due by time. The seconds of evaluations are a stage of their own and do not count as training.
+Rule: no files and no sockets. A decision depends on counts alone, so that every run of these settings makes the same ones.
+The seconds of evaluations are a stage of their own and do not count as training. (`run_folder/checkpoint.py` says when a
+checkpoint is due.)
 """
 
 from __future__ import annotations

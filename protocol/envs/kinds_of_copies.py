@@ -20,7 +20,7 @@ from millrace.protocol.own_module import import_own
 from millrace.protocol.specs import RunSpec
 
 KINDS = {
-    "loop": "millrace.workers.copies.loop:LOOP",
+    "loop": "millrace.workers.copies.looped_kind:LOOP",
     "native": "millrace.extras.envs.kinds:NATIVE",
     "envpool": "millrace.extras.envs.kinds:ENVPOOL",
 }

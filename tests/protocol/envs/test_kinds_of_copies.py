@@ -21,7 +21,7 @@ SOURCE = """
 from gymnasium.spaces import Box, Discrete
 
 from millrace.protocol.envs.kinds_of_copies import CopiesKind
-from millrace.workers.copies.loop import open_loop
+from millrace.workers.copies.looped_kind import open_loop
 
 LOOPED = CopiesKind(open_loop, lambda env: (Box(-1.0, 1.0, (7,)), Discrete(2)))
 NOTHING = 1
