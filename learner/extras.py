@@ -7,8 +7,8 @@ environments (`protocol/env_spec.py`). It names extras nowhere else.
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from millrace.learner.config.config import Config
@@ -57,5 +57,4 @@ def check_packages(config: Config) -> None:
 
 def started_by(setting: str) -> Any:
     """Import the object that this setting starts, and return it."""
-    module, name = STARTED_BY[setting].split(":")
-    return getattr(import_module(module), name)
+    return resolve_name(STARTED_BY[setting])

@@ -7,7 +7,7 @@ torch; calling `algorithm_class` does.
 
 from __future__ import annotations
 
-from importlib import import_module
+from pkgutil import resolve_name
 
 import millrace.protocol.machine.waiting_threads  # noqa: F401  # before torch: whoever imports an algorithm imports this file first
 from millrace.learner.algorithms.algorithm import Algorithm
@@ -25,6 +25,5 @@ def algorithm_class(name: str) -> type[Algorithm]:
     if is_own(name):
         own: type[Algorithm] = own_class(name)
         return own
-    module, _, attribute = ALGORITHMS[name].partition(":")
-    found: type[Algorithm] = getattr(import_module(module), attribute)
+    found: type[Algorithm] = resolve_name(ALGORITHMS[name])
     return found

@@ -8,7 +8,7 @@ worker's packages can run the commands that need no others. Other packages insta
 
 from __future__ import annotations
 
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import NamedTuple
 
 from millrace.protocol.errors import MillraceError
@@ -62,19 +62,16 @@ def installed_commands() -> dict[str, Command]:
     """The commands that other packages install, by name. Imports none of these packages."""
     from importlib import metadata
 
-    points = metadata.entry_points(group=GROUP)
-    packages = {point.name: point.dist.name if point.dist is not None else "another package" for point in points}
     return {
-        point.name: Command(point.value, "…", f"from {packages[point.name]}")
-        for point in sorted(points)
+        point.name: Command(point.value, "…", f"from {point.dist.name if point.dist is not None else 'another package'}")
+        for point in sorted(metadata.entry_points(group=GROUP))
         if point.name not in COMMANDS
     }
 
 
 def run_command(name: str, argv: list[str]) -> int:
     """Run one of our commands with these arguments. Returns the exit code."""
-    module, function = COMMANDS[name].runs.split(":")
-    code: int = getattr(import_module(module), function)(argv)
+    code: int = resolve_name(COMMANDS[name].runs)(argv)
     return code
 
 
