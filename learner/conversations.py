@@ -19,7 +19,7 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.kinds_of_copies import copies_kind
+from millrace.protocol.envs.kinds_of_copies import has_masks
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import acting_size
 from millrace.protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats, seat_returns
@@ -51,7 +51,7 @@ def rollout_spec(
     `spaces`: those of the environment. `teams`, `scripted`: of a run with opponents.
     """
     masked, seats = spaces.masked, spaces.seats
-    if masked and config.vector != "loop" and not copies_kind(config.vector).has_masks:
+    if masked and not has_masks(config.vector):
         raise UsageError(
             f"vector {config.vector}: its environments report no action masks; use --vector loop, or --action-masks none"
         )

@@ -12,7 +12,7 @@ from millrace.learner.between_updates.tally import Tally
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.learner.run_folder.requests import Requests
-from millrace.protocol.envs.kinds_of_copies import copies_kind
+from millrace.protocol.envs.kinds_of_copies import has_attributes
 
 
 class BetweenUpdates(NamedTuple):
@@ -37,6 +37,6 @@ def open_files(run: RunParts, callbacks: Callbacks, time_limit: int | None) -> B
 
 def _why_no_attributes(vector: str) -> str:
     """Why attributes of the env copies can't be set; empty if they can."""
-    if vector == "loop" or copies_kind(vector).has_attributes:
+    if has_attributes(vector):
         return ""
     return f"the env copies of vector {vector} have no attributes"

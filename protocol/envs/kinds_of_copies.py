@@ -24,6 +24,7 @@ KINDS = {
     "native": "millrace.extras.envs.kinds:NATIVE",
     "envpool": "millrace.extras.envs.kinds:ENVPOOL",
 }
+DEFAULT = "loop"
 GROUP = "millrace.copies"
 
 
@@ -53,6 +54,16 @@ def copies_kind(name: str) -> CopiesKind:
     if not isinstance(found, CopiesKind):
         raise UsageError(f"{what}: expected {module}:{qualname} to be a CopiesKind, got {type(found).__name__}")
     return found
+
+
+def has_masks(name: str) -> bool:
+    """Whether copies of this kind report masks of the allowed actions. `loop` can do all, and is not imported to ask."""
+    return name == DEFAULT or copies_kind(name).has_masks
+
+
+def has_attributes(name: str) -> bool:
+    """Whether attributes of copies of this kind can be set. `loop` is not imported to ask, either."""
+    return name == DEFAULT or copies_kind(name).has_attributes
 
 
 def check_kind(name: str) -> None:
