@@ -8,16 +8,14 @@ import sys
 from pathlib import Path
 
 from millrace.cli.commands import COMMANDS
+from millrace.cli.main import INSTALLED_IN
 from millrace.flags.parse import asks_for_help, show_help
 from millrace.protocol.errors import UsageError
-
-HERE = Path(__file__).parents[2]
-"""The folder that holds `millrace`"""
 
 
 def run(argv: list[str]) -> int:
     """Run them. Returns the exit code."""
-    clone = next((folder for folder in (HERE, Path.cwd()) if (folder / "benchmarks" / "program.py").is_file()), None)
+    clone = next((folder for folder in (INSTALLED_IN, Path.cwd()) if (folder / "benchmarks" / "program.py").is_file()), None)
     if clone is None and asks_for_help(argv):
         show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
     if clone is None:

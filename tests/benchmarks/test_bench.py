@@ -31,7 +31,7 @@ def test_an_unknown_benchmark_is_refused(capfd: pytest.CaptureFixture[str]) -> N
 def test_where_they_are_not_installed_a_line_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("millrace.cli.bench.HERE", tmp_path)
+    monkeypatch.setattr("millrace.cli.bench.INSTALLED_IN", tmp_path)
     monkeypatch.chdir(tmp_path)
     assert main(["bench"]) == 2
     assert capsys.readouterr().err.splitlines() == [
@@ -46,7 +46,7 @@ def test_where_they_are_not_installed_a_line_says_so(
 def test_an_installed_millrace_finds_them_in_the_clone_that_is_the_current_folder(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("millrace.cli.bench.HERE", tmp_path)
+    monkeypatch.setattr("millrace.cli.bench.INSTALLED_IN", tmp_path)
     monkeypatch.chdir(ROOT)
     assert main(["bench", "--help"]) == 0
     assert capfd.readouterr().out == f"{overview()}\n"
