@@ -438,6 +438,7 @@ def test_every_public_name_of_millrace_is_documented() -> None:
 @pytest.mark.parametrize(
     ("names", "heavy"),
     [
+        ("millrace.door", SLOW_TO_IMPORT),
         ("millrace.workers.__main__", {"numpy", "gymnasium", "torch"}),
         (
             "millrace.learner.algorithms, millrace.learner.config.command_line, millrace.learner.policy_player",

@@ -13,6 +13,7 @@ import pytest
 from millrace.cli.commands import COMMANDS, GROUP
 from millrace.cli.main import main
 from tests.docs.pages import blocks
+from tests.support.installed_package import install_package
 from tests.test_architecture import ROOT
 
 Install = Callable[[str, str], None]
@@ -23,14 +24,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     """Installs a package with this module, and these entry points of our group."""
 
     def installed(source: str, entry_points: str) -> None:
-        (tmp_path / "fake_extra.py").write_text(source)
-        info = tmp_path / "fake_extra-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-extra\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{entry_points}\n")
-        monkeypatch.syspath_prepend(str(tmp_path))
+        install_package(tmp_path, monkeypatch, module="fake_extra", source=source, group=GROUP, entry_points=entry_points)
 
-    monkeypatch.delitem(sys.modules, "fake_extra", raising=False)
     yield installed
     sys.modules.pop("fake_extra", None)
 

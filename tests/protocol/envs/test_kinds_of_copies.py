@@ -16,6 +16,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import DescribeSpec
 from millrace.workers.described_copy import describing
 from tests.support.in_process.collectors import trained
+from tests.support.installed_package import install_package
 
 SOURCE = """
 from gymnasium.spaces import Box, Discrete
@@ -34,14 +35,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     """Installs a package whose entry points of our group are these."""
 
     def installed(entry_points: str) -> None:
-        (tmp_path / "fake_copies.py").write_text(SOURCE)
-        info = tmp_path / "fake_copies-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-copies\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{entry_points}\n")
-        monkeypatch.syspath_prepend(str(tmp_path))
+        install_package(tmp_path, monkeypatch, module="fake_copies", source=SOURCE, group=GROUP, entry_points=entry_points)
 
-    monkeypatch.delitem(sys.modules, "fake_copies", raising=False)
     yield installed
     sys.modules.pop("fake_copies", None)
 
