@@ -373,7 +373,7 @@ class RolloutService:
         {'0': 1}
         """
         with self._lock:
-            return self._hub.weight_age.histogram()
+            return self._hub.lag_statistics.histogram()
 
     def workers(self) -> list[str]:
         """The names of the workers that have joined.

@@ -60,7 +60,7 @@ NO_PROCESS = (
     "tests/learner/rollouts/test_status.py",
     "tests/learner/rollouts/test_ticket_coordinator.py",
     "tests/learner/rollouts/test_waiting.py",
-    "tests/learner/rollouts/test_weight_age.py",
+    "tests/learner/rollouts/test_lag_statistics.py",
     "tests/learner/run_folder/test_checkpoint.py",
     "tests/learner/run_folder/test_run_folder.py",
     "tests/learner/run_folder/test_run_format.py",

@@ -1,9 +1,9 @@
-"""Ends a process whose environment hangs, even if it hangs in C code and holds the interpreter's lock.
+"""The last resort against a hang: a process ends itself if its supervisor, which ends hung workers, could not.
 
 Rule: when nobody calls `feed` for as long as the run allows, the process writes the stack of each of its threads to stderr
-and exits at once with exit code 1. Its supervisor ends it before that (`enforce` in `supervise/worker_process.py`), unless
-the supervisor is dead or the worker hangs in our own code. The timer is a C thread of Python's faulthandler, which does not
-need the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
+and exits at once with exit code 1. Its supervisor ends it before that (`end_if_hung` in `supervise/worker_process.py`),
+unless the supervisor is dead or the worker hangs in our own code. The timer is a C thread of Python's faulthandler: it works
+also while C code holds the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class WorkerThread:
         """Nothing: a thread writes to this process's stderr."""
         return ""
 
-    def enforce(self, now: float) -> None:
+    def end_if_hung(self, now: float) -> None:
         """Nothing: a thread cannot be ended from outside."""
 
     def lower_priority(self) -> None:

@@ -18,8 +18,8 @@ from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.progress import Progress, Row, named, steps_per_second
-from millrace.learner.run_folder.requests import Requests
 from millrace.protocol.arrays import Array
 from millrace.protocol.logs.notices import log_notice
 

@@ -10,8 +10,8 @@ from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.between_updates.tally import Tally
 from millrace.learner.callbacks.callbacks import Callbacks
+from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.env_attributes import EnvAttributes
-from millrace.learner.run_folder.requests import Requests
 from millrace.protocol.envs.kinds_of_copies import has_attributes
 
 

@@ -214,8 +214,8 @@ class RunFiles:
             ended_by=None if (ended_by := self._evaluations.ended_by) is None else ended_by.return_mean,
             best=self._evaluations.confirmed,
             ledger=snapshot.ledger.counts(),
-            lags=self._hub.weight_age.histogram(),
-            first_use_s=self._hub.weight_age.first_use_s(),
+            lags=self._hub.lag_statistics.histogram(),
+            first_use_s=self._hub.lag_statistics.first_use_s(),
             stages=tally.stages(snapshot),
             versions=versions(),
         )

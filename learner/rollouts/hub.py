@@ -23,13 +23,13 @@ from millrace.learner.members.membership import Outgoing
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
+from millrace.learner.rollouts.lag_statistics import LagStatistics
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.run_status import status
 from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.rollouts.waiting import LearnerTime
-from millrace.learner.rollouts.weight_age import WeightAge
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.address import name_for_people, worker_name
 from millrace.protocol.arrays import Array, Floats
@@ -128,7 +128,7 @@ class Hub:
         self._processes = processes or ProcessCallbacks()
         self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
-        self.weight_age = WeightAge()
+        self.lag_statistics = LagStatistics()
         self._progress = Progress()
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
@@ -161,7 +161,7 @@ class Hub:
         """
         sent = to_wire_dtype(parameters, self.settings.acting_dtype)
         self._time.learned(self._clock())
-        self.weight_age.published(version, self._clock())
+        self.lag_statistics.published(version, self._clock())
         self.coordinator.publish(version, sent, buffers, env_attributes=env_attributes, env_steps=env_steps)
         if deal:
             self._server.send(self.coordinator.begin_update())
@@ -207,13 +207,13 @@ class Hub:
         self._server.send(self.coordinator.begin_update())
         taken = self._wait(rollouts.take, rollouts.waiting, watch_and_log, "no rollout came")
         self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
-        self.weight_age.used(self._lags)
+        self.lag_statistics.used(self._lags)
         return taken
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """The update of the rollouts that `gather` returned last failed: they are counted as lost."""
         self.coordinator.rollouts.not_used(taken)
-        self.weight_age.not_used(self._lags)
+        self.lag_statistics.not_used(self._lags)
 
     def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
         """Let the workers play these episodes under the newest weights; `beside` training, those that only evaluate."""
@@ -253,7 +253,7 @@ class Hub:
         finally:
             played = evaluation.end()
             self._time.turn("learning", self._clock())
-        self.weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
+        self.lag_statistics.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
         return played
 
     def pulse(self) -> None:
@@ -304,7 +304,7 @@ class Hub:
             incarnations=coordinator.rollouts.incarnations(),
             lags=self._lags,
             collected=coordinator.collected(),
-            lag_counts=dict(self.weight_age.lags),
+            lag_counts=dict(self.lag_statistics.lags),
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],
             learn_s=spent_s["learning"],
@@ -398,7 +398,7 @@ class Hub:
         waiting = self.coordinator.rollouts.waiting()
         out = self.coordinator.receive(peer, message, now)
         if self.coordinator.rollouts.waiting() > waiting:  # of a ticket that this worker held
-            self.weight_age.arrived(name_for_people(peer), message.version, now)
+            self.lag_statistics.arrived(name_for_people(peer), message.version, now)
             self._failures.collected(message.lane)
         return out
 

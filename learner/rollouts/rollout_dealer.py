@@ -1,6 +1,6 @@
 """The tickets for rollouts: which rounds are open, which worker collects what, and what has come. Pure.
 
-Rule: a ticket is the permission for one rollout: of this lane, in this round, under this version. `rounds.py` says which
+Rule: a ticket is the permission for one rollout: of this lane, in this round, under this version. `lag_rule.py` says which
 rounds are open, and each lane gets a ticket for every one of them. When a ticket is lost, its round is dealt again, under
 the same version. Every ticket and every transition is counted in the ledger.
 """
@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
-from millrace.learner.rollouts.rounds import Rounds
 from millrace.protocol.messages import Collect, Permit, Received, Rollout, versions_of
 
 

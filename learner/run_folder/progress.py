@@ -10,7 +10,7 @@ from typing import Any, SupportsFloat
 
 import msgspec
 
-from millrace.learner.run_folder.requests import Requests
+from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, FactMean, fact_metrics
 from millrace.protocol.errors import UsageError
 from millrace.protocol.rollout import Episode, Rollout

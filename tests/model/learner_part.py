@@ -11,10 +11,10 @@ from typing import Self, TypeVar
 from millrace.learner.members.lane_placement import LanePlacement
 from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
+from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
-from millrace.learner.rollouts.rounds import Rounds
 from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.messages import ToLearner, WorkerExit
@@ -227,7 +227,7 @@ class Learner:
         self._check_rounds()
 
     def _check_rounds(self) -> None:
-        """Each lane has every open round once: due, with a worker, or waiting. Round u acts under what `rounds.py` says."""
+        """Each lane has every open round once: due, with a worker, or waiting. A round acts as `lag_rule.py` says."""
         coordinator, rounds = self.coordinator, self.coordinator.rollouts.rounds
         opened = list(rounds._versions)
         assert opened == list(range(rounds.next, rounds.next + len(opened))), "an open round is missing"

@@ -15,9 +15,9 @@ from millrace.learner.members.lane_placement import LanePlacement
 from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer
+from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
-from millrace.learner.rollouts.rounds import Rounds
 from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane

@@ -22,7 +22,7 @@ from millrace.protocol.envs.unknown_ids import load_plugins, what_to_write
 from millrace.protocol.envs.wrappers import wrap
 from millrace.protocol.errors import UsageError, first_line, joined, safe_repr, words_an_error, worker_exception
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
-from millrace.workers.copies.facts import facts_of_info
+from millrace.workers.copies.episode_facts import facts_of_info
 from millrace.workers.copies.mask_reader import _shown
 from millrace.workers.copies.row_writers import missing_leaf, one_number
 

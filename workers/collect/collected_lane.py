@@ -1,4 +1,4 @@
-"""One lane that a worker collects on: its env copies, their running episodes, and the random generator of its actions.
+"""One lane that a worker collects on: its env copies, the return and length of their running episodes, its random generator.
 
 It keeps what one rollout passes on to the next: the last observations, which copies have ended, the running episodes. The
 collector steps it.
@@ -24,7 +24,7 @@ from millrace.workers.collect.seat_rows import SeatRows
 from millrace.workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.facts import Facts
+from millrace.workers.copies.episode_facts import Facts
 from millrace.workers.copies.row_writers import ObservationWriter
 from millrace.workers.copies.seated_copies import SeatedCopies
 from millrace.workers.opponents import Opponent

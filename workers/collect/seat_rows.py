@@ -20,7 +20,7 @@ from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, wrong_episode
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import SeatColumns, StepResult
 from millrace.workers.copies.env_errors import environment_failed
-from millrace.workers.copies.facts import Facts
+from millrace.workers.copies.episode_facts import Facts
 from millrace.workers.copies.value_checks import check_rewards
 from millrace.workers.opponents import Match, Opponent, OtherTeams, whole_episode
 

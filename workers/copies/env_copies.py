@@ -28,7 +28,7 @@ from millrace.protocol.wire.plain_values import unpack
 from millrace.workers.activity import EVALUATING, MAKING, STEPPING, activity
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
-from millrace.workers.copies.facts import Facts, facts_of_info
+from millrace.workers.copies.episode_facts import Facts, facts_of_info
 from millrace.workers.copies.mask_reader import MaskReader, unused_mask
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.row_writers import read_leaves

@@ -17,7 +17,7 @@ from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from millrace.workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.facts import facts_of_info
+from millrace.workers.copies.episode_facts import facts_of_info
 from millrace.workers.copies.mask_reader import unused_mask
 from millrace.workers.copies.row_writers import read_leaves
 

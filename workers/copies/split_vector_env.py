@@ -23,7 +23,7 @@ from millrace.protocol.wire.plain_values import unpack
 from millrace.workers.copies.env_copies import EnvCopies, Leaves, StepResult
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.facts import Facts, facts_of_copies, of_ended
+from millrace.workers.copies.episode_facts import Facts, facts_of_copies, of_ended
 from millrace.workers.copies.mask_reader import MaskReader
 
 METHODS = ("close", "render", "reset", "step")  # of every environment

@@ -64,7 +64,7 @@ class Running(Protocol):
         """The last line that it wrote to a log of its own; empty if it has written nothing, or has no log."""
         ...
 
-    def enforce(self, now: float) -> None:
+    def end_if_hung(self, now: float) -> None:
         """End it if a call of the user's code takes longer than its run allows."""
         ...
 
@@ -153,7 +153,7 @@ class Supervisor:
             self._enforce_due_s = now + ENFORCE_EVERY_S
         for worker in self._workers:
             if worker.running is not None and enforce:
-                worker.running.enforce(now)
+                worker.running.end_if_hung(now)
             if worker.running is not None and (end := worker.running.ended()) is not None:
                 name, nonce = worker.running.name, worker.running.process_nonce  # the learner knows it by this name
                 self._record_end(worker, end, now)

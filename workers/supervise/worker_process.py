@@ -139,7 +139,7 @@ class WorkerProcess:
         """The last line of its log that it wrote itself; empty if it has none."""
         return one_line("".join(self._output().strip().splitlines()[-1:]))
 
-    def enforce(self, now: float) -> None:
+    def end_if_hung(self, now: float) -> None:
         """End it if a call of the user's code takes longer than its run allows, or if it does not end although it leaves."""
         if not self._runs():
             return

@@ -20,7 +20,7 @@ from millrace.workers.activity import RESETTING, STEPPING, activity
 from millrace.workers.copies.env_copies import Leaves, StepResult
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.facts import facts_of_copies, of_ended
+from millrace.workers.copies.episode_facts import facts_of_copies, of_ended
 from millrace.workers.copy_slots import close_copy, give_back
 
 

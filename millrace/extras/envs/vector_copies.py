@@ -21,7 +21,7 @@ from millrace.workers.activity import RESETTING, STEPPING, activity
 from millrace.workers.copies.env_copies import Leaves, StepResult, set_attribute
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.facts import Facts, facts_of_copies, of_ended
+from millrace.workers.copies.episode_facts import Facts, facts_of_copies, of_ended
 from millrace.workers.copies.mask_reader import MaskReader, unused_mask
 from millrace.workers.copies.row_writers import missing_leaf
 from millrace.workers.copy_slots import close_copy

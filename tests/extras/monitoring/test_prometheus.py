@@ -113,7 +113,7 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     learning.publish(0)
     learning.deliver_all()
     assert learning.coordinator.rollouts.take()
-    hub.weight_age.used([0, 0, 3])
+    hub.lag_statistics.used([0, 0, 3])
     learning.publish(1)
     process_ends(learning.coordinator, "a", "was killed")
     learning.coordinator.reject_message(B, "rubbish", 0.0)

@@ -14,9 +14,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import millrace
 from millrace.extras.monitoring.tensorboard import TensorBoardCallback
+from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, Progress
-from millrace.learner.run_folder.requests import Requests
 from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.errors import RunError

@@ -13,8 +13,8 @@ import millrace
 from millrace.extras.monitoring.mlflow import MlflowCallback
 from millrace.extras.monitoring.run_rows import RowFilter
 from millrace.extras.monitoring.wandb import WandbCallback
+from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.progress import Progress
-from millrace.learner.run_folder.requests import Requests
 
 ENV = "tests.support.envs.toy:Identity-v0"
 SMALL: dict[str, Any] = {

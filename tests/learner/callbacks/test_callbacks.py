@@ -14,8 +14,8 @@ import torch
 
 from millrace.learner.callbacks.callback import Callback
 from millrace.learner.callbacks.callbacks import MOMENTS, Callbacks
+from millrace.learner.run_folder.callback_requests import MOST_LOGGED, Requests
 from millrace.learner.run_folder.progress import Progress
-from millrace.learner.run_folder.requests import MOST_LOGGED, Requests
 from millrace.protocol.errors import UsageError
 
 NOW = Progress(env_steps=7)

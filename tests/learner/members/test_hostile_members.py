@@ -17,8 +17,8 @@ from millrace.learner.members.member_server import TURN_S
 from millrace.learner.members.membership import MAX_MEMBERS, REMEMBERED
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_statistics import WORKERS, LagStatistics
 from millrace.learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
-from millrace.learner.rollouts.weight_age import WORKERS, WeightAge
 from millrace.protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
@@ -176,7 +176,7 @@ def test_what_is_kept_of_workers_that_left_is_limited() -> None:
     logging.disable(logging.NOTSET)
     assert set(noisy.coordinator.members) == {b"honest"}
     assert len(stages._removed_for_silence) == REMEMBERED
-    assert len(noisy.hub.weight_age._newest_used) == 0, "a rollout counts for the weights' age only if it was accepted"
+    assert len(noisy.hub.lag_statistics._newest_used) == 0, "a rollout counts for the weights' age only if it was accepted"
     assert stages.stages().keys() == {"step"}
     assert 0 < stages.stages()["step"] < 0.1 * (REMEMBERED + 500), "no session has taken longer than it lasted"
 
@@ -194,7 +194,7 @@ def test_the_stages_of_a_process_that_joins_again_are_counted_once() -> None:
 
 
 def test_measurements_of_the_weights_age_are_kept_of_a_limited_number_of_workers() -> None:
-    age = WeightAge()
+    age = LagStatistics()
     age.published(0, 0.0)
     for number in range(3 * WORKERS):
         age.arrived("honest", 0, 1.0)

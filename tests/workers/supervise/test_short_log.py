@@ -92,7 +92,7 @@ def test_a_supervisor_keeps_the_log_of_a_loud_simulator_short(tmp_path: Path, mo
     worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0", log))
     monkeypatch.setattr(worker, "_runs", lambda: True)
     os.waitid(os.P_PID, worker.pid, os.WEXITED | os.WNOWAIT)
-    worker.enforce(time.monotonic())
+    worker.end_if_hung(time.monotonic())
     monkeypatch.undo()
     assert log.read_bytes().startswith(b"line 0\n")
     assert log.stat().st_size < 2_000

@@ -47,7 +47,7 @@ class FakeRunning:
     def activity(self, now: float) -> WorkerActivity | None:
         return WorkerActivity(self.name, NONCE, self.doing, now - self.since_s, 0) if self.end is None else None
 
-    def enforce(self, now: float) -> None:
+    def end_if_hung(self, now: float) -> None:
         self.enforced.append(now)
 
     def lower_priority(self) -> None:

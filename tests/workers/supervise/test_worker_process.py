@@ -178,7 +178,7 @@ def test_a_call_is_ended_by_the_timeout_that_the_run_of_its_worker_has(monkeypat
         for limit_s, after_s, ends in ((0.0, 1e6, False), (30.0, 29.0, False), (30.0, 31.0, True)):
             page.limit(CallTimeouts(1.0, limit_s))
             for _ in range(2):
-                worker.enforce(began_s + after_s)
+                worker.end_if_hung(began_s + after_s)
             assert (worker._because != "") == ends
     finally:
         worker.wait(0.0 if not worker._because else WITHIN_S)

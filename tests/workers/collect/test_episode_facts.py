@@ -19,7 +19,7 @@ from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.copies.env_errors import CopyFailed
-from millrace.workers.copies.facts import facts_of_copies, facts_of_info
+from millrace.workers.copies.episode_facts import facts_of_copies, facts_of_info
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.in_process.collectors import (

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from millrace.learner.rollouts.weight_age import REMEMBERED, WeightAge
+from millrace.learner.rollouts.lag_statistics import REMEMBERED, LagStatistics
 
 
 def test_lags_are_counted() -> None:
-    fresh = WeightAge()
+    fresh = LagStatistics()
     fresh.used([2, 0, 0])
     fresh.used([1, 0])
     assert fresh.histogram() == {"0": 3, "1": 1, "2": 1}
@@ -14,7 +14,7 @@ def test_lags_are_counted() -> None:
 
 
 def test_only_a_workers_first_rollout_under_new_weights_tells_how_long_they_took() -> None:
-    fresh = WeightAge()
+    fresh = LagStatistics()
     for version in range(3):
         fresh.published(version, 10.0 * version)
     fresh.arrived("a", 0, 1.0)
@@ -26,7 +26,7 @@ def test_only_a_workers_first_rollout_under_new_weights_tells_how_long_they_took
 
 
 def test_versions_of_before_this_learner_and_of_long_ago_tell_nothing() -> None:
-    fresh = WeightAge()
+    fresh = LagStatistics()
     fresh.arrived("a", 5, 1.0)
     for version in range(6, 10 + REMEMBERED):
         fresh.published(version, float(version))

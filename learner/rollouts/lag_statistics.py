@@ -15,7 +15,7 @@ REMEMBERED = 1_000  # the newest versions, and the newest measurements of each w
 WORKERS = 1_000  # of which measurements are kept; of more, the newest
 
 
-class WeightAge:
+class LagStatistics:
     """Lags and first-use times since this learner started."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Which weights act in which round. Pure.
+"""The lag rule: how far behind the newest weights the acting ones may be, and so which weights act in which round. Pure.
 
 Rule: update u takes round u, which is one rollout of every lane. All of them act under one version: the newest one when
 update u - L began, or when the first update began if u < L, where L is `max_lag`. So nobody's speed decides what a run
