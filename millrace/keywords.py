@@ -121,7 +121,7 @@ class RolloutKeywords(TypedDict, total=False):
 class TrainKeywords(RolloutKeywords, total=False):
     """Keywords of `millrace.train`."""
 
-    algo: Literal["ppo", "a2c", "dqn", "impala", "reinforce", "sac", "td3"] | str | type
+    algo: Literal["ppo", "a2c", "dqn", "impala", "reinforce", "sac", "td3", "tqc", "crossq", "xqc"] | str | type
     """Learning algorithm: a built-in one, or your own, such as my_module:MyClass. `--algo NAME --help` shows its
     settings.
     """
@@ -216,13 +216,14 @@ class TrainKeywords(RolloutKeywords, total=False):
     which prior_share sets.
     """
     rollout_steps: int
-    """ppo, a2c, dqn, impala, sac, td3: T, the steps of each env copy in a rollout.
+    """ppo, a2c, dqn, impala, sac, td3, tqc, crossq, xqc: T, the steps of each env copy in a rollout.
     reinforce: T, the steps of each env copy in a rollout. Must be longer than any episode.
     """
     net: Sequence[int]
     """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers: of the actor and of the critic each, or of the
     Q-network.
-    sac, td3: Sizes of the hidden layers: of the actor and of each critic.
+    sac, td3, tqc: Sizes of the hidden layers: of the actor and of each critic.
+    crossq, xqc: Sizes of the hidden layers of the actor.
     """
     activation: Literal["tanh", "relu"]
     """Activation function of the hidden layers."""
@@ -233,16 +234,16 @@ class TrainKeywords(RolloutKeywords, total=False):
     normalize_observations: bool
     """ppo: Normalize observations, except images: subtract the running mean, divide by the running standard deviation,
     clip to ±10. docs/how-to/algorithms.md shows why PPO does by default.
-    a2c, dqn, impala, reinforce, sac, td3: Normalize observations, except images: subtract the running mean, divide by
-    the running standard deviation, clip to ±10.
+    a2c, dqn, impala, reinforce, sac, td3, tqc, crossq, xqc: Normalize observations, except images: subtract the
+    running mean, divide by the running standard deviation, clip to ±10.
     """
     gamma: float
     """Discount factor."""
     shared_net: bool
     """ppo, a2c, impala, reinforce: Let actor and critic share their hidden layers."""
     learning_rate: float
-    """ppo, a2c, dqn, impala, reinforce, sac: Learning rate of the optimizer.
-    td3: Learning rate of the optimizers.
+    """ppo, a2c, dqn, impala, reinforce, sac, tqc, xqc: Learning rate of the optimizer.
+    td3, crossq: Learning rate of the optimizers.
     """
     learning_rate_schedule: Literal["constant", "linear"]
     """linear: the learning rate falls to zero over the run."""
@@ -252,7 +253,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     ent_coef: float | None
     """ppo, a2c, impala, reinforce: Weight of the entropy bonus in the loss.
-    sac: Temperature α: the weight of the entropy. none: learned, so that the entropy stays near target_entropy.
+    sac, tqc, crossq, xqc: Temperature α: the weight of the entropy. none: learned, so that the entropy stays near
+    target_entropy.
     """
     vf_coef: float
     """ppo, a2c, impala, reinforce: Weight of the value loss in the loss."""
@@ -264,16 +266,18 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo, a2c, impala, reinforce: Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: bool
     """ppo, a2c, impala: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
-    dqn, sac, td3: Divide rewards by the running standard deviation of the discounted return, when they are drawn from
-    the buffer, and clip them to ±10; with n_step, the sum of n rewards.
+    dqn, sac, td3, tqc, crossq: Divide rewards by the running standard deviation of the discounted return, when they
+    are drawn from the buffer, and clip them to ±10; with n_step, the sum of n rewards.
     reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
     Otherwise the loss of the baseline dominates the gradient.
+    xqc: Divide rewards by the running standard deviation of the discounted return, and by so much that no discounted
+    return so far exceeds return_bound.
     """
     clone_epochs: int
     """ppo, a2c, impala, reinforce: Number of epochs of cloning on the dataset of --prior, before the first rollouts are
     collected: the actor learns its actions, the critic its returns. Needs --prior.
-    sac, td3: Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the
-    actor learns its actions. Needs --prior.
+    sac, td3, tqc, crossq, xqc: Number of epochs of cloning on the dataset of --prior, before prior_steps and the first
+    rollouts: the actor learns its actions. Needs --prior.
     """
     core: Literal["lstm", "gru"] | None
     """ppo, a2c, impala: Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T
@@ -283,7 +287,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo, a2c, impala: Number of units of the recurrent layer."""
     batch_size: int
     """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more.
-    dqn, sac, td3: Number of transitions in a gradient step.
+    dqn, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step.
     """
     n_epochs: int
     """ppo: Number of epochs: how often an update uses each row.
@@ -305,34 +309,38 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo: End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
     learning_starts: int | float
     """dqn: Number of env steps before the first gradient step.
-    sac, td3: Number of env steps before the first gradient step. Until then, actions are drawn uniformly.
+    sac, td3, tqc, crossq, xqc: Number of env steps before the first gradient step. Until then, actions are drawn
+    uniformly.
     """
     replay_size: int | float
-    """dqn, sac, td3: Capacity of the replay buffer in transitions; the newest are kept. The final observation of a
-    truncated episode takes the place of one.
+    """dqn, sac, td3, tqc, crossq, xqc: Capacity of the replay buffer in transitions; the newest are kept. The final
+    observation of a truncated episode takes the place of one.
     """
     priority_alpha: float
-    """dqn, sac, td3: α of prioritized replay: how far its last TD error decides how often a transition is drawn from the
-    replay buffer. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
+    """dqn, sac, td3, tqc, crossq, xqc: α of prioritized replay: how far its last TD error decides how often a transition
+    is drawn from the replay buffer. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
     """
     priority_beta: float
-    """dqn, sac, td3: Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully)
-    over the run.
+    """dqn, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how far importance weights correct the bias. It
+    grows to 1 (fully) over the run.
     """
     prior_share: float
-    """dqn, sac, td3: Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
+    """dqn, sac, td3, tqc, crossq, xqc: Share of each minibatch that is prior data, in a run with --prior (Ball et al.
+    2023 use 0.5).
+    """
     prior_steps: int | float
-    """dqn, sac, td3: Number of gradient steps on prior data alone, before the first rollouts are collected. Needs
-    --prior.
+    """dqn, sac, td3, tqc, crossq, xqc: Number of gradient steps on prior data alone, before the first rollouts are
+    collected. Needs --prior.
     """
     n_step: int
-    """dqn, sac, td3: Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there
-    are several.
+    """dqn, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps; those of one agent, in its own
+    time, if there are several.
     """
     tau: float
     """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one,
     such as 0.005, take target_every 1 (polyak averaging).
-    sac, td3: τ of the polyak update: the fraction by which the target network moves in each gradient step.
+    sac, td3, tqc, crossq, xqc: τ of the polyak update: the fraction by which the target network moves in each gradient
+    step.
     """
     amsgrad: bool
     """dqn: Use the AMSGrad variant of the optimizer."""
@@ -377,19 +385,37 @@ class TrainKeywords(RolloutKeywords, total=False):
     normalize_returns: bool
     """reinforce: Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
     updates_per_step: float
-    """sac, td3: Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts
-    are.
+    """sac, td3, tqc, crossq, xqc: Replay ratio: gradient steps for each env step after learning_starts. It is exact,
+    whatever the rollouts are.
     """
     target_entropy: float | None
-    """sac: The entropy that a learned temperature aims at. none: minus the number of the action's elements."""
+    """sac, tqc, crossq, xqc: The entropy that a learned temperature aims at. none: minus the number of the action's
+    elements.
+    """
     exploration_noise: float
     """td3: Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
     policy_delay: int
-    """td3: Number of gradient steps of the critics for each one of the actor and of the target networks."""
+    """td3: Number of gradient steps of the critics for each one of the actor and of the target networks.
+    crossq, xqc: Number of gradient steps of the critics for each one of the actor and of the temperature.
+    """
     target_noise: float
     """td3: Standard deviation of the noise that is added to the actions of targets."""
     target_noise_clip: float
     """td3: Clip the noise of targets to ± this."""
+    critics: int
+    """tqc: Number of critics."""
+    quantiles: int
+    """tqc: Number of quantiles that each critic learns."""
+    dropped_quantiles: int
+    """tqc: Number of quantiles for each critic that targets leave out, the highest, so that values are not overestimated."""
+    critic_net: Sequence[int]
+    """crossq, xqc: Sizes of the hidden layers of each critic."""
+    renormalize_after: int
+    """crossq: Number of gradient steps after which batch normalization becomes batch renormalization."""
+    atoms: int
+    """xqc: Number of returns whose probabilities a critic learns, equally spaced from -return_bound to return_bound."""
+    return_bound: float
+    """xqc: Largest return, in units of scaled reward, that a critic can learn."""
 
 
 class PlayKeywords(TypedDict, total=False):

@@ -46,7 +46,7 @@ class Start(NamedTuple):
         if "observations" in state:
             taken["observations"] = state["observations"]
         if "rewards" in state and "rewards" in fresh:
-            taken["rewards"] = {"moments": state["rewards"]["moments"], "returns": {}}
+            taken["rewards"] = state["rewards"] | {"returns": {}}
         for name in weights if self.critic else {"parameters", "target"}.intersection(weights):
             own = taken[name] = fresh[name].clone()
             found = state[name if self.critic else "parameters"]

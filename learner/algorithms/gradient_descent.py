@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -22,13 +22,19 @@ from millrace.learner.algorithms.normalization import ObservationNormalizer, Rew
 from millrace.learner.algorithms.prior_data import PriorData
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import RunError, UsageError
-from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 UpdateMetrics = dict[str, float]
 
 ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards"
+
+
+class Network(Protocol):
+    """What every network is."""
+
+    flat: Tensor
+    """[P] all parameters"""
 
 
 class GradientDescent(Algorithm):
@@ -40,7 +46,7 @@ class GradientDescent(Algorithm):
 
     tensors: dict[str, Tensor]
     """The tensors that steps change in place, by their names in the saved state."""
-    net: ActorCriticNetwork | QNetwork | ActorAndCritics
+    net: Network
     optimizers: dict[str, Optimizer]
     """The optimizers, each of one flat tensor that has a gradient, by their names in the saved state."""
 

@@ -178,6 +178,7 @@ class RewardScaler:
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
         self._moments = RunningMoments()
+        self._largest = 0.0  # size of a discounted return so far
         self._returns: dict[int, Doubles] = {}  # lane -> [copies]
 
     def count_and_scale(self, batch: Batch) -> Floats:
@@ -189,6 +190,11 @@ class RewardScaler:
         """These rewards, scaled and clipped to ±10 as VecNormalize of Stable-Baselines3 does, float32."""
         clipped: Floats = np.clip(reward / self.std, -CLIP, CLIP).astype(np.float32)
         return clipped
+
+    def bounded(self, reward: Floats, bound: float) -> Floats:
+        """These rewards divided so that no discounted return so far exceeds the bound, and by `std` at least, float32."""
+        divided: Floats = (reward / max(self.std, self._largest / bound)).astype(np.float32)
+        return divided
 
     @property
     def std(self) -> float:
@@ -207,16 +213,20 @@ class RewardScaler:
             found, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )
-            self._moments.update(found[ends.valid[:, columns]])
+            valid = found[ends.valid[:, columns]]
+            self._moments.update(valid)
+            self._largest = max(self._largest, float(abs(valid).max(initial=0)))
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""
         return {
             "moments": self._moments.state_dict(),
+            "largest": self._largest,
             "returns": {lane: torch.tensor(found) for lane, found in self._returns.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state["moments"])
+        self._largest = float(state["largest"])
         self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}

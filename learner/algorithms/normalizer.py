@@ -110,7 +110,7 @@ class Normalizer:
         self._observations.load_state_dict(_tensors(state["observations"]))
         if "gamma" in state:
             scaler = RewardScaler(state["gamma"])
-            scaler.load_state_dict({"moments": _tensors(state["rewards"]), "returns": {}})
+            scaler.load_state_dict(scaler.state_dict() | {"moments": _tensors(state["rewards"])})
             self._rewards = state["gamma"], scaler
 
 

@@ -13,6 +13,7 @@ from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from millrace.learner.config.hyperparameters import TD3Config
+from millrace.protocol.policy.networks import ActorAndCritics
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -20,6 +21,7 @@ class TD3(Continuous):
     """An actor and two critics, with a target for each."""
 
     Config = TD3Config
+    net: ActorAndCritics
 
     @staticmethod
     def policy_spec(config: TD3Config, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:

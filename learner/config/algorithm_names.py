@@ -31,6 +31,9 @@ ALGORITHMS = {
     "reinforce": "millrace.learner.algorithms.reinforce:REINFORCE",
     "sac": "millrace.learner.algorithms.sac:SAC",
     "td3": "millrace.learner.algorithms.td3:TD3",
+    "tqc": "millrace.learner.algorithms.tqc:TQC",
+    "crossq": "millrace.learner.algorithms.crossq:CrossQ",
+    "xqc": "millrace.learner.algorithms.xqc:XQC",
 }
 """`module:Class` of each algorithm of ours, imported when it is used"""
 

@@ -279,6 +279,58 @@ class SACConfig(ContinuousConfig, frozen=True):
     """The entropy that a learned temperature aims at. none: minus the number of the action's elements."""
 
 
+class TQCConfig(SACConfig, frozen=True):
+    """Truncated quantile critics (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return."""
+
+    critics: Fixed[Count] = 2
+    """Number of critics."""
+    quantiles: Fixed[Count] = 25
+    """Number of quantiles that each critic learns."""
+    dropped_quantiles: Free[Natural] = 2
+    """Number of quantiles for each critic that targets leave out, the highest, so that values are not overestimated."""
+
+
+class NormalizedConfig(SACConfig, frozen=True):
+    """Settings of SAC with batch normalization in the actor and the critics."""
+
+    critic_net: Fixed[tuple[Count, ...]] = (256, 256)
+    """Sizes of the hidden layers of each critic."""
+    learning_starts: Free[Natural] = 5000
+    """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
+    policy_delay: Free[Count] = 3
+    """Number of gradient steps of the critics for each one of the actor and of the temperature."""
+
+
+class CrossQConfig(NormalizedConfig, frozen=True):
+    """CrossQ (Bhatt et al. 2024): batch normalization in place of target networks."""
+
+    net: Fixed[tuple[Count, ...]] = (256, 256)
+    """Sizes of the hidden layers of the actor."""
+    critic_net: Fixed[tuple[Count, ...]] = (1024, 1024)
+    """Sizes of the hidden layers of each critic."""
+    learning_rate: Free[Positive] = 1e-3
+    """Learning rate of the optimizers."""
+    renormalize_after: Free[Natural] = 100_000
+    """Number of gradient steps after which batch normalization becomes batch renormalization."""
+
+
+class XQCConfig(NormalizedConfig, frozen=True):
+    """XQC (Palenicek et al. 2025): batch normalization, weights of norm 1, critics of a distribution of returns."""
+
+    net: Fixed[tuple[Count, ...]] = (256, 256)
+    """Sizes of the hidden layers of the actor."""
+    critic_net: Fixed[tuple[Count, ...]] = (256, 256, 256)
+    """Sizes of the hidden layers of each critic."""
+    atoms: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 101
+    """Number of returns whose probabilities a critic learns, equally spaced from -return_bound to return_bound."""
+    return_bound: Fixed[Positive] = 5.0
+    """Largest return, in units of scaled reward, that a critic can learn."""
+    normalize_rewards: Fixed[bool] = True
+    """Divide rewards by the running standard deviation of the discounted return, and by so much that no discounted return so
+    far exceeds return_bound.
+    """
+
+
 class TD3Config(ContinuousConfig, frozen=True):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
 
@@ -302,6 +354,9 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
     "reinforce": REINFORCEConfig,
     "sac": SACConfig,
     "td3": TD3Config,
+    "tqc": TQCConfig,
+    "crossq": CrossQConfig,
+    "xqc": XQCConfig,
 }
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from millrace.protocol.arrays import Floats
 from millrace.protocol.policy.encoder import make_encoder
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import (
@@ -400,6 +401,10 @@ class ActorAndCritics(FlatNetwork):
         self.actor.grad, self.critics.grad = (self.flat_grad[end] for end in ends)
         self._actor = self.layers([*hidden_names(spec), "actor.out"])
         self._critics = trainable(self.critics, self.critics.grad)
+
+    def acting_parameters(self) -> Floats:
+        """A copy of the parameters [A] that workers act with."""
+        return self.actor.cpu().numpy().copy()
 
     def _stacked(self, critics: int, flat: Tensor) -> list[Tensor]:
         """Weight [critics, out, in] and bias [critics, out] of each layer of the critics, as views of `flat` [C]."""

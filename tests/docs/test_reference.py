@@ -36,6 +36,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "dqn": {"algo": "dqn", "learning_starts": 0, "gradient_steps": 1},
     "sac": {"env": "Pendulum-v1", "algo": "sac", "learning_starts": 0, "batch_size": 8, "net": (8,)},
     "self-play": {"env": "tests.support.users_code.seat_envs:RockPaperScissors", "algo": "ppo", "self_play": 1},
+    "xqc": {"env": "Pendulum-v1", "algo": "xqc", "learning_starts": 0, "batch_size": 8, "net": (8,), "policy_delay": 1},
     "td3": {"env": "Pendulum-v1", "algo": "td3", "learning_starts": 0, "batch_size": 8, "net": (8,)},
 }
 OF_MONITORING = ("dashboard.Dashboard", "wandb.WandbCallback", "mlflow.MlflowCallback")

@@ -7,9 +7,9 @@ size of the rollouts and the number and speed of the workers. Where these settin
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -25,16 +25,44 @@ from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import ContinuousConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.networks import ActorAndCritics
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+
+
+class Networks(Protocol):
+    """An actor and critics, such as `ActorAndCritics`: x are features [B, D], actions [B, D′] are in [-1, 1]."""
+
+    flat: Tensor
+    """[A + C] all parameters, those of the actor first"""
+    actor: Tensor
+    """[A] in the memory of `flat`, with a gradient"""
+    critics: Tensor
+    """[C] in the memory of `flat`, with a gradient"""
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """The actor's output before the tangent, [B, D′] or [B, 2 D′]."""
+        ...
+
+    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions and their log-densities [B], for noise [B, D′]."""
+        ...
+
+    def values(self, x: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
+        """Values [critics, B]. `constant`: the critics get no gradient; the actions do."""
+        ...
+
+    def acting_parameters(self) -> Floats:
+        """A copy of the parameters [P] that workers act with."""
+        ...
 
 
 class Continuous(OffPolicy):
     """An off-policy algorithm for a bounded Box: the networks, their targets, their optimizers and the source of noise."""
 
     Config = ContinuousConfig
-    net: ActorAndCritics
+    ADAM: ClassVar[Mapping[str, Any]] = {}
+    """Arguments of torch's Adam, for the actor and the critics"""
+    net: Networks
 
     @classmethod
     def bounded_policy_spec(
@@ -69,14 +97,18 @@ class Continuous(OffPolicy):
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed)
         self.seed = seed
-        self.net, self.target = (actor_and_critics(policy, device, seed) for _ in range(2))
+        self.net, self.target = self.networks(device), self.networks(device)
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
         self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
-        self.optimizers = {name: make_optimizer("adam", part) for name, part in trained.items()}
+        self.optimizers = {name: make_optimizer("adam", part, **self.ADAM) for name, part in trained.items()}
+
+    def networks(self, device: str) -> Networks:
+        """New networks, the same each time: those that are trained, then their targets."""
+        return actor_and_critics(self.policy, device, self.seed)
 
     def begin_with_actor(self) -> None:
         """The actor was trained before the first rollouts: it acts from the first env step, and its target equals it."""
@@ -114,7 +146,7 @@ class Continuous(OffPolicy):
         """Copies of the actor's parameters [P], and of the buffers: observation statistics, and what exploration needs."""
         warm_up = float(self.env_steps < self.config.learning_starts and not self._acts_at_once)
         exploration = np.array([*self.exploration(), warm_up], np.float32)
-        return self.net.actor.cpu().numpy().copy(), np.concatenate((self.statistics, exploration))
+        return self.net.acting_parameters(), np.concatenate((self.statistics, exploration))
 
     def exploration(self) -> list[float]:
         """What the buffers of the policy hold between the statistics and the number that says whether it warms up."""

@@ -93,11 +93,11 @@ METRICS: dict[str, dict[str, Meaning]] = {
     "Cloning, in a row of its own before the first update": {
         "clone/loss": Meaning(NONE, "Loss of the cloned policy and its critic, on the whole dataset.", "loss of cloning"),
         "clone/accuracy": Meaning(NONE, "Discrete actions: fraction of the steps whose action is the most probable one."),
-        "clone/mean_absolute_error": Meaning(NONE, "Box actions: error of the greedy ones; SAC, TD3: in [-1, 1]."),
+        "clone/mean_absolute_error": Meaning(NONE, "Box actions: error of the greedy ones; with replay, in [-1, 1]."),
     },
     "Updates: all algorithms": {
         "train/learning_rate": Meaning(NONE, "Learning rate of this update."),
-        "train/n_updates": Meaning(NONE, "PPO: epochs; DQN, SAC, TD3: gradient steps; others: updates.", "learning rounds"),
+        "train/n_updates": Meaning(NONE, "PPO: epochs; with replay: gradient steps; others: updates.", "learning rounds"),
         "train/grad_norm": Meaning(NONE, "Its norm before it is clipped, mean over the update.", "norm of the gradient"),
     },
     "Updates: actor-critic algorithms": {
@@ -116,13 +116,14 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "train/rows_used": Meaning("rows", "REINFORCE: rows of whole episodes, from which the update learned."),
         "train/rows_dropped": Meaning("rows", "REINFORCE: rows of unfinished episodes. They were dropped."),
     },
-    "Updates: DQN, SAC, TD3": {
+    "Updates: algorithms with a replay buffer": {
         "train/q_mean": Meaning(NONE, "Mean value of the actions that were taken.", "mean value"),
-        "train/critic_loss": Meaning(NONE, "SAC, TD3: mean loss of both critics."),
-        "train/actor_loss": Meaning(NONE, "SAC, TD3: mean loss of the actor."),
-        "train/ent_coef": Meaning(NONE, "SAC: mean temperature α, the weight of the entropy.", "entropy coefficient"),
-        "train/ent_coef_loss": Meaning(NONE, "SAC: mean loss of a learned temperature.", "loss of the entropy coefficient"),
-        "train/entropy": Meaning("nats", "SAC: mean entropy of the actions in [-1, 1], estimated from samples."),
+        "train/critic_loss": Meaning(NONE, "Continuous actions: mean loss of the critics."),
+        "train/actor_loss": Meaning(NONE, "Continuous actions: mean loss of the actor."),
+        "train/ent_coef": Meaning(NONE, "Mean temperature α, the weight of the entropy in SAC.", "entropy coefficient"),
+        "train/ent_coef_loss": Meaning(NONE, "Mean loss of a learned temperature α.", "loss of the entropy coefficient"),
+        "train/entropy": Meaning("nats", "Mean entropy of the actions in [-1, 1], estimated from samples."),
+        "train/scaled_reward": Meaning(NONE, "XQC: mean reward of a minibatch, scaled."),
         "replay/size": Meaning("transitions", "Transitions in the replay buffer.", "transitions in the replay buffer"),
         "replay/bytes": Meaning("bytes", "Memory of the replay buffer.", "memory of the replay buffer"),
         "replay/env_steps_per_gradient_step": Meaning(STEPS, "New env steps for each gradient step of this update."),

@@ -41,7 +41,11 @@ STEPS: dict[str, dict[str, Any]] = {
     "dqn": {"gradient_steps": 3},
     "sac": {"updates_per_step": 0.03},
     "td3": {"updates_per_step": 0.03},
+    "tqc": {"updates_per_step": 0.03},
+    "crossq": {"updates_per_step": 0.03, "critic_net": (12, 10), "policy_delay": 2, "renormalize_after": 4},
+    "xqc": {"updates_per_step": 0.03, "critic_net": (12, 10), "policy_delay": 2, "atoms": 11},
 }
+CONTINUOUS = [name for name in STEPS if name != "dqn"]
 
 
 def kinds() -> dict[str, tuple[str, PolicySpec, dict[str, Any]]]:
@@ -77,7 +81,7 @@ def subject_of(name: str, spec: PolicySpec, settings: dict[str, Any], masks: boo
     return subject._replace(batches=tuple(rows))
 
 
-ONE_KIND = ("ppo, discrete", "a2c, Gaussian", "impala, LSTM", "reinforce, masks", "dqn, everything", "sac", "td3")
+ONE_KIND = ("ppo, discrete", "a2c, Gaussian", "impala, LSTM", "reinforce, masks", "dqn, everything", *CONTINUOUS)
 
 
 @pytest.mark.parametrize("kind", variants(kinds(), default=ONE_KIND))
@@ -92,7 +96,7 @@ def test_it_keeps_the_rules(kind: str) -> None:
 
 
 def small(name: str, seed: int = 0, **settings: Any) -> Algorithm:
-    spec = GAUSSIAN if name in ("sac", "td3") else DISCRETE
+    spec = GAUSSIAN if name in CONTINUOUS else DISCRETE
     subject = subject_of(name, spec, (REPLAY | STEPS[name] if name in STEPS else {}) | settings)
     return subject.algorithm(subject.config, subject.policy, total_steps=10_000, seed=seed)
 

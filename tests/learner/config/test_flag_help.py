@@ -55,7 +55,7 @@ def test_groups_stand_below_each_other_the_basic_one_first(
 
 
 def test_the_algorithms_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--algo {ppo,a2c,dqn,impala,reinforce,sac,td3}" in help_text(capsys)
+    assert "--algo {ppo,a2c,dqn,impala,reinforce,sac,td3,tqc,crossq,xqc}" in help_text(capsys)
 
 
 def test_a_setting_that_may_be_none_is_written_so_on_the_command_line_and_in_a_file() -> None:

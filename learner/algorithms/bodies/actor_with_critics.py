@@ -1,0 +1,82 @@
+"""An actor and K critics as `StackedMLPs`: what `ActorAndCritics` is to SAC, for critics of any form.
+
+Rule: where a gradient is recorded (`torch.is_grad_enabled`), the actor is being trained, so it normalizes by the statistics
+of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics count. So SAC's losses hold
+for it as they are written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
+from millrace.protocol.arrays import Floats
+from millrace.protocol.policy.layout import LOG_STD_BOUNDS
+from millrace.protocol.policy.networks import trainable
+from millrace.protocol.policy.torch_distributions import squashed_sample
+from millrace.protocol.random_streams import Purpose, torch_seed
+
+
+class ActorWithCritics:
+    """A squashed Gaussian actor, and K critics of features and actions, whose outputs stand for values."""
+
+    def __init__(
+        self, actor: MLPShape, critics: MLPShape, values_of: Callable[[Tensor], Tensor], device: str, seed: int
+    ) -> None:
+        """`values_of`: outputs of critics [K, B, O] -> values [K, B]. The initial parameters depend on `seed`."""
+        generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
+        parts = [initial(shape, generator) for shape in (actor, critics)]
+        self.flat = torch.cat(parts).to(device)
+        """[A + C] float32: all parameters, those of the actor first"""
+        self.flat_grad = torch.zeros_like(self.flat)
+        self.actor, self.critics = torch.split(self.flat, [len(part) for part in parts])
+        """[A] and [C], which share memory with `flat`"""
+        self.actor.grad, self.critics.grad = torch.split(self.flat_grad, [len(part) for part in parts])
+        statistics = [initial_statistics(shape) for shape in (actor, critics)]
+        self.statistics = torch.cat(statistics).to(device)
+        """[S] the running statistics, those of the actor first; empty without normalization"""
+        of_actor, of_critics = torch.split(self.statistics, [len(part) for part in statistics])
+        self.actor_body = StackedMLPs(actor, trainable(self.actor, self.actor.grad), of_actor)
+        self.critic_bodies = StackedMLPs(critics, trainable(self.critics, self.critics.grad), of_critics)
+        self.project()
+        self.renormalizes = False
+        """whether the passes that train use batch renormalization"""
+        self._values_of = values_of
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """The actor's means and log standard deviations [B, 2 D′] for features [B, D], before the tangent."""
+        if torch.is_grad_enabled():
+            (out,) = self.actor_body.trained(x, renormalizes=self.renormalizes)
+        else:
+            (out,) = self.actor_body.evaluated(x)
+        mean, log_std = out.chunk(2, -1)
+        return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
+
+    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, D′] in [-1, 1] and their log-densities [B], for features [B, D] and noise [B, D′]."""
+        return squashed_sample(self.params(x), noise)
+
+    def outputs(self, x: Tensor, action: Tensor) -> Tensor:
+        """Outputs of the critics [K, B, O] for features [B, D] and actions [B, D′], to train the critics by."""
+        return self.critic_bodies.trained(torch.cat((x, action), -1), renormalizes=self.renormalizes)
+
+    def minibatch_outputs(self, x: Tensor, action: Tensor) -> Tensor:
+        """As `outputs`, normalized by the statistics of this minibatch, but nothing is trained or moves: for targets."""
+        return self.critic_bodies.of_minibatch(torch.cat((x, action), -1))
+
+    def values(self, x: Tensor, action: Tensor, *, constant: bool = True) -> Tensor:
+        """The values [K, B] of features [B, D] and actions [B, D′], by critics that get no gradient; the actions do."""
+        assert constant, "outputs() is what critics are trained by"
+        return self._values_of(self.critic_bodies.evaluated(torch.cat((x, action), -1)))
+
+    def project(self) -> None:
+        """See `StackedMLPs.project`."""
+        self.actor_body.project()
+        self.critic_bodies.project()
+
+    def acting_parameters(self) -> Floats:
+        """A copy of the parameters [P] that workers act with: those of a plain MLP."""
+        return self.actor_body.folded().cpu().numpy().copy()

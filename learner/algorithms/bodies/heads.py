@@ -1,0 +1,61 @@
+"""Critics that learn a distribution of returns: by quantiles (TQC), or by probabilities of categories (C51, XQC). Pure.
+
+Arrays are [..., B, O]: rows, then outputs. A quantile critic's outputs are the quantiles of the fractions (2 i + 1) / 2 O; a
+categorical critic's are logits of O returns, the atoms, which are equally spaced between two bounds.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+def lowest(quantiles: Tensor, kept: int) -> Tensor:
+    """The `kept` lowest [B, kept] of all quantiles [K, B, O] of K critics together, in order (Kuznetsov et al. 2020)."""
+    together = quantiles.transpose(0, 1).flatten(1)
+    return together.sort(-1).values[:, :kept]
+
+
+def quantile_huber(quantiles: Tensor, targets: Tensor) -> Tensor:
+    """The loss [K, B] of quantiles [K, B, O] for target returns [B, J] (Dabney et al. 2018).
+
+    Mean over i and j of |τᵢ − [u < 0]| · H(u), where u = yⱼ − qᵢ, and H is Huber's loss, quadratic up to 1.
+    """
+    count = quantiles.shape[-1]
+    fractions = (torch.arange(count, dtype=quantiles.dtype, device=quantiles.device) + 0.5) / count
+    error = targets.unsqueeze(-2) - quantiles.unsqueeze(-1)  # [K, B, O, J]
+    slope = torch.where(error.detach() < 0, 1 - fractions[:, None], fractions[:, None])
+    return (slope * F.huber_loss(error, torch.zeros_like(error), reduction="none")).mean((-2, -1))
+
+
+class Categories:
+    """O returns, the atoms, from −bound to bound."""
+
+    def __init__(self, count: int, bound: float, device: str | torch.device = "cpu") -> None:
+        self.bound = bound
+        self.step = 2 * bound / (count - 1)
+        self.atoms = torch.linspace(-bound, bound, count, device=device)  # [O]
+
+    def mean(self, logits: Tensor) -> Tensor:
+        """The expected returns [..., B] of logits [..., B, O]."""
+        return logits.softmax(-1) @ self.atoms.to(logits.dtype)
+
+    def shifted(self, probabilities: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
+        """The distribution [B, O] of reward + discount · Z, for Z of these probabilities [B, O], on the same atoms.
+
+        A return between two atoms is divided between them in proportion; one beyond the bounds counts as the bound
+        (Bellemare et al. 2017).
+        """
+        returns = reward[:, None] + discount[:, None] * self.atoms.to(reward.dtype)
+        position = (returns.clamp(-self.bound, self.bound) + self.bound) / self.step
+        lower = position.floor().clamp(0, len(self.atoms) - 2)
+        upper_share = position - lower
+        found = torch.zeros_like(probabilities)
+        found.scatter_add_(-1, lower.long(), probabilities * (1 - upper_share))
+        return found.scatter_add_(-1, lower.long() + 1, probabilities * upper_share)
+
+    @staticmethod
+    def cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
+        """−Σ target · log softmax(logits) [..., B], for logits [..., B, O] and a target [B, O]."""
+        return -(target * F.log_softmax(logits, -1)).sum(-1)

@@ -1,0 +1,180 @@
+"""A pass of MLPs with batch normalization through a whole minibatch, as one node of autograd's graph.
+
+Rule: a layer's mean and variance are those of the whole minibatch, so all its rows pass a layer before any passes the next.
+That is why this pass isn't cut into chunks of rows, as that of `kernels/mlp.py` is.
+
+Arrays are [K, n, B]: K networks, n features, B rows. So a sum over the minibatch reads memory in its order, and the features
+of all networks are normalized by one call. With x̂ = (h − μ) / σ, where σ² = variance + ε, and g = ∂L/∂(γ x̂ + β):
+∂L/∂β = Σ g, ∂L/∂γ = Σ g x̂, ∂L/∂h = γ / σ · (g − mean(g) − x̂ mean(g x̂)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from millrace.protocol.policy.networks import refuse_second_derivatives
+
+EPS = 1e-3
+"""ε beside a variance: that of CrossQ and XQC"""
+MOMENTUM = 0.01
+"""by which running means and variances move towards those of a minibatch"""
+
+
+class Layer(NamedTuple):
+    """A linear layer of K networks, and the normalization in front of it: views of a flat tensor, or of its gradient."""
+
+    gain: Tensor
+    """[K, in, 1] γ"""
+    shift: Tensor
+    """[K, in, 1] β"""
+    weight: Tensor
+    """[K, out, in]"""
+    bias: Tensor | None
+    """[K, out, 1]"""
+
+
+class RunningStatistics(NamedTuple):
+    """The running statistics of one normalization: views of a flat tensor."""
+
+    mean: Tensor
+    """[K, n, 1]"""
+    variance: Tensor
+    """[K, n, 1] of the population"""
+
+
+class Plan(NamedTuple):
+    """How the MLPs of a pass are built."""
+
+    layers_of: Callable[[Tensor], Sequence[Layer]]
+    """the layers as views of a tensor like the flat parameters"""
+    relu: bool
+    """ReLU, else tanh"""
+    before: bool
+    """normalize before each activation, else after it"""
+
+
+class NormalizedPass(torch.autograd.Function):
+    """Rows x [B, D] -> outputs [K, B, O]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: Tensor, flat: Tensor, plan: Plan, running: Sequence[RunningStatistics] | None, renormalizes: bool
+    ) -> Tensor:
+        """`running` moves towards the statistics of the minibatch; None: nothing does. `renormalizes`: see `_normalized`."""
+        h, kept = x.t().contiguous().unsqueeze(0), []
+        for i, layer in enumerate(plan.layers_of(flat)):
+            statistics = None if running is None else running[i]
+            if i and not plan.before:
+                h = _activation(h, plan.relu)
+            activated = h
+            h, normalization = _normalized(h, layer, statistics, renormalizes, in_place=i > 0 and plan.before)
+            if i and plan.before:
+                h = activated = _activation(h, plan.relu)
+            kept.append((normalization, activated, h))
+            h = torch.bmm(layer.weight, h) if layer.bias is None else torch.baddbmm(layer.bias, layer.weight, h)
+        ctx.kept, ctx.plan = kept, plan
+        ctx.save_for_backward(flat)  # so that torch raises if a step changes them before the backward pass
+        return h.mT
+
+    @staticmethod
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        """The gradients of x and of the flat parameters."""
+        refuse_second_derivatives()
+        (flat,), plan = ctx.saved_tensors, ctx.plan
+        by_flat = torch.zeros_like(flat)
+        layers, by_layers = plan.layers_of(flat), plan.layers_of(by_flat)
+        g = outputs[0].mT
+        for i in reversed(range(len(layers))):
+            layer, by_layer = layers[i], by_layers[i]
+            normalization, activated, h = ctx.kept[i]
+            by_layer.weight.copy_(torch.bmm(g, h.mT))
+            if by_layer.bias is not None:
+                by_layer.bias.copy_(g.sum(-1, keepdim=True))
+            g = torch.bmm(layer.weight.mT, g)
+            if i and plan.before:
+                g = _before_activation(g, activated, plan.relu)
+            g = normalization.backward(g, layer, by_layer)
+            if i and not plan.before:
+                g = _before_activation(g, activated, plan.relu)
+        by_x = g.sum(0).t() if ctx.needs_input_grad[0] else None
+        return by_x, by_flat, None, None, None
+
+
+class _Normalization(NamedTuple):
+    """What the backward pass needs of a normalization."""
+
+    x_hat: Tensor
+    """[K or 1, n, B]"""
+    inverse: Tensor
+    """[K or 1, n, 1] 1/σ"""
+    r: Tensor | None
+    """[K, n, 1] r and d of batch renormalization; None without it"""
+    d: Tensor | None
+
+    def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
+        """The gradient [K, n, B] by what was normalized, from `g` by the result, which is overwritten."""
+        total, product = g.sum(-1, keepdim=True), _row_products(g, self.x_hat.expand_as(g))
+        by_layer.shift.copy_(total)
+        by_layer.gain.copy_(product if self.r is None or self.d is None else self.r * product + self.d * total)
+        gain = layer.gain if self.r is None else layer.gain * self.r
+        rows = g.shape[-1]
+        return g.sub_(total / rows).addcmul_(self.x_hat, product / -rows).mul_(gain * self.inverse)
+
+
+def _normalized(
+    h: Tensor, layer: Layer, running: RunningStatistics | None, renormalizes: bool, in_place: bool
+) -> tuple[Tensor, _Normalization]:
+    """γ x̂ + β [K, n, B] of h [K or 1, n, B], and what the backward pass needs.
+
+    With batch renormalization (Ioffe 2017), γ (r x̂ + d) + β, which up to bounds normalizes by the running statistics. The
+    numbers r and d count as constants.
+    """
+    mean = h.mean(-1, keepdim=True)
+    x_hat = h.sub_(mean) if in_place else h - mean
+    variance = _row_products(x_hat, x_hat) / h.shape[-1]
+    inverse = (variance + EPS).rsqrt()
+    x_hat.mul_(inverse)
+    gain, shift, r, d = layer.gain, layer.shift, None, None
+    if running is not None:
+        if renormalizes:
+            r, d = renormalization(mean, inverse, running)
+            gain, shift = gain * r, shift + gain * d
+        running.mean.lerp_(mean.expand_as(running.mean), MOMENTUM)
+        running.variance.lerp_(variance.expand_as(running.variance), MOMENTUM)
+    return torch.addcmul(shift, x_hat, gain), _Normalization(x_hat, inverse, r, d)
+
+
+R_MAX, D_MAX = 3.0, 5.0
+"""bounds of batch renormalization: of σ / σ(running) and its inverse, and of (μ − μ(running)) / σ(running)"""
+
+
+def renormalization(mean: Tensor, inverse: Tensor, running: RunningStatistics) -> tuple[Tensor, Tensor]:
+    """R = σ / σ(running) and d = (μ − μ(running)) / σ(running), within their bounds, [K, n, 1] each."""
+    running_inverse = (running.variance + EPS).rsqrt()
+    r = (running_inverse / inverse).clamp(1 / R_MAX, R_MAX)
+    return r, ((mean - running.mean) * running_inverse).clamp(-D_MAX, D_MAX)
+
+
+def _row_products(a: Tensor, b: Tensor) -> Tensor:
+    """Σ a b over the last dimension, which is kept. On a CPU numpy adds as it multiplies; torch stores products."""
+    if a.device.type != "cpu":
+        return (a * b).sum(-1, keepdim=True)
+    return torch.from_numpy(np.vecdot(a.numpy(), b.numpy())).unsqueeze(-1)
+
+
+def _activation(h: Tensor, relu: bool) -> Tensor:
+    """φ(h), in the memory of h."""
+    return h.relu_() if relu else h.tanh_()
+
+
+def _before_activation(g: Tensor, activated: Tensor, relu: bool) -> Tensor:
+    """The gradient by what was activated, from that by the result φ(h)."""
+    by_pre_activation: Tensor = (
+        torch.ops.aten.threshold_backward(g, activated, 0) if relu else torch.ops.aten.tanh_backward(g, activated)
+    )
+    return by_pre_activation

@@ -1,0 +1,106 @@
+"""What CrossQ and XQC share: SAC with batch normalization in actor and critics, whose actor learns at every k-th step.
+
+Rule: observations with their actions pass the critics in one minibatch with those that followed. These come from another
+distribution; passed alone, they would be normalized by other means, and values would not fit together (Bhatt et al. 2024).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from millrace.learner.algorithms.algorithm import Start
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.stacked_mlps import size_of
+from millrace.learner.algorithms.gradient_descent import UpdateMetrics
+from millrace.learner.algorithms.replay.off_policy import Transitions
+from millrace.learner.algorithms.sac import SAC
+from millrace.learner.config.hyperparameters import NormalizedConfig
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.features import feature_size
+from millrace.protocol.policy.networks import trainable
+from millrace.protocol.specs import PolicySpec
+
+
+class Joint(NamedTuple):
+    """What the critics are asked for at once."""
+
+    x: Tensor
+    """[2 B, D] features of the observations, then of those that followed"""
+    action: Tensor
+    """[2 B, D′] the actions, then those that the actor would take next"""
+    next_log_prob: Tensor
+    """[B] log π of the latter"""
+
+
+class NormalizedSAC(SAC):
+    """An actor and critics with batch normalization, and the temperature."""
+
+    net: ActorWithCritics
+    target: ActorWithCritics
+    config: NormalizedConfig
+
+    def __init__(
+        self, config: NormalizedConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
+    ) -> None:
+        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        self.tensors["statistics"] = self.net.statistics
+
+    def sizes(self, outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The sizes of the layers of the actor, and of each critic."""
+        features, size = feature_size(self.policy), math.prod(self.policy.action.shape)
+        return (features, *self.config.net, 2 * size), (features + size, *self.config.critic_net, outputs)
+
+    @torch.no_grad()
+    def joint(self, rows: Transitions) -> Joint:
+        """The observations and actions of these rows, and the next ones with actions ã′ ~ π(s′)."""
+        action, log_prob = self.sample(rows.next_x)
+        return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
+
+    def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
+        """See `Continuous`. Afterwards weights that are to have norm 1 have it again."""
+        measured = super().descend(name, loss, numbers)
+        self.net.project()
+        return measured
+
+    def begin_with_actor(self) -> None:
+        """See `Continuous`."""
+        self.net.project()
+        super().begin_with_actor()
+
+    def move_target(self) -> None:
+        """After each step of the critics: move their targets, if there are any."""
+
+    def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
+        """One gradient step of the critics; of the actor and the temperature if it is their turn."""
+        critic = self.critic_loss(rows)
+        measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)
+        self.move_target()
+        self.gradient_steps += 1
+        if self.gradient_steps % self.config.policy_delay == 0:
+            measured |= self.actor_step(rows.x)
+        return measured, critic.error
+
+    def actor_step(self, x: Tensor) -> UpdateMetrics:
+        """One gradient step of the actor and of a learned temperature, on features [B, D]."""
+        loss, log_prob = self.actor_loss(x)
+        measured = self.descend("actor", loss, {"entropy": -log_prob.mean()})
+        if self.config.ent_coef is None:
+            loss = self.temperature_loss(trainable(self.log_temperature, self.log_temperature.grad), log_prob)
+            measured |= self.descend("ent_coef", loss, {})
+        return measured
+
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm.start_from`. Raises `UsageError` if only a policy is known: its normalization is folded into it."""
+        if "statistics" not in start.state:
+            raise UsageError(
+                "start_from: expected a run with a checkpoint, got a policy alone, which lacks the statistics of its batch "
+                "normalization"
+            )
+        actor, statistics = len(self.net.actor), size_of(self.net.actor_body.shape.statistics())
+        super().start_from(start._replace(acting=actor))
+        self.net.statistics[:statistics].copy_(start.state["statistics"][:statistics])

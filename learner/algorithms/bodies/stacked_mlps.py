@@ -1,0 +1,189 @@
+"""MLPs of one shape, with or without batch normalization (Ioffe and Szegedy 2015), and what one is when it only acts.
+
+Rule: a pass by which parameters are trained normalizes by the mean and variance of its own minibatch, and moves the running
+ones towards them. Any other pass uses the running ones. There, batch normalization is linear, so it is folded into the
+linear layers: workers act with a plain MLP, and need neither statistics nor PyTorch.
+
+With `Normalized.BEFORE` an MLP is BN, then linear, BN, activation for each hidden layer, then linear (XQC, Palenicek et al.
+2025); with `Normalized.AFTER`, a BN in front of every linear layer (CrossQ, Bhatt et al. 2024).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import Enum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from millrace.learner.algorithms.bodies.normalized_pass import EPS, Layer, NormalizedPass, Plan, RunningStatistics
+from millrace.protocol.policy.layout import Field
+from millrace.protocol.policy.networks import DTYPE, StackedMLP
+
+
+class Normalized(Enum):
+    """Where an MLP normalizes."""
+
+    NOWHERE = "nowhere"
+    BEFORE = "before"
+    """its input, and before each activation; hidden layers have no biases, which the means would take away"""
+    AFTER = "after"
+    """its input, and after each activation"""
+
+
+class MLPShape(NamedTuple):
+    """What K MLPs have in common."""
+
+    networks: int
+    """K"""
+    sizes: tuple[int, ...]
+    """the number of inputs, of units of each hidden layer, and of outputs"""
+    relu: bool = True
+    """ReLU, else tanh"""
+    normalized: Normalized = Normalized.NOWHERE
+    unit_rows: bool = False
+    """the weights of each unit have norm 1 (weight normalization)"""
+    output_gain: float = 1.0
+    """gain of the orthogonal initialization of the last layer; that of the others is √2"""
+
+    def fields(self) -> list[Field]:
+        """The parameters, [K, …] each."""
+        K, last = self.networks, len(self.sizes) - 2
+        fields: list[Field] = []
+        for i in range(last + 1):
+            inputs, outputs = self.sizes[i : i + 2]
+            if self.normalized is not Normalized.NOWHERE:
+                fields += [Field(f"{i}.gain", (K, inputs, 1), 0), Field(f"{i}.shift", (K, inputs, 1), 0)]
+            fields.append(Field(f"{i}.weight", (K, outputs, inputs), self.output_gain if i == last else math.sqrt(2)))
+            if self.normalized is not Normalized.BEFORE or i == last:
+                fields.append(Field(f"{i}.bias", (K, outputs, 1), 0))
+        return fields
+
+    def folded(self) -> MLPShape:
+        """That of the plain MLPs that act alike."""
+        return self._replace(normalized=Normalized.NOWHERE, unit_rows=False)
+
+    def statistics(self) -> list[Field]:
+        """The running mean and variance of each normalization, [K, …] each; none without normalization."""
+        if self.normalized is Normalized.NOWHERE:
+            return []
+        shapes = [(self.networks, size, 1) for size in self.sizes[:-1]]
+        return [Field(f"{i}.{kind}", shape, 0) for i, shape in enumerate(shapes) for kind in ("mean", "variance")]
+
+
+def size_of(fields: Sequence[Field]) -> int:
+    """The numbers that these fields hold."""
+    return sum(math.prod(field.shape) for field in fields)
+
+
+def initial(shape: MLPShape, generator: torch.Generator) -> Tensor:
+    """Parameters [P] to begin with: orthogonal weights, gains of 1, and zeros."""
+    flat = torch.zeros(size_of(shape.fields()), dtype=DTYPE)
+    for name, view in _views(flat, shape.fields()).items():
+        if name.endswith("gain"):
+            view.fill_(1)
+        elif name.endswith("weight"):
+            gain = next(field.gain for field in shape.fields() if field.name == name)
+            for weight in view:
+                torch.nn.init.orthogonal_(weight, gain, generator)
+    return flat
+
+
+def initial_statistics(shape: MLPShape) -> Tensor:
+    """Means of 0 and variances of 1, flat."""
+    flat = torch.zeros(size_of(shape.statistics()), dtype=DTYPE)
+    for name, view in _views(flat, shape.statistics()).items():
+        view.fill_(float(name.endswith("variance")))
+    return flat
+
+
+class StackedMLPs:
+    """K MLPs of one shape, in a flat tensor of parameters [P] and one of running statistics [S], which others own."""
+
+    def __init__(self, shape: MLPShape, parameters: Tensor, statistics: Tensor) -> None:
+        """`parameters`: a leaf of the graph. `statistics`: as `initial_statistics`, changed in place."""
+        self.shape = shape
+        self._trained, self._constant = parameters, parameters.detach()
+        found = _views(statistics, shape.statistics())
+        norms = len(found) // 2
+        self._running = [RunningStatistics(found[f"{i}.mean"], found[f"{i}.variance"]) for i in range(norms)]
+        self._plan = Plan(self._layers, shape.relu, shape.normalized is Normalized.BEFORE)
+        self._normalizes = norms > 0
+
+    def trained(self, x: Tensor, *, renormalizes: bool = False) -> Tensor:
+        """Outputs [K, B, O] of rows [B, D]. The parameters get a gradient, and running statistics move."""
+        if not self._normalizes:
+            return self._plain(x, self._trained, self.shape)
+        out: Tensor = NormalizedPass.apply(x, self._trained, self._plan, self._running, renormalizes)  # type: ignore[no-untyped-call]
+        return out
+
+    def of_minibatch(self, x: Tensor) -> Tensor:
+        """As `trained` without renormalization, but nothing gets a gradient or moves: for target networks."""
+        if not self._normalizes:
+            return self._plain(x, self._constant, self.shape)
+        out: Tensor = NormalizedPass.apply(x, self._constant, self._plan, None, False)  # type: ignore[no-untyped-call]
+        return out
+
+    def evaluated(self, x: Tensor) -> Tensor:
+        """Outputs [K, B, O] of rows [B, D], with the running statistics. Only x gets a gradient."""
+        return self._plain(x, self.folded(), self.shape.folded())
+
+    @torch.no_grad()
+    def folded(self) -> Tensor:
+        """The parameters [P′] of plain MLPs with the outputs of `evaluated`: of each layer weight and bias, [K, …] each."""
+        if not self._normalizes:
+            return self._constant
+        flat = self._constant.new_zeros(size_of(self.shape.folded().fields()))
+        into = _views(flat, self.shape.folded().fields())
+        scales, shifts = zip(*(self._linear(i) for i in range(len(self._running))), strict=True)
+        for i, layer in enumerate(self._layers(self._constant)):
+            weight, bias = into[f"{i}.weight"], into[f"{i}.bias"]
+            weight.copy_(layer.weight)
+            if layer.bias is not None:
+                bias.copy_(layer.bias)
+            if i == 0 or not self._plan.before:
+                bias.add_(weight @ shifts[i])
+                weight.mul_(scales[i].mT)
+            if i + 1 < len(scales) and self._plan.before:
+                weight.mul_(scales[i + 1])
+                bias.mul_(scales[i + 1]).add_(shifts[i + 1])
+        return flat
+
+    def _linear(self, i: int) -> tuple[Tensor, Tensor]:
+        """Scale and shift [K, n, 1] of a normalization by running statistics."""
+        layer, running = self._layers(self._constant)[i], self._running[i]
+        scale = layer.gain * (running.variance + EPS).rsqrt()
+        return scale, layer.shift - running.mean * scale
+
+    def _layers(self, flat: Tensor) -> list[Layer]:
+        views = _views(flat, self.shape.fields())
+        return [
+            Layer(views[f"{i}.gain"], views[f"{i}.shift"], views[f"{i}.weight"], views.get(f"{i}.bias"))
+            for i in range(len(self.shape.sizes) - 1)
+        ]
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """With `unit_rows`: scale the weights of each unit to norm 1. Called after each step of an optimizer."""
+        if self.shape.unit_rows:
+            for layer in self._layers(self._constant):
+                layer.weight.div_(torch.linalg.vector_norm(layer.weight, dim=-1, keepdim=True))
+
+    @staticmethod
+    def _plain(x: Tensor, flat: Tensor, shape: MLPShape) -> Tensor:
+        """Outputs [K, B, O] of MLPs that normalize nothing."""
+        fields = shape.fields()
+
+        def layers_of(flat: Tensor) -> list[Tensor]:
+            return [view.squeeze(-1) if name.endswith("bias") else view for name, view in _views(flat, fields).items()]
+
+        out: Tensor = StackedMLP.apply(x, shape.relu, flat, layers_of)  # type: ignore[no-untyped-call]
+        return out
+
+
+def _views(flat: Tensor, fields: Sequence[Field]) -> dict[str, Tensor]:
+    """A view of each field of a flat tensor, by name."""
+    parts = torch.split(flat, [math.prod(field.shape) for field in fields])
+    return {field.name: part.view(field.shape) for field, part in zip(fields, parts, strict=True)}

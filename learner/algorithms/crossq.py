@@ -1,0 +1,61 @@
+"""CrossQ (Bhatt et al. 2024): SAC with batch normalization in actor and critics, and without target networks.
+
+The newest critics value the next observations, too. That is stable because these pass them together with the observations,
+and are normalized alike. `NormalizedSAC` has what XQC shares.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
+from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.config.hyperparameters import CrossQConfig
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+
+
+class CrossQ(NormalizedSAC):
+    """An actor, two critics without targets, and the temperature."""
+
+    Config = CrossQConfig
+    ADAM = {"betas": (0.5, 0.999)}
+    config: CrossQConfig
+
+    @staticmethod
+    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        return CrossQ.bounded_policy_spec(config, observation, action, head="squashed")
+
+    def __init__(
+        self, config: CrossQConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
+    ) -> None:
+        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        self.target = self.net
+        del self.tensors["target"]
+
+    def networks(self, device: str) -> ActorWithCritics:
+        """See `Continuous`."""
+        relu, (actor, critic) = self.policy.activation == "relu", self.sizes(outputs=1)
+        return ActorWithCritics(
+            MLPShape(1, actor, relu, Normalized.AFTER, output_gain=0.01),
+            MLPShape(2, critic, relu, Normalized.AFTER),
+            lambda outputs: outputs[..., 0],
+            device,
+            self.seed,
+        )
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """½ Σ E[w (Q(s, a) − y)²] over both critics, y = Σ γⁱ r + γᵏ (min Q(s′, a′) − α log π(a′|s′)), in one pass of Q.
+
+        y is a constant; the statistics of the minibatch, to which s′ contributes, are not.
+        """
+        self.net.renormalizes = self.gradient_steps >= self.config.renormalize_after
+        joint, size = self.joint(rows), len(rows.x)
+        both = self.net.outputs(joint.x, joint.action)[..., 0]  # [2, 2 B]
+        values, next_values = both[:, :size], both[:, size:].detach()
+        y = rows.reward + rows.discount * (next_values.amin(0) - self.temperature * joint.next_log_prob)
+        error = values - y
+        loss = 0.5 * (rows.weight * error.square()).mean(1).sum()
+        return CriticLoss(loss, error.detach().abs().mean(0), {"q_mean": values.mean()})

@@ -1,0 +1,87 @@
+"""XQC (Palenicek et al. 2025): SAC whose loss is well conditioned, so that more is learned from each step.
+
+Three things do that: batch normalization before each activation; weights of norm 1, so that steps of the optimizer turn them
+by the same angle, however large they would have grown; and critics that learn the probabilities of returns by cross-entropy,
+whose gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has what CrossQ
+shares.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.heads import Categories
+from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
+from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.config.hyperparameters import XQCConfig
+from millrace.protocol.arrays import Floats
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+
+INITIAL_TEMPERATURE = 0.01
+"""in units of scaled rewards"""
+
+
+class XQC(NormalizedSAC):
+    """An actor, two critics of categories with their targets, and the temperature."""
+
+    Config = XQCConfig
+    config: XQCConfig
+
+    @staticmethod
+    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        return XQC.bounded_policy_spec(config, observation, action, head="squashed")
+
+    def __init__(self, config: XQCConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
+        self.categories = Categories(config.atoms, config.return_bound, device)
+        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        if config.ent_coef is None:
+            self.log_temperature.fill_(math.log(INITIAL_TEMPERATURE))
+        if config.target_entropy is None:
+            self.target_entropy = -0.5 * math.prod(policy.action.shape)
+
+    def networks(self, device: str) -> ActorWithCritics:
+        """See `Continuous`."""
+        relu, (actor, critic) = self.policy.activation == "relu", self.sizes(outputs=self.config.atoms)
+        return ActorWithCritics(
+            MLPShape(1, actor, relu, Normalized.BEFORE, unit_rows=True),
+            MLPShape(2, critic, relu, Normalized.BEFORE, unit_rows=True),
+            self.categories.mean,
+            device,
+            self.seed,
+        )
+
+    def scaled(self, reward: Floats) -> Floats:
+        """See `GradientDescent`: no discounted return so far is beyond `return_bound` after this."""
+        if not self.config.normalize_rewards:
+            return reward
+        return self.rewards.bounded(reward, self.config.return_bound)
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """Σ E[w · cross-entropy] over both critics, of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)) on the categories.
+
+        Z′ are the returns of s′ and a′ as that target critic distributes them which expects less.
+        """
+        joint, size = self.joint(rows), len(rows.x)
+        with torch.no_grad():
+            next_logits = self.target.minibatch_outputs(joint.x, joint.action)[:, size:]  # [2, B, O]
+            pessimist = self.categories.mean(next_logits).argmin(0)
+            probabilities = next_logits[pessimist, torch.arange(size, device=pessimist.device)].softmax(-1)
+            reward = rows.reward - rows.discount * self.temperature * joint.next_log_prob
+            target = self.categories.shifted(probabilities, reward, rows.discount)  # [B, O]
+        logits = self.net.outputs(joint.x, joint.action)[:, :size]
+        loss = (rows.weight * self.categories.cross_entropy(logits, target)).mean(1).sum()
+        with torch.no_grad():
+            values = self.categories.mean(logits)
+            error = (values - target @ self.categories.atoms).abs().mean(0)
+        # The loss is finite even if a reward is not: a return beyond the bounds counts as the bound.
+        return CriticLoss(loss, error, {"q_mean": values.mean(), "scaled_reward": rows.reward.mean()})
+
+    def move_target(self) -> None:
+        """See `NormalizedSAC`. Statistics of the targets count nowhere."""
+        self.target.critics.lerp_(self.net.critics, self.config.tau)
