@@ -48,6 +48,9 @@ RUNS: dict[str, tuple[str, ...]] = {
     "dqn": (f"train CartPole-v1 --algo dqn {REPLAY}",),
     "sac": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 {REPLAY}",),
     "td3": (f"train Pendulum-v1 --algo td3 --updates-per-step 0.5 {NORMALIZED} {REPLAY}",),
+    "tqc": (f"train Pendulum-v1 --algo tqc --updates-per-step 0.5 {REPLAY}",),
+    "crossq": (f"train Pendulum-v1 --algo crossq --critic-net 32 32 --updates-per-step 0.5 {REPLAY}",),
+    "xqc": (f"train Pendulum-v1 --algo xqc --critic-net 32 32 --updates-per-step 0.5 {REPLAY}",),
     "lstm": (f"train toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
     "images": (f"train toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
@@ -64,7 +67,7 @@ RUNS: dict[str, tuple[str, ...]] = {
 """The commands of each run, in one folder. COMMON is added to `train`, and RUN is its run folder."""
 FROM_RECORDED = {"prior", "clone"}
 """Runs that learn from the dataset of the run `record` of the base."""
-LAGS = {"ppo": 1, "a2c": 2, "impala": 2, "dqn": 1, "sac": 2, "lstm": 2, "masks": 1}
+LAGS = {"ppo": 1, "a2c": 2, "impala": 2, "dqn": 1, "sac": 2, "xqc": 1, "lstm": 2, "masks": 1}
 RUNS |= {f"{name} at lag {lag}": (f"{RUNS[name][0]} --max-lag {lag}",) for name, lag in LAGS.items()}
 TIMES = ("stage/", "time/fps", "time/time_elapsed", "ledger/transitions_received", "ledger/transitions_waiting")
 EVALUATED = ("env_steps", "updates", "return_mean_100", "evaluation", "best")

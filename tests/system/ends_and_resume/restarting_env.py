@@ -46,4 +46,16 @@ class Restarting(CartPoleEnv):
             raise RuntimeError("this copy fails once, as it was asked to")
 
 
+class Push(gymnasium.ActionWrapper[Any, Any, Any]):
+    """A number in [-1, 1] for an action: which way to push."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def action(self, action: Any) -> int:
+        """Left or right."""
+        return int(action[0] > 0)
+
+
 gymnasium.register("Restarting-v0", f"{__name__}:Restarting", max_episode_steps=MOST_STEPS)

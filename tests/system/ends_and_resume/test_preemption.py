@@ -42,6 +42,10 @@ COMMON: dict[str, Any] = {
 NORMAL = {"normalize_observations": True, "normalize_rewards": True}
 PPO_SETTINGS = {"algo": "ppo", "n_epochs": 2, "batch_size": 16}
 DQN = {"algo": "dqn", "learning_starts": 100, "gradient_steps": 4, "batch_size": 16, "replay_size": 300}
+PUSHES = {
+    "wrappers": ("tests.system.ends_and_resume.restarting_env:Push",), "learning_starts": 100, "updates_per_step": 0.1,
+    "batch_size": 16, "replay_size": 300,
+}  # fmt: skip
 VARIANTS: dict[str, dict[str, Any]] = {
     "ppo": {**PPO_SETTINGS, **NORMAL, "learning_rate_schedule": "linear", "clip_range_schedule": "linear"},
     "ppo, lstm": {**PPO_SETTINGS, "core": "lstm", "core_size": 4, "normalize_rewards": True},
@@ -50,9 +54,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "reinforce": {"algo": "reinforce", **NORMAL, "rollout_steps": 31, "steps": 12 * 31 * ENVS, "eval_every": 200},
     "dqn, uniform": {**DQN, "normalize_observations": True},
     "dqn, prioritized": {**DQN, "priority_alpha": 0.6, "n_step": 3, "amsgrad": True, "dueling": True},
+    "tqc": {**PUSHES, "algo": "tqc", "quantiles": 5},
+    "crossq": {**PUSHES, "algo": "crossq", "critic_net": (8,), "renormalize_after": 40},
+    "xqc": {**PUSHES, "algo": "xqc", "critic_net": (8,), "atoms": 21, "priority_alpha": 0.6, "normalize_observations": True},
     "ppo, evaluated beside": {**PPO_SETTINGS, **NORMAL, "eval_workers": 1, "learning_rate": 0.02},
 }
-IN_MAKE_TEST = ("ppo", "ppo, lstm", "dqn, prioritized", "ppo, evaluated beside")  # `make soak` runs the others
+IN_MAKE_TEST = ("ppo", "ppo, lstm", "dqn, prioritized", "xqc", "ppo, evaluated beside")  # `make soak` runs the others
 STOP = 6  # the update after which a run is interrupted
 Watch = Callable[[Progress], None]
 
@@ -152,9 +159,10 @@ def evaluated(folder: Path) -> list[tuple[float, float]]:
     return [(row.get("eval/env_steps", row["time/total_timesteps"]), row["eval/mean_reward"]) for row in rows]
 
 
-def test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal(tmp_path: Path) -> None:
+@pytest.mark.parametrize("variant", ["impala", "xqc"])
+def test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal(tmp_path: Path, variant: str) -> None:
     """They are not equal to one that went on: its first updates after the checkpoint use older weights."""
-    settings = {**VARIANTS["impala"], "max_lag": 2}
+    settings = {**VARIANTS[variant], "max_lag": 2}
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "one", interrupts_at(STOP), **settings)
     folder = folder_of(tmp_path / "one")

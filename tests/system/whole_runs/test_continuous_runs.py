@@ -1,4 +1,4 @@
-"""Whole runs of SAC and TD3: the same for any number of workers, after a resume, beside the learner, and with prior data."""
+"""Whole runs with continuous actions and replay: the same for any number of workers, beside the learner, with prior data."""
 
 from __future__ import annotations
 
@@ -34,11 +34,20 @@ SMALL: dict[str, Any] = {
     "eval_episodes": 1,
     "steps": 600,
 }
-ALGORITHMS = pytest.mark.parametrize("algo", ["sac", pytest.param("td3", marks=pytest.mark.soak)])
+ALGORITHMS = pytest.mark.parametrize(
+    "algo", ["sac", "xqc", *(pytest.param(algo, marks=pytest.mark.soak) for algo in ("td3", "tqc", "crossq"))]
+)
+NORMALIZED: dict[str, Any] = {"critic_net": (16,), "policy_delay": 2}
+OWN: dict[str, dict[str, Any]] = {
+    "tqc": {"quantiles": 5},
+    "crossq": NORMALIZED | {"renormalize_after": 40},
+    "xqc": NORMALIZED | {"atoms": 21},
+}
+"""Settings of an algorithm of its own"""
 
 
 def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) -> Path:
-    keywords = SMALL | settings
+    keywords = SMALL | OWN.get(settings.get("algo", ""), {}) | settings
     config = resolve("" if resume else "Pendulum-v1", run_dir=str(tmp_path / name), resume=resume, **keywords)
     return train(config, resume, lambda _: None)
 
@@ -47,6 +56,8 @@ def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) 
 def test_bits_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, algo: str) -> None:
     folders = [run(tmp_path, str(workers), algo=algo, workers=workers) for workers in (1, 3)]
     assert policy_of(folders[0]) == policy_of(folders[1])
+    ahead = [run(tmp_path, f"{workers} at a lag", algo=algo, workers=workers, max_lag=1) for workers in (1, 4)]
+    assert policy_of(ahead[0]) == policy_of(ahead[1])
     for folder in folders:
         for row in read_rows(folder / "metrics.jsonl"):
             own = max(0, row["time/total_timesteps"] - 90)
