@@ -15,6 +15,7 @@ from torch import Tensor
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS
+from millrace.protocol.policy.malloc import keep_freed_memory
 from millrace.protocol.policy.networks import trainable
 from millrace.protocol.policy.torch_distributions import squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
@@ -27,6 +28,7 @@ class ActorWithCritics:
         self, actor: MLPShape, critics: MLPShape, values_of: Callable[[Tensor], Tensor], device: str, seed: int
     ) -> None:
         """`values_of`: outputs of critics [K, B, O] -> values [K, B]. The initial parameters depend on `seed`."""
+        keep_freed_memory()  # a pass takes and frees arrays of half a megabyte again and again
         generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
         parts = [initial(shape, generator) for shape in (actor, critics)]
         self.flat = torch.cat(parts).to(device)
