@@ -10,7 +10,7 @@ cloning that was interrupted goes on with the same bits. Hence the order of each
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 
-BATCH_SIZE = 64  # rows of a minibatch, if the settings have no batch_size
+BATCH_SIZE = 64  # rows of a minibatch; that of updates is often larger, and here it would take more epochs
 LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; here it would take more epochs
 
 
@@ -47,7 +47,9 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
     config = algorithm.config
     rows = Demonstrations.of(episodes, algorithm.scaled, config.gamma)
     size = len(rows.at)
-    count = math.ceil(size / getattr(config, "batch_size", BATCH_SIZE))
+    count = math.ceil(size / BATCH_SIZE)
+    if isinstance(algorithm, ActorCritic) and not algorithm.pretraining_steps:
+        center_critic(algorithm, _parts(rows, count))
     optimizer = algorithm.optimizers["optimizer" if isinstance(algorithm, ActorCritic) else "actor_optimizer"]
     for epoch in range(algorithm.pretraining_steps // count, config.clone_epochs):
         order = generator(algorithm.seed, Purpose.CLONING, epoch).permutation(size)
@@ -60,30 +62,60 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
             pulse()
     if isinstance(algorithm, Continuous):
         algorithm.begin_with_actor()
-    return _measured(algorithm, rows, count)
+    return _measured(algorithm, _parts(rows, count))
+
+
+def center_critic(algorithm: ActorCritic, parts: Sequence[Demonstrations]) -> None:
+    """Add a number δ to all values, so that the mean error over these steps is 0: E[V(o) + δ] = E[G + γᵏ δ].
+
+    Otherwise the critic would have to reach the level of the returns by gradient steps. They would saturate its units, which
+    then learn little in the updates. If γ is 1 and no episode was terminated, no δ does it, and nothing changes.
+    """
+    error = weight = 0.0
+    for rows in parts:
+        with torch.no_grad():
+            value = algorithm.net.value(*_inputs(algorithm, rows))
+        error += float((_returns(algorithm, rows) - value).sum())
+        weight += float((1 - rows.discount).sum())
+    if weight:
+        algorithm.net.parameters["critic.out.bias"].detach().add_(error / weight)
 
 
 def cloning_loss(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[Tensor, Tensor]:
     """The loss, a tensor of no dimension, and the params [B, P] of the action distribution."""
-    inputs = algorithm.inputs(rows.obs(rows.at))
+    inputs = _inputs(algorithm, rows)
     action = algorithm.tensor(rows.action)
     if isinstance(algorithm, Continuous):
         params = algorithm.net.params(*inputs)
         return -policy_log_prob(algorithm.policy, params, action).mean(), params
     params, value = algorithm.net.forward(*inputs)
+    log_prob = policy_log_prob(algorithm.policy, params, action)
+    return algorithm.vf_coef * losses.value_loss(value, _returns(algorithm, rows)) - log_prob.mean(), params
+
+
+def _inputs(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Features [B, D] and images [B, *leaf] of the observations of these steps."""
+    return algorithm.inputs(rows.obs(rows.at))
+
+
+def _returns(algorithm: ActorCritic, rows: Demonstrations) -> Tensor:
+    """G [B] under the present critic, without a gradient."""
     with torch.no_grad():
         last_value = algorithm.net.value(*algorithm.inputs(rows.obs(rows.last)))
-    returns = algorithm.tensor(rows.returns) + algorithm.tensor(rows.discount) * last_value
-    log_prob = policy_log_prob(algorithm.policy, params, action)
-    return algorithm.vf_coef * losses.value_loss(value, returns) - log_prob.mean(), params
+    return algorithm.tensor(rows.returns) + algorithm.tensor(rows.discount) * last_value
 
 
-def _measured(algorithm: ActorCritic | Continuous, rows: Demonstrations, count: int) -> dict[str, float]:
-    """The metrics over all steps, computed in `count` parts."""
-    size = len(rows.at)
+def _parts(rows: Demonstrations, count: int) -> list[Demonstrations]:
+    """The steps, in `count` parts of nearly equal size. Parts share their observations."""
+    return [rows.select(some) for some in np.array_split(np.arange(len(rows.at)), count)]
+
+
+def _measured(algorithm: ActorCritic | Continuous, parts: Sequence[Demonstrations]) -> dict[str, float]:
+    """The metrics over all steps."""
+    size = sum(len(rows.at) for rows in parts)
     with torch.no_grad():
-        parts = [_sums(algorithm, rows.select(some)) for some in np.array_split(np.arange(size), count)]
-    loss, error = (float(total) / size for total in np.sum(parts, 0))
+        sums = [_sums(algorithm, rows) for rows in parts]
+    loss, error = (float(total) / size for total in np.sum(sums, 0))
     if algorithm.policy.action.kind == "box":
         return {"clone/loss": loss, "clone/mean_absolute_error": error}
     return {"clone/loss": loss, "clone/accuracy": 1 - error}

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from millrace.extras.datasets import cloning
-from millrace.extras.datasets.cloning import clone, cloning_loss
+from millrace.extras.datasets.cloning import center_critic, clone, cloning_loss
 from millrace.extras.datasets.demonstrations import Demonstrations
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.algorithms.ppo import PPO
@@ -115,17 +115,17 @@ def test_the_loss_is_the_one_that_the_file_states() -> None:
 
 
 @pytest.mark.parametrize(
-    ("algo", "action", "settings"),
+    ("algo", "action"),
     [
-        *(("ppo", action, {"clone_epochs": 20, "batch_size": 16}) for action in ACTIONS),
-        ("reinforce", DISCRETE, {"clone_epochs": 80}),
-        ("sac", CONTINUOUS, {"clone_epochs": 20, "batch_size": 16}),
-        ("td3", CONTINUOUS, {"clone_epochs": 20, "batch_size": 16}),
+        *(("ppo", action) for action in ACTIONS),
+        ("reinforce", DISCRETE),
+        ("sac", CONTINUOUS),
+        ("td3", CONTINUOUS),
     ],
     ids=lambda value: value if isinstance(value, str) else getattr(value, "kind", ""),
 )
-def test_actions_of_every_kind_are_learned(algo: str, action: ActionSpec, settings: dict[str, Any]) -> None:
-    algorithm = made(algo, action, **settings)
+def test_actions_of_every_kind_are_learned(algo: str, action: ActionSpec) -> None:
+    algorithm = made(algo, action, clone_epochs=80)
     found = cloned(algorithm, episodes_of(action))
     assert set(found) == {"clone/loss", "clone/mean_absolute_error" if action.kind == "box" else "clone/accuracy"}
     if action.kind == "box":
@@ -149,7 +149,7 @@ def test_the_density_of_a_squashed_action_is_the_one_that_workers_compute() -> N
 
 
 def test_images_are_looked_at() -> None:
-    ppo: PPO = made("ppo", DISCRETE, image=True, clone_epochs=4, batch_size=16)
+    ppo: PPO = made("ppo", DISCRETE, image=True, clone_epochs=16)
     assert cloned(ppo, episodes_of(DISCRETE, image=True))["clone/accuracy"] > 0.9
 
 
@@ -164,19 +164,57 @@ def test_the_critic_learns_the_returns() -> None:
     assert values == pytest.approx([4, 3, 2, 1], abs=0.5)
 
 
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_before_the_first_step_the_values_are_right_on_average(gamma: float) -> None:
+    """Also where the value of the last observation counts. The mean return is about 40 with γ = 1, which is far from 0."""
+    ppo: PPO = made("ppo", DISCRETE, normalize_rewards=False, gamma=gamma)
+    batches = episodes_of(DISCRETE)
+    rows = Demonstrations.of(batches, np.asarray, gamma)
+    before = ppo.net.flat.clone()
+    center_critic(ppo, [rows.select(np.arange(100)), rows.select(np.arange(100, len(rows.at)))])
+    with torch.no_grad():
+        value = ppo.net.value(*ppo.inputs(rows.obs(rows.at))).double().numpy()
+        last_value = ppo.net.value(*ppo.inputs(rows.obs(rows.last))).double().numpy()
+    target = rows.returns + rows.discount * last_value
+    assert target.mean() > 8
+    assert value.mean() == pytest.approx(target.mean(), rel=1e-5)
+    assert torch.count_nonzero(ppo.net.flat != before) == 1, "a bias alone"
+
+
+def test_values_without_a_right_level_stay() -> None:
+    """With γ = 1, the value of an episode that never ends depends on itself alone."""
+    ppo: PPO = made("ppo", DISCRETE, normalize_rewards=False, gamma=1.0)
+    before = ppo.net.flat.clone()
+    center_critic(ppo, [Demonstrations.of([episode(0, 9, DISCRETE, terminated=False)], np.asarray, 1.0)])
+    assert torch.equal(ppo.net.flat, before)
+
+
+def test_large_returns_saturate_no_unit_of_the_critic() -> None:
+    """Rewards of 100 for ever, and γ = 0.9: each value is 1,000. The weights learn it in three epochs, and hardly move."""
+    ppo: PPO = made("ppo", DISCRETE, clone_epochs=3, normalize_rewards=False, gamma=0.9)
+    batches = [episode(i, 60, DISCRETE, terminated=False) for i in range(4)]
+    batches = [msgspec.structs.replace(one, reward=np.full_like(one.reward, 100)) for one in batches]
+    before = ppo.net.parameters["critic.0.weight"].detach().clone()
+    cloned(ppo, batches)
+    with torch.no_grad():
+        values = ppo.net.value(*ppo.inputs([batches[0].obs[0][:-1, 0]])).numpy()
+    assert values == pytest.approx(np.full(60, 1_000), rel=0.01)
+    assert (ppo.net.parameters["critic.0.weight"] - before).abs().max() < 0.05
+
+
 def test_each_epoch_uses_each_step_once_and_in_an_order_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    ppo: PPO = made("ppo", DISCRETE, clone_epochs=2, batch_size=100)
+    ppo: PPO = made("ppo", DISCRETE, clone_epochs=2, batch_size=1_000)
     seen: list[Array] = []
-    select = Demonstrations.select
 
-    def noted(self: Demonstrations, some: Array) -> Demonstrations:
-        seen.append(some)
-        return select(self, some)
+    def noted(algorithm: PPO, rows: Demonstrations) -> Any:
+        seen.append(rows.at)
+        return cloning_loss(algorithm, rows)
 
-    monkeypatch.setattr(Demonstrations, "select", noted)
+    monkeypatch.setattr(cloning, "cloning_loss", noted)
     cloned(ppo, episodes_of(DISCRETE))
-    first, second = np.concatenate(seen[:3]), np.concatenate(seen[3:6])
-    assert sorted(first) == sorted(second) == list(range(255))
+    assert {len(rows) for rows in seen} == {63, 64}, "not the minibatches of updates"
+    first, second = np.concatenate(seen[:4]), np.concatenate(seen[4:8])
+    assert sorted(first) == sorted(second) == Demonstrations.of(episodes_of(DISCRETE), np.asarray, 0.9).at.tolist()
     assert (first != second).any()
 
 
@@ -208,18 +246,20 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
     assert not torch.equal(whole.net.flat, untrained.net.flat)
 
 
-def test_a_loss_that_is_not_finite_changes_no_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_with_a_loss_that_is_not_finite_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     ppo: PPO = made("ppo", DISCRETE, clone_epochs=1, normalize_rewards=False)
-    before = ppo.net.flat.clone()
+    before: list[torch.Tensor] = []
 
     def endless(algorithm: PPO, rows: Demonstrations) -> Any:
+        before.append(algorithm.net.flat.clone())
         found, params = cloning_loss(algorithm, rows)
         return found * float("inf"), params
 
     monkeypatch.setattr(cloning, "cloning_loss", endless)
     with pytest.raises(RunError, match="clone/loss: expected finite"):
         cloned(ppo, episodes_of(DISCRETE))
-    assert torch.equal(ppo.net.flat, before)
+    assert len(before) == 1
+    assert torch.equal(ppo.net.flat, before[0])
 
 
 def test_an_algorithm_without_a_policy_to_clone_is_named() -> None:
