@@ -296,8 +296,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     gae_lambda: float
     """ppo, a2c: λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     normalize_advantage: bool
-    """ppo: Normalize the advantages of each minibatch to mean 0 and standard deviation 1.
-    a2c: Normalize the advantages of each batch to mean 0 and standard deviation 1.
+    """ppo: Normalize the advantages of each minibatch to mean 0 and standard deviation 1, unless the policy was cloned.
+    a2c: Normalize the advantages of each batch to mean 0 and standard deviation 1, unless the policy was cloned.
     """
     clip_range: float
     """ppo: ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""

@@ -121,9 +121,13 @@ class ActorCritic(GradientDescent):
         return math.ceil(rows / batch_size)
 
     def standardizes_advantages(self) -> bool:
-        """Whether the advantages of each minibatch get mean 0 and standard deviation 1."""
+        """Whether the advantages of each minibatch get mean 0 and standard deviation 1. After cloning they do not.
+
+        A policy that acts well from the start has advantages that are little more than small errors of the critic. With a
+        standard deviation of 1, these would change the policy as much as advantages that tell good actions from bad ones.
+        """
         found: bool = self.config.normalize_advantage
-        return found
+        return found and not self.pretraining_steps
 
     def stops(self, metrics: UpdateMetrics) -> bool:
         """Whether a minibatch with these metrics ends the update, before its gradient step is taken."""

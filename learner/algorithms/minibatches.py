@@ -161,7 +161,7 @@ class LossInput(NamedTuple):
     log_prob: Tensor
     """[B] log-probability of the action under the policy that acted"""
     advantage: Tensor
-    """[B] how much better the action was than expected; mean 0 and standard deviation 1 if `normalize_advantage` is set"""
+    """[B] how much better the action was than expected; standardized if `standardizes_advantages()`"""
     raw_advantage: Tensor
     """[B] the advantage as it was estimated"""
     target: Tensor

@@ -92,7 +92,7 @@ class ActorCriticConfig(RecurrentConfig, frozen=True):
     gae_lambda: Free[Fraction] = 0.95
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     normalize_advantage: Free[bool] = True
-    """Normalize the advantages of each minibatch to mean 0 and standard deviation 1."""
+    """Normalize the advantages of each minibatch to mean 0 and standard deviation 1, unless the policy was cloned."""
 
 
 class PPOConfig(ActorCriticConfig, frozen=True):
@@ -126,7 +126,7 @@ class A2CConfig(RecurrentConfig, frozen=True):
     gae_lambda: Free[Fraction] = 1.0
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     normalize_advantage: Free[bool] = False
-    """Normalize the advantages of each batch to mean 0 and standard deviation 1."""
+    """Normalize the advantages of each batch to mean 0 and standard deviation 1, unless the policy was cloned."""
 
 
 class IMPALAConfig(RecurrentConfig, frozen=True):

@@ -14,6 +14,7 @@ from millrace.extras.datasets import cloning
 from millrace.extras.datasets.cloning import center_critic, clone, cloning_loss
 from millrace.extras.datasets.demonstrations import Demonstrations
 from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.minibatches import Minibatch
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.arrays import Array
@@ -200,6 +201,23 @@ def test_large_returns_saturate_no_unit_of_the_critic() -> None:
         values = ppo.net.value(*ppo.inputs([batches[0].obs[0][:-1, 0]])).numpy()
     assert values == pytest.approx(np.full(60, 1_000), rel=0.01)
     assert (ppo.net.parameters["critic.0.weight"] - before).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("clone_epochs", [0, 1])
+def test_the_advantages_of_a_cloned_policy_are_not_standardized(clone_epochs: int) -> None:
+    """Also after the algorithm was saved and loaded."""
+    ppo, loaded = (made("ppo", DISCRETE, clone_epochs=clone_epochs) for _ in range(2))
+    assert ppo.config.normalize_advantage
+    if clone_epochs:
+        cloned(ppo, episodes_of(DISCRETE))
+    loaded.load_state_dict(ppo.state_dict())
+    raw = torch.tensor([0.001, 0.002, 0.003])
+    rows = Minibatch(
+        torch.zeros(3, 3), (), torch.zeros(3, dtype=torch.int64), torch.zeros(3), raw, torch.zeros(3), None, None
+    )
+    for each in (ppo, loaded):
+        found = each.evaluate(rows).advantage
+        assert found.tolist() == pytest.approx(raw.tolist() if clone_epochs else [-1, 0, 1], rel=1e-3)
 
 
 def test_each_epoch_uses_each_step_once_and_in_an_order_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
