@@ -111,9 +111,10 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, bound: float) -> None:
     spec = pendulum_like(bound)
     parameters, buffers = weights(spec)
     folder = RunFolder(tmp_path)
-    folder.write_policy(policy_run(spec, EnvSpec("Mine-v0", {"g": 9.8})), parameters, buffers)
+    env = EnvSpec("Mine-v0", {"g": 9.8}, eval_kwargs={"g": 1.6})
+    folder.write_policy(policy_run(spec, env), parameters, buffers)
     card, acting, normal = folder.read_policy()
-    assert (card.policy, card.env, card.env_kwargs) == (spec, "Mine-v0", {"g": 9.8})
+    assert (card.policy, card.env, card.env_kwargs, card.eval_env_kwargs) == (spec, "Mine-v0", {"g": 9.8}, {"g": 1.6})
     assert acting.tobytes() == parameters[: acting_size(spec)].tobytes()
     assert normal.tobytes() == buffers.tobytes()
 
