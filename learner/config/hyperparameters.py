@@ -293,6 +293,8 @@ class TQCConfig(SACConfig, frozen=True):
 class NormalizedConfig(SACConfig, frozen=True):
     """Settings of SAC with batch normalization in the actor and the critics."""
 
+    net: Fixed[tuple[Count, ...]] = (256, 256)
+    """Sizes of the hidden layers of the actor."""
     critic_net: Fixed[tuple[Count, ...]] = (256, 256)
     """Sizes of the hidden layers of each critic."""
     learning_starts: Free[Natural] = 5000
@@ -304,8 +306,6 @@ class NormalizedConfig(SACConfig, frozen=True):
 class CrossQConfig(NormalizedConfig, frozen=True):
     """CrossQ (Bhatt et al. 2024): batch normalization in place of target networks."""
 
-    net: Fixed[tuple[Count, ...]] = (256, 256)
-    """Sizes of the hidden layers of the actor."""
     critic_net: Fixed[tuple[Count, ...]] = (1024, 1024)
     """Sizes of the hidden layers of each critic."""
     learning_rate: Free[Positive] = 1e-3
@@ -317,10 +317,6 @@ class CrossQConfig(NormalizedConfig, frozen=True):
 class XQCConfig(NormalizedConfig, frozen=True):
     """XQC (Palenicek et al. 2025): batch normalization, weights of norm 1, critics of a distribution of returns."""
 
-    net: Fixed[tuple[Count, ...]] = (256, 256)
-    """Sizes of the hidden layers of the actor."""
-    critic_net: Fixed[tuple[Count, ...]] = (256, 256, 256)
-    """Sizes of the hidden layers of each critic."""
     atoms: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 101
     """Number of returns whose probabilities a critic learns, equally spaced from -return_bound to return_bound."""
     return_bound: Fixed[Positive] = 5.0
