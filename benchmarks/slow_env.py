@@ -8,6 +8,8 @@ with episodes of 1,000 steps in place of 200.
 
 `benchmarks.slow_env:Constant-v0`: a step takes `seconds`, a reset no time, and an episode has `steps` steps.
 
+`StepTime` makes the steps of any environment take a given time: `--wrappers "benchmarks.slow_env:StepTime(seconds=0.05)"`.
+
 With the environment variable `SLOW_ENV_TIMELINE` each copy appends every step and reset to a file in that folder: three
 float64 numbers: start and end by the monotonic clock, and 1 for a reset.
 """
@@ -84,6 +86,20 @@ class Constant(gymnasium.Env[Any, Any]):
 
     def _observation(self) -> Any:
         return np.array([self._left / self._steps], np.float32)
+
+
+class StepTime(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment whose steps take a given time: each sleeps until it is over. Resets are not changed."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], seconds: float) -> None:
+        super().__init__(env)
+        self._seconds = seconds
+
+    def step(self, action: Any) -> Any:
+        end_s = time.monotonic() + self._seconds
+        result = self.env.step(action)
+        time.sleep(max(0.0, end_s - time.monotonic()))
+        return result
 
 
 class SlowPendulum(PendulumEnv):

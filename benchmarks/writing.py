@@ -33,6 +33,17 @@ def circumstances() -> dict[str, object]:
     }
 
 
+def processor() -> str:
+    """The cores of this machine and their name, as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{cores} cores of {names[0] if names else platform.machine()}"
+
+
 def _commit() -> str:
     command = ["git", "describe", "--always", "--dirty"]
     try:
