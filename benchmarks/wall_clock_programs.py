@@ -1,0 +1,82 @@
+"""The programs that `benchmarks/wall_clock.py` compares, and the commands that train a curve or measure a rate. Pure.
+
+Rule: a rate is measured with the settings of the curve, except that steps take longer, that nothing is evaluated, and that
+gradient steps begin earlier (`LEARNING_STARTS`). A curve is trained by two workers, because its steps wait for nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import NamedTuple
+
+from millrace.learner.config.layers import resolve
+
+COPIES = 16
+ENVS = ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
+OURS, THEIRS = "millrace", "Stable-Baselines3"
+ALGORITHMS = {OURS: ("ppo", "sac", "tqc", "crossq", "xqc"), THEIRS: ("ppo", "sac", "tqc", "crossq")}
+NAMES = {"ppo": "PPO", "sac": "SAC", "tqc": "TQC", "crossq": "CrossQ", "xqc": "XQC"}
+EVAL_EVERY, EVAL_EPISODES = 10_000, 20
+STEPS = {"ppo": 1_000_000}
+MOST_STEPS = 300_000
+"""env steps of a curve, if `STEPS` has no others"""
+LEARNING_STARTS = 512
+"""env steps before the first gradient step where a rate is measured"""
+WARM_UP_STEPS = 768
+"""env steps of such a run that do not count"""
+THEIR_PPO_STEPS = 2048
+"""steps of a copy in a rollout of Stable-Baselines3's PPO"""
+THEIR_PROGRAM = "benchmarks.wall_clock_stable_baselines3"
+
+
+class Program(NamedTuple):
+    """An algorithm of one of the two systems."""
+
+    system: str
+    algo: str
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether env copies step during updates."""
+        return self.system == OURS and self.algo != "ppo"
+
+    def steps_of_an_update(self, env: str) -> int:
+        """Env steps between two updates."""
+        if self.algo != "ppo":
+            return COPIES * (4 if self.system == OURS else 1)
+        return COPIES * (resolve(env).algorithm.rollout_steps if self.system == OURS else THEIR_PPO_STEPS)
+
+    def warm_up_steps(self, env: str) -> int:
+        """Env steps that a rate leaves out: the first update of PPO; otherwise until some gradient steps were made."""
+        return self.steps_of_an_update(env) if self.algo == "ppo" else WARM_UP_STEPS
+
+
+PROGRAMS = tuple(Program(system, algo) for system, algorithms in ALGORITHMS.items() for algo in algorithms)
+
+
+def curve_command(program: Program, env: str, seed: int, out: str) -> list[str]:
+    """The command that trains a curve into a folder in `out`."""
+    steps = str(STEPS.get(program.algo, MOST_STEPS))
+    if program.system == THEIRS:
+        folder = f"{out}/{env}-sb3-{program.algo}-s{seed}"
+        return ["python", "-m", THEIR_PROGRAM, env, program.algo, str(seed), "--steps", steps, "--out", folder]
+    evaluations = ["--eval-every", str(EVAL_EVERY), "--eval-episodes", str(EVAL_EPISODES)]
+    words = ["nice", "-n", "19", "millrace", "train", env, "--algo", program.algo, "--seed", str(seed), "--steps", steps]
+    return [*words, "--workers", "2", *_flags(program.algo), *evaluations, "--run-dir", out]
+
+
+def rate_command(program: Program, env: str, step_s: float, seed: int | str, threads: int, device: str) -> list[str]:
+    """The command of a run that is stopped when its rate has been measured. It runs in an empty folder."""
+    starts = [] if program.algo == "ppo" else ["--learning-starts", str(LEARNING_STARTS)]
+    if program.system == THEIRS:
+        words = [sys.executable, "-m", THEIR_PROGRAM, env, program.algo, str(seed), *starts, "--step-s", str(step_s)]
+        return [*words, "--threads", str(threads), "--device", device]
+    words = [sys.executable, "-m", "millrace", "train", env, "--algo", program.algo, "--seed", str(seed), *starts]
+    words += ["--steps", str(10**8), "--eval-every", "0", "--eval-episodes", "1", "--run-dir", ".", "--grace-s", "4"]
+    words += ["--wrappers", f"benchmarks.slow_env:StepTime(seconds={step_s})", "--workers", str(COPIES)]
+    return [*words, *_flags(program.algo), "--torch-threads", str(threads), "--device", device]
+
+
+def _flags(algo: str) -> list[str]:
+    copies = ["--envs", str(COPIES), "--lanes", str(COPIES)]
+    return copies if algo == "ppo" else [*copies, "--rollout-steps", "4", "--max-lag", "1"]
