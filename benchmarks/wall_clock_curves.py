@@ -1,0 +1,108 @@
+"""Learning curves: greedy return by env steps of one run each. Those that are kept are in benchmarks/curves.json.
+
+Rule: a curve is that of one environment, system, algorithm and seed; a newer one takes its place. It has the evaluations
+that the run made itself, in raw returns.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from benchmarks import results
+from benchmarks.wall_clock_programs import OURS
+from benchmarks.writing import processor
+from millrace.learner.config.layers import config_of_run
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY
+from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.learner.run_folder.run_format import CONFIG_FILE
+
+CURVES = Path(__file__).with_name("curves.json")
+THEIR_CURVE = "curve.jsonl"
+RETURN_KEY, EVALUATED_KEY = "eval/mean_reward", "eval/env_steps"
+
+
+class Curve(msgspec.Struct, kw_only=True):
+    """One run."""
+
+    env: str
+    system: str
+    algo: str
+    seed: int
+    command: str
+    """the command of the run, with S in place of the seed"""
+    processor: str
+    points: list[tuple[int, float]] = []
+    """env steps, and the mean return of the greedy episodes of an evaluation"""
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        """What a newer curve has in common with the one whose place it takes."""
+        return self.env, self.system, self.algo, self.seed
+
+
+class _Point(msgspec.Struct):
+    env_steps: int
+    returned: float = msgspec.field(name="return")
+
+
+def read_curves() -> list[Curve]:
+    """The curves that are kept."""
+    return msgspec.json.decode(CURVES.read_bytes(), type=list[Curve])
+
+
+def write_curves(curves: Iterable[Curve]) -> None:
+    """Keep these curves, one a line."""
+    ordered = sorted(curves, key=lambda curve: curve.key)
+    CURVES.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, ordered)) + b"\n]\n")
+
+
+def merged(old: Iterable[Curve], new: Iterable[Curve]) -> list[Curve]:
+    """The new curves, and the old ones of other runs."""
+    return list({curve.key: curve for curve in (*old, *new)}.values())
+
+
+def found_in(folder: Path, made_on: str | None) -> Iterator[Curve]:
+    """The curves of all runs in this folder. `made_on`: the processor of millrace's runs, if it is not this machine's."""
+    for path in sorted(folder.rglob(THEIR_CURVE)):
+        yield of_their_file(path)
+    for path in sorted(folder.rglob(CONFIG_FILE)):
+        yield of_run(path.parent, made_on or processor())
+
+
+def of_run(path: Path, made_on: str) -> Curve:
+    """The curve of a run folder of millrace."""
+    config, table = config_of_run(path), path / METRICS_FILE
+    rows = read_rows(table) if table.exists() else []
+    points = [(int(row.get(EVALUATED_KEY) or row[ENV_STEPS_KEY]), row[RETURN_KEY]) for row in rows if RETURN_KEY in row]
+    summary = RunFolder.open(path).summary()
+    if summary is not None and summary.evaluation is not None and not (points and points[-1][0] >= summary.env_steps):
+        points.append((summary.env_steps, summary.evaluation.return_mean))  # it is not in metrics.jsonl
+    words = shlex.split(results.command(config))
+    if "--workers" not in words:  # the command leaves it out where it has no effect, but a reader looks for it
+        words += ["--workers", str(config.workers)]
+    return Curve(
+        env=config.env,
+        system=OURS,
+        algo=config.algo,
+        seed=config.seed,
+        command=shlex.join(words),
+        processor=made_on,
+        points=_rounded(points),
+    )
+
+
+def of_their_file(path: Path) -> Curve:
+    """The curve that `benchmarks/wall_clock_stable_baselines3.py` wrote. A last line that was cut off is ignored."""
+    first, *lines = path.read_bytes().split(b"\n")[:-1]
+    read = [msgspec.json.decode(line, type=_Point) for line in lines]
+    points = _rounded((point.env_steps, point.returned) for point in read)
+    return msgspec.structs.replace(msgspec.json.decode(first, type=Curve), points=points)
+
+
+def _rounded(points: Iterable[tuple[int, float]]) -> list[tuple[int, float]]:
+    return [(env_steps, round(returned, 1)) for env_steps, returned in points]

@@ -1,0 +1,172 @@
+"""Env steps/s of a program whose steps take a given time. Those that are kept are in benchmarks/rates.json.
+
+Rule: a rate is measured after the warm-up, over whole updates, with the gradient steps that belong to them. For other step
+times it follows from the measured one: where env copies wait for updates, an env step takes its share of the updates and of
+the step time; where they step during updates, the slower of both decides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from benchmarks.wall_clock_programs import COPIES, OURS, Program, rate_command
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
+
+ROOT = Path(__file__).parents[1]
+RATES = Path(__file__).with_name("rates.json")
+LOOK_S, LONGEST_S = 0.5, 600.0
+LEAST_UPDATES = 2
+"""of those that are measured"""
+
+
+class Rate(msgspec.Struct, kw_only=True):
+    """A program on one environment, with one step time."""
+
+    env: str
+    system: str
+    algo: str
+    step_s: float
+    processor: str
+    command: str
+    """the command of each round, with S in place of the seed"""
+    rates: list[float]
+    """env steps/s of each round"""
+
+    @property
+    def key(self) -> tuple[str, str, str, float, str]:
+        """What a newer rate has in common with the one whose place it takes."""
+        return self.env, self.system, self.algo, self.step_s, self.processor
+
+    @property
+    def median(self) -> float:
+        """Env steps/s."""
+        return statistics.median(self.rates)
+
+
+class RateAt(NamedTuple):
+    """Env steps/s at a step time."""
+
+    per_s: float
+    computed: bool
+    """whether it follows from the rate at another step time"""
+
+
+def read_rates() -> list[Rate]:
+    """The rates that are kept."""
+    return msgspec.json.decode(RATES.read_bytes(), type=list[Rate])
+
+
+def write_rates(rates: Iterable[Rate]) -> None:
+    """Keep these rates, one a line."""
+    ordered = sorted(rates, key=lambda rate: rate.key)
+    RATES.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, ordered)) + b"\n]\n")
+
+
+def merged(old: Iterable[Rate], new: Iterable[Rate]) -> list[Rate]:
+    """The new rates, and the old ones of other programs, step times and processors."""
+    return list({rate.key: rate for rate in (*old, *new)}.values())
+
+
+def rate_at(step_s: float, rates: Sequence[Rate]) -> RateAt | None:
+    """The rate of a program at a step time, from its rates at one or more; None if there are none.
+
+    The nearest shorter step time decides: at longer ones, updates count less, so that less can be learned of them.
+    """
+    if not rates:
+        return None
+    ordered = sorted(rates, key=lambda rate: rate.step_s)
+    base = next((rate for rate in reversed(ordered) if rate.step_s <= step_s), ordered[0])
+    return RateAt(base.median, False) if base.step_s == step_s else RateAt(computed(step_s, base), True)
+
+
+def computed(step_s: float, base: Rate) -> float:
+    """The rate at a step time that follows from that at another one."""
+    if Program(base.system, base.algo).overlaps:
+        return min(base.median, COPIES / step_s)
+    of_updates_s = max(0.0, 1 / base.median - base.step_s / COPIES)
+    return 1 / (of_updates_s + step_s / COPIES)
+
+
+def largest_error(rates: Iterable[Rate]) -> float | None:
+    """How far computed rates are from measured ones at most, as a share of these; None if no program has two step times."""
+    of: dict[tuple[str, ...], list[Rate]] = {}
+    for rate in sorted(rates, key=lambda rate: rate.step_s):
+        of.setdefault((rate.env, rate.system, rate.algo, rate.processor), []).append(rate)
+    errors = [abs(computed(long.step_s, first) / long.median - 1) for first, *longer in of.values() for long in longer]
+    return max(errors, default=None)
+
+
+def can_be_measured(program: Program, env: str, step_s: float, seconds: float) -> bool:
+    """Whether the steps of an update take no longer than what is measured."""
+    return program.steps_of_an_update(env) / COPIES * step_s <= seconds
+
+
+def measure(
+    program: Program, env: str, step_s: float, seed: int, *, seconds: float, threads: int = 1, device: str = "cpu"
+) -> float:
+    """Env steps/s over at least so many seconds after the warm-up. Raises `RuntimeError`."""
+    command = rate_command(program, env, step_s, seed, threads, device)
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
+        folder, began_s = Path(name), time.monotonic()
+        with (folder / "out").open("w") as out:
+            process = subprocess.Popen(
+                command,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env=os.environ | one_thread | {"PYTHONPATH": path},
+                cwd=folder,
+                start_new_session=True,  # so that its child processes can be ended with it
+            )
+        try:
+            while True:
+                found = rate_of(updates(program, folder), program.warm_up_steps(env), seconds)
+                if found is not None:
+                    return found
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(LOOK_S)
+                if process.returncode is not None or time.monotonic() - began_s > LONGEST_S + seconds:
+                    said = (folder / "out").read_text()[-500:]
+                    raise RuntimeError(f"{program.system}, {program.algo}, {env}: no rate was found: {said}")
+        finally:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def updates(program: Program, folder: Path) -> list[tuple[int, float]]:
+    """Env steps and time in seconds of each update of the run in this folder."""
+    if program.system == OURS:
+        return [
+            (int(row["time/total_timesteps"]), row["time/time_elapsed"])
+            for table in folder.rglob(METRICS_FILE)
+            for row in read_rows(table)
+        ]
+    *lines, _ = (folder / "out").read_text().split("\n")
+    read = [json.loads(line) for line in lines if line.startswith('{"env_steps"')]
+    return [(line["env_steps"], line["at_s"]) for line in read]
+
+
+def rate_of(found: Sequence[tuple[int, float]], warm_up_steps: int, seconds: float) -> float | None:
+    """Env steps/s between the first update after the warm-up and the last one; None if that is not long enough yet."""
+    counted = [update for update in found if update[0] >= warm_up_steps]
+    if len(counted) <= LEAST_UPDATES:
+        return None
+    (first, began_s), (last, ended_s) = counted[0], counted[-1]
+    return (last - first) / (ended_s - began_s) if ended_s - began_s >= seconds else None
