@@ -33,7 +33,7 @@ class CrossQ(NormalizedSAC):
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
         self.target = self.net
-        del self.tensors["unfolded_target"]
+        del self.tensors["target"]
 
     def networks(self, device: str) -> ActorWithCritics:
         """See `Continuous`."""

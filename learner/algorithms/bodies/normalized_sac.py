@@ -48,9 +48,6 @@ class NormalizedSAC(SAC):
         self, config: NormalizedConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        # By other names than those of networks that act as they are: SAC must not start from these.
-        self.tensors["unfolded"] = self.tensors.pop("parameters")
-        self.tensors["unfolded_target"] = self.tensors.pop("target")
         self.tensors["statistics"] = self.net.statistics
 
     def sizes(self, outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -98,18 +95,12 @@ class NormalizedSAC(SAC):
         return measured
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. Raises `UsageError` without statistics: in a policy alone they are folded into it."""
+        """See `Algorithm.start_from`. Raises `UsageError` if only a policy is known: its normalization is folded into it."""
         if "statistics" not in start.state:
             raise UsageError(
-                "start_from: expected a checkpoint of the same algorithm, with the statistics of batch normalization, got "
-                "none; start from such a run"
+                "start_from: expected a run with a checkpoint, got a policy alone, which lacks the statistics of its batch "
+                "normalization"
             )
-        super().start_from(start)
-        if not start.critic:
-            statistics = self.net.statistics[: size_of(self.net.actor_body.shape.statistics())]
-            for name, own in (("unfolded", self.net.actor), ("statistics", statistics)):
-                found = start.state[name][: len(own)]
-                if found.shape != own.shape:
-                    raise ValueError(f"{name}: expected at least {len(own)} numbers, got {len(found)}")
-                own.copy_(found)
-            self.target.actor.copy_(self.net.actor)
+        actor, statistics = len(self.net.actor), size_of(self.net.actor_body.shape.statistics())
+        super().start_from(start._replace(acting=actor))
+        self.net.statistics[:statistics].copy_(start.state["statistics"][:statistics])
