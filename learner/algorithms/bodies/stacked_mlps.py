@@ -168,8 +168,9 @@ class StackedMLPs:
     def project(self) -> None:
         """With `unit_rows`: scale the weights of each unit to norm 1. Called after each step of an optimizer."""
         if self.shape.unit_rows:
-            for layer in self._layers(self._constant):
-                layer.weight.div_(torch.linalg.vector_norm(layer.weight, dim=-1, keepdim=True))
+            for name, view in _views(self._constant, self.shape.fields()).items():
+                if name.endswith("weight"):
+                    view.div_(torch.linalg.vector_norm(view, dim=-1, keepdim=True))
 
     @staticmethod
     def _plain(x: Tensor, flat: Tensor, shape: MLPShape) -> Tensor:

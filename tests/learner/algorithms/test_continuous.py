@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.spaces import action_spec
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy import networks
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.exploration import Deterministic, Squashed
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS, named_views
@@ -234,7 +232,7 @@ def rows_of(algorithm: Continuous, terminated: bool, truncated: bool) -> Transit
     }, leaves=(sample.leaves[0][second],), next_leaves=(sample.next_leaves[0][second],)))  # fmt: skip
 
 
-def as_table(algorithm: Continuous) -> None:
+def as_table(algorithm: Any) -> None:
     """Networks without hidden layers: Q₀ = 5, Q₁ = 7 in the last state; (1, -1) is the action before the tangent."""
     for net in (algorithm.net, algorithm.target):
         net.flat.zero_()
@@ -375,14 +373,6 @@ def test_they_import_nothing_that_a_user_could_not(name: str) -> None:
 
 
 # -------------------------------------------------------------------- Stable-Baselines3, in float64
-
-
-@pytest.fixture
-def _float64(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(networks, "DTYPE", torch.float64)
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
 
 
 def sample_of(generator: np.random.Generator, rows: int) -> Sample:
