@@ -64,13 +64,13 @@ class NormalizedSAC(SAC):
     def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
         """See `Continuous`. Afterwards weights that are to have norm 1 have it again."""
         measured = super().descend(name, loss, numbers)
-        self.net.project()
+        if name != "ent_coef":
+            (self.net.actor_body if name == "actor" else self.net.critic_bodies).project()
         return measured
 
-    def begin_with_actor(self) -> None:
+    def project_actor(self) -> None:
         """See `Continuous`."""
-        self.net.project()
-        super().begin_with_actor()
+        self.net.actor_body.project()
 
     def move_target(self) -> None:
         """After each step of the critics: move their targets, if there are any."""

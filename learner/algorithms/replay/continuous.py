@@ -110,6 +110,9 @@ class Continuous(OffPolicy):
         """New networks, the same each time: those that are trained, then their targets."""
         return actor_and_critics(self.policy, device, self.seed)
 
+    def project_actor(self) -> None:
+        """After each step of the actor: return its weights to where the algorithm holds them, if it does."""
+
     def begin_with_actor(self) -> None:
         """The actor was trained before the first rollouts: it acts from the first env step, and its target equals it."""
         self.target.actor.copy_(self.net.actor)

@@ -58,6 +58,8 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
             algorithm.differentiate(loss, optimizer, {"clone/loss": loss})
             optimizer.param_groups[0]["lr"] = LEARNING_RATE
             take_step(optimizer)
+            if isinstance(algorithm, Continuous):
+                algorithm.project_actor()
             algorithm.pretraining_steps += 1
             pulse()
     if isinstance(algorithm, Continuous):

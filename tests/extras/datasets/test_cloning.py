@@ -23,6 +23,7 @@ from millrace.protocol.policy.exploration import Squashed
 from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.learner.algorithms.bodies import plain_formula
 from tests.support.numbers.prior_data import GivenPrior
 
 BOX = Leaf("", "box", (3,), "float32")
@@ -120,8 +121,7 @@ def test_the_loss_is_the_one_that_the_file_states() -> None:
     [
         *(("ppo", action) for action in ACTIONS),
         ("reinforce", DISCRETE),
-        ("sac", CONTINUOUS),
-        ("td3", CONTINUOUS),
+        *((algo, CONTINUOUS) for algo in ("sac", "td3", "tqc", "crossq", "xqc")),
     ],
     ids=lambda value: value if isinstance(value, str) else getattr(value, "kind", ""),
 )
@@ -243,7 +243,9 @@ def test_the_statistics_of_observations_are_those_of_the_demonstrations() -> Non
     np.testing.assert_allclose(ppo.weights()[1], np.concatenate((x.mean(0), x.std(0))), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("algo", "action"), [("ppo", DISCRETE), ("a2c", CONTINUOUS), ("sac", CONTINUOUS)])
+@pytest.mark.parametrize(
+    ("algo", "action"), [("ppo", DISCRETE), *((algo, CONTINUOUS) for algo in ("a2c", "sac", "tqc", "xqc"))]
+)
 def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, action: ActionSpec) -> None:
     whole, stopped, resumed = (made(algo, action, clone_epochs=3) for _ in range(3))
     episodes = episodes_of(action)
@@ -262,6 +264,20 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
     assert torch.equal(whole.net.flat, resumed.net.flat)
     untrained = made(algo, action, clone_epochs=3)
     assert not torch.equal(whole.net.flat, untrained.net.flat)
+
+
+def test_weights_of_units_of_xqc_have_norm_1_after_each_step() -> None:
+    """Else the policy would be another one when its weights are scaled at the end."""
+    algorithm = made("xqc", CONTINUOUS, clone_epochs=1)
+
+    def pulse() -> None:
+        (layers,) = plain_formula.layers(algorithm.net.actor_body.shape, algorithm.net.actor)
+        for layer in layers:
+            norms = torch.linalg.vector_norm(layer.weight, dim=1)
+            torch.testing.assert_close(norms, torch.ones_like(norms))
+
+    cloned(algorithm, episodes_of(CONTINUOUS), pulse)
+    assert algorithm.pretraining_steps == 3
 
 
 def test_a_step_with_a_loss_that_is_not_finite_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
