@@ -15,7 +15,8 @@ import torch
 from millrace.learner.algorithms.minibatches import log_probs
 from millrace.learner.algorithms.normalization import ObservationNormalizer
 from millrace.learner.algorithms.ppo import PPO
-from millrace.learner.config.hyperparameters import PPOConfig
+from millrace.learner.algorithms.xqc import XQC
+from millrace.learner.config.hyperparameters import PPOConfig, XQCConfig
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import observation_leaves
@@ -29,6 +30,7 @@ from tests.docs.pages import blocks, written
 from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around
 from tests.support.in_process.saved_policies import policy_run
+from tests.support.numbers.batches import GAUSSIAN, batch, no_pulse
 
 TWO = ActionSpec("discrete", (), "int64", (2,), (0,))
 IMAGE = gymnasium.spaces.Box(0, 255, (12, 12, 3), np.uint8)
@@ -127,12 +129,16 @@ def test_planes_of_0_and_1_reach_the_convolutions_as_they_are(shape: tuple[int, 
         assert np.abs(found[0]).max() > 0.1
 
 
-@pytest.mark.parametrize(("dtype", "high"), [("uint8", 1), ("uint8", 255), ("int8", 1), ("float32", 1)])
-def test_the_exported_actor_of_the_page_sees_what_the_policy_sees(dtype: str, high: int, tmp_path: Path) -> None:
+def exported_actor(run: Path) -> Any:
     """The TorchScript module of docs/how-to/policies.md."""
     (code,) = (block.text for block in blocks(written()["docs/how-to/policies.md"]) if "class Actor" in block.text)
     names: dict[str, Any] = {}
     exec(code.partition("\nactor = ")[0], names)
+    return names["Actor"](run)
+
+
+@pytest.mark.parametrize(("dtype", "high"), [("uint8", 1), ("uint8", 255), ("int8", 1), ("float32", 1)])
+def test_the_exported_actor_of_the_page_sees_what_the_policy_sees(dtype: str, high: int, tmp_path: Path) -> None:
     spec = policy_of(gymnasium.spaces.Box(0, high, (4,), np.dtype(dtype).type), normalize_observations=True)
     generator = np.random.default_rng(0)
     weights = generator.normal(0, 0.5, acting_size(spec)).astype(np.float32), np.ones(buffer_size(spec), np.float32)
@@ -140,9 +146,22 @@ def test_the_exported_actor_of_the_page_sees_what_the_policy_sees(dtype: str, hi
     policy = make_policy(spec)
     policy.load(*weights)
     rows = generator.integers(0, high + 1, (1, 20, 4)).astype(dtype)
-    found = names["Actor"](tmp_path)(torch.from_numpy(rows[0]))
+    found = exported_actor(tmp_path)(torch.from_numpy(rows[0]))
     # A hundred float32 operations on numbers of the size of 1, in another order.
     np.testing.assert_allclose(found.numpy(), policy([rows])[0], atol=1e-4)
+
+
+def test_the_exported_actor_of_the_page_acts_as_xqc_does_which_normalizes_in_training(tmp_path: Path) -> None:
+    """Its statistics are folded into the layers of policy.safetensors."""
+    config = XQCConfig(net=(16, 16), critic_net=(16,), learning_starts=0, updates_per_step=0.1)
+    box = msgspec.structs.replace(GAUSSIAN.action, low=(-2.0,) * 2, high=(2.0,) * 2)
+    algorithm = XQC(config, XQC.policy_spec(config, GAUSSIAN.observation, box), total_steps=1000, seed=0)
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    RunFolder(tmp_path).write_policy(policy_run(algorithm.policy, EnvSpec("Mine-v0")), *algorithm.weights())
+    x = torch.randn(20, 4, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = algorithm.net.params(x)
+    torch.testing.assert_close(exported_actor(tmp_path)(x), expected, atol=1e-4, rtol=1e-4)
 
 
 # ------------------------------------------------------------------------------------------------ images
