@@ -27,6 +27,7 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.saved_policies import policy_run
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, batch, no_pulse
+from tests.support.variants import variants
 
 SMALL: dict[str, Any] = {"net": (16,), "normalize_observations": True, "normalize_rewards": True, "rollout_steps": 20}
 OFF_POLICY = SMALL | {"batch_size": 16, "replay_size": 1000}
@@ -34,9 +35,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "ppo": SMALL, "a2c": SMALL, "reinforce": SMALL,
     "dqn": OFF_POLICY | {"learning_starts": 0, "gradient_steps": 4},
     "sac": OFF_POLICY | {"learning_starts": 50}, "td3": OFF_POLICY | {"learning_starts": 50},
+    "tqc": OFF_POLICY | {"learning_starts": 50, "updates_per_step": 0.1},
+    "crossq": OFF_POLICY | {"learning_starts": 50, "updates_per_step": 0.1, "critic_net": (16,)},
+    "xqc": OFF_POLICY | {"learning_starts": 50, "updates_per_step": 0.1, "critic_net": (16,), "atoms": 11},
 }  # fmt: skip
-SPACES = {"ppo": GAUSSIAN, "a2c": GAUSSIAN, "reinforce": GAUSSIAN, "dqn": DISCRETE, "sac": GAUSSIAN, "td3": GAUSSIAN}
-ALL = pytest.mark.parametrize("algo", ["ppo", "dqn", "sac", "td3"])
+SPACES = {name: DISCRETE if name == "dqn" else GAUSSIAN for name in SETTINGS}
+ALL = pytest.mark.parametrize("algo", ["ppo", "dqn", "sac", "td3", "tqc", "xqc"])
 
 
 def made(algo: str, folder: Path, spaces: PolicySpec | None = None, seed: int = 2, **settings: Any) -> tuple[Config, Any]:
@@ -95,6 +99,18 @@ def statistics(algorithm: Any) -> dict[str, Any]:
     }
 
 
+def actor_size(algorithm: Any) -> int:
+    """The number of parameters of the actor. Workers may act with fewer: those of its layers after normalization."""
+    return len(algorithm.net.actor) if hasattr(algorithm.net, "actor") else len(algorithm.weights()[0])
+
+
+def with_those_of_its_actor(algorithm: Any, fresh: torch.Tensor) -> torch.Tensor:
+    """Running statistics of batch normalization: the mean and variance of each input of the actor's layers, then others."""
+    actors = sum(2 * size for size in algorithm.net.actor_body.shape.sizes[:-1])
+    assert not torch.equal(algorithm.net.statistics[:actors], fresh[:actors])
+    return torch.cat([algorithm.net.statistics[:actors], fresh[actors:]])
+
+
 # ------------------------------------------------------------------------------------------------------ what is taken
 
 
@@ -103,7 +119,7 @@ def test_the_policy_and_the_statistics_are_taken_and_all_else_starts_anew(tmp_pa
     run, before = earlier_run(algo, tmp_path)
     algorithm, said = started(algo, tmp_path, run, from_parts="policy")
     fresh = made(algo, tmp_path / "new")[1].state_dict()
-    P = len(before.weights()[0])
+    P = actor_size(before)
     assert said == f"starts from {run} (made:Env-v0): policy, statistics, after {before.env_steps} env steps"
     assert np.array_equal(algorithm.weights()[0], before.weights()[0])
     assert not np.array_equal(algorithm.weights()[0], made(algo, tmp_path)[1].weights()[0])
@@ -113,6 +129,8 @@ def test_the_policy_and_the_statistics_are_taken_and_all_else_starts_anew(tmp_pa
     for name in ("parameters", "target"):
         if name in state:
             assert first_difference(state.pop(name), torch.cat([theirs["parameters"][:P], fresh[name][P:]])) is None
+    if "statistics" in state:  # of batch normalization
+        assert first_difference(state.pop("statistics"), with_those_of_its_actor(before, fresh["statistics"])) is None
     assert state.pop("acts_at_once", True)
     assert first_difference(state, {name: fresh[name] for name in state}) is None
 
@@ -122,7 +140,7 @@ def test_all_weights_are_taken_with_the_critic_and_the_moments_of_optimizers_wit
     run, before = earlier_run(algo, tmp_path)
     theirs = before.state_dict()
     fresh = made(algo, tmp_path, learning_rate=0.25)[1].state_dict()
-    weights = [name for name in ("parameters", "target", "log_temperature") if name in fresh]
+    weights = [name for name in ("parameters", "target", "statistics", "log_temperature") if name in fresh]
     optimizers = [name for name in fresh if name.endswith("optimizer")]
     for parts, kept in (("critic", fresh), ("all", theirs)):
         algorithm, said = started(algo, tmp_path, run, from_parts=parts, learning_rate=0.25)
@@ -144,6 +162,26 @@ def test_the_critic_comes_too_where_the_actor_follows_it_at_once(tmp_path: Path,
     algorithm, said = started(algo, tmp_path, run)
     assert said.endswith("): policy")
     assert np.array_equal(algorithm.weights()[0], before.weights()[0])
+
+
+@pytest.mark.parametrize("algo", variants(["crossq", "xqc"], default=["xqc"]))
+def test_a_policy_alone_is_refused_by_an_algorithm_that_needs_the_statistics_of_its_normalization(
+    tmp_path: Path, algo: str
+) -> None:
+    """Workers act with a policy into which they are folded."""
+    run, _ = earlier_run(algo, tmp_path)
+    shutil.rmtree(run / "checkpoints")
+    for parts in ("auto", "policy", "best"):
+        line = refusal(algo, tmp_path, run, from_parts=parts)
+        assert "expected a run with a checkpoint, got a policy alone, which lacks the statistics of its batch" in line
+
+
+@pytest.mark.parametrize("algo", variants(["crossq", "xqc"], default=["crossq"]))
+def test_normalized_networks_start_with_the_critic_and_all_statistics(tmp_path: Path, algo: str) -> None:
+    run, before = earlier_run(algo, tmp_path)
+    algorithm, _ = started(algo, tmp_path, run, from_parts="critic")
+    assert first_difference(algorithm.net.statistics, before.net.statistics) is None
+    assert first_difference(algorithm.net.flat, before.net.flat) is None
 
 
 def test_a_fixed_temperature_is_a_setting_and_is_not_taken(tmp_path: Path) -> None:
