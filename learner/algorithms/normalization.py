@@ -228,5 +228,5 @@ class RewardScaler:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state["moments"])
-        self._largest = float(state["largest"])
+        self._largest = float(state.get("largest", 0))  # states of version 0.2.0 have none
         self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}
