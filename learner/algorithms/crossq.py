@@ -21,6 +21,7 @@ class CrossQ(NormalizedSAC):
 
     Config = CrossQConfig
     ADAM = {"betas": (0.5, 0.999)}
+    batch_normalization = "after activations"
     config: CrossQConfig
 
     @staticmethod

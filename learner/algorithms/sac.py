@@ -7,6 +7,7 @@ update is `OffPolicy.update`, which calls `step` for each gradient step that is 
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from millrace.learner.config.hyperparameters import SACConfig
+from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.networks import trainable
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -25,6 +27,8 @@ class SAC(Continuous):
     """An actor, two critics with their targets, and the temperature."""
 
     Config = SACConfig
+    batch_normalization: ClassVar[str] = "none"
+    """Where the actor has it: the parameters of one kind of actor mean something else in another"""
 
     @staticmethod
     def policy_spec(config: SACConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
@@ -74,7 +78,16 @@ class SAC(Continuous):
         return -(log_temperature * (log_prob + self.target_entropy)).mean()
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. A temperature that the earlier run did not learn is learned from its initial value."""
+        """See `Algorithm.start_from`. A temperature that the earlier run did not learn is learned from its initial value.
+
+        Raises `UsageError` if the actor of the earlier run is of another kind.
+        """
+        expected, got = self.batch_normalization, start.state.get("batch_normalization", "none")
+        if expected != got:
+            raise UsageError(
+                f"start_from: batch normalization of its actor: expected {expected} as in this run, got {got}; "
+                "take a run of the same algorithm"
+            )
         anew = {"log_temperature": self.log_temperature, "ent_coef_optimizer": {"state": {}}}
         super().start_from(start._replace(state=anew | start.state))
 

@@ -30,6 +30,7 @@ class XQC(NormalizedSAC):
     """An actor, two critics of categories with their targets, and the temperature."""
 
     Config = XQCConfig
+    batch_normalization = "before activations"
     config: XQCConfig
 
     @staticmethod

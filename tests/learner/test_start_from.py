@@ -173,7 +173,30 @@ def test_a_policy_alone_is_refused_by_an_algorithm_that_needs_the_statistics_of_
     shutil.rmtree(run / "checkpoints")
     for parts in ("auto", "policy", "best"):
         line = refusal(algo, tmp_path, run, from_parts=parts)
-        assert "expected a run with a checkpoint, got a policy alone, which lacks the statistics of its batch" in line
+        assert "expected a run of the same algorithm with a checkpoint, got a policy without the statistics of batch" in line
+
+
+@pytest.mark.parametrize(
+    ("algo", "earlier", "expected"),
+    [
+        ("sac", "xqc", "expected none as in this run, got before activations"),
+        ("tqc", "crossq", "expected none as in this run, got after activations"),
+        ("xqc", "crossq", "expected before activations as in this run, got after activations"),
+        ("xqc", "sac", "expected a run of the same algorithm with a checkpoint, got a policy without the statistics"),
+    ],
+)
+def test_an_actor_of_another_kind_is_refused(tmp_path: Path, algo: str, earlier: str, expected: str) -> None:
+    """Its policy is described alike, and workers act with it alike, but its parameters mean something else."""
+    run, _ = earlier_run(earlier, tmp_path)
+    assert expected in refusal(algo, tmp_path, run, from_parts="policy")
+
+
+@pytest.mark.parametrize("earlier", ["tqc", "xqc"])
+def test_the_policy_that_workers_act_with_is_one_of_sac(tmp_path: Path, earlier: str) -> None:
+    run, before = earlier_run(earlier, tmp_path)
+    shutil.rmtree(run / "checkpoints")
+    algorithm, _ = started("sac", tmp_path, run)
+    assert np.array_equal(algorithm.weights()[0], before.weights()[0])
 
 
 @pytest.mark.parametrize("algo", variants(["crossq", "xqc"], default=["crossq"]))

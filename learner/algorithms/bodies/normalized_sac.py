@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -94,12 +94,16 @@ class NormalizedSAC(SAC):
             measured |= self.descend("ent_coef", loss, {})
         return measured
 
+    def other_state(self) -> dict[str, Any]:
+        """See `GradientDescent`."""
+        return super().other_state() | {"batch_normalization": self.batch_normalization}
+
     def start_from(self, start: Start) -> None:
         """See `Algorithm.start_from`. Raises `UsageError` if only a policy is known: its normalization is folded into it."""
         if "statistics" not in start.state:
             raise UsageError(
-                "start_from: expected a run with a checkpoint, got a policy alone, which lacks the statistics of its batch "
-                "normalization"
+                "start_from: expected a run of the same algorithm with a checkpoint, got a policy without the statistics of "
+                "batch normalization"
             )
         actor, statistics = len(self.net.actor), size_of(self.net.actor_body.shape.statistics())
         super().start_from(start._replace(acting=actor))
