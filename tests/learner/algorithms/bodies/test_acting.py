@@ -12,6 +12,7 @@ from torch import Tensor
 
 from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.protocol.arrays import Array
+from millrace.protocol.policy.layout import LOG_STD_BOUNDS
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from tests.learner.algorithms.bodies import plain_formula as plain
@@ -89,7 +90,18 @@ def test_the_learner_evaluates_its_networks_as_workers_act(algo: str) -> None:
     assert ((found - expected).abs() <= error).all()
 
 
-@NORMALIZED
+@ALL
+@pytest.mark.parametrize("trains", [True, False])
+def test_logarithms_of_standard_deviations_have_bounds(algo: str, trains: bool) -> None:
+    algorithm = learned(algo, updates=0)
+    (layers,) = plain.layers(algorithm.net.actor_body.shape, algorithm.net.actor)
+    layers[-1].bias[2:] = torch.tensor([50.0, -50.0])
+    with torch.set_grad_enabled(trains):
+        found = algorithm.net.params(torch.from_numpy(observations()[0]))
+    assert (found[:, 2:].detach() == torch.tensor(LOG_STD_BOUNDS).flip(0)).all()
+
+
+@ALL
 def test_weights_that_were_published_stay_those_of_their_version(algo: str) -> None:
     algorithm = learned(algo)
     published = algorithm.weights()[0]
