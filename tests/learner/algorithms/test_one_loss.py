@@ -28,20 +28,23 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "dqn": {"gradient_steps": 3},
     "sac": {"updates_per_step": 0.1},
     "td3": {"updates_per_step": 0.1},
+    "tqc": {"updates_per_step": 0.1},
+    "crossq": {"updates_per_step": 0.1, "critic_net": (16,)},
 }
+CONTINUOUS = ("sac", "td3", "tqc", "crossq")
 OFF_POLICY = {"net": (16,), "learning_starts": 0, "batch_size": 32, "replay_size": 1000}
 
 
 def made(name: str, **settings: Any) -> Any:
-    off_policy = OFF_POLICY if name in ("dqn", "sac", "td3") else {}
+    off_policy = OFF_POLICY if name in ("dqn", *CONTINUOUS) else {}
     config = msgspec.convert({**off_policy, **SETTINGS[name], **settings}, HYPERPARAMETERS[name])
-    spec, kind = GAUSSIAN if name in ("sac", "td3") else DISCRETE, algorithm_class(name)
+    spec, kind = GAUSSIAN if name in CONTINUOUS else DISCRETE, algorithm_class(name)
     return kind(config, kind.policy_spec(config, spec.observation, spec.action), total_steps=10_000, seed=0)
 
 
 def learned(name: str, **settings: Any) -> tuple[Any, list[dict[str, float]]]:
     """An algorithm after two updates, and their metrics. The batches are the same, whatever it learned."""
-    algorithm, acting = made(name, **settings), made("td3" if name == "sac" else name)
+    algorithm, acting = made(name, **settings), made("td3" if name in CONTINUOUS else name)
     return algorithm, [algorithm.update(batch(acting, seed, seed == 0), no_pulse) for seed in range(2)]
 
 
@@ -68,15 +71,19 @@ def times_zero(found: Any) -> Any:
         ("sac", "temperature_loss", "log_temperature"),
         ("td3", "critic_loss", "net.critics"),
         ("td3", "actor_loss", "net.actor"),
+        ("tqc", "critic_loss", "net.critics"),
+        ("tqc", "actor_loss", "net.actor"),
+        ("crossq", "critic_loss", "net.critics"),
+        ("crossq", "actor_loss", "net.actor"),
     ],
 )
 def test_zero_times_a_loss_leaves_its_weights_where_they_are_and_no_others(
     name: str, loss: str, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def parts(algorithm: Any) -> dict[str, Tensor]:
-        if name not in ("sac", "td3"):
+        if name not in CONTINUOUS:
             return {"net.flat": algorithm.net.flat}
-        temperature = {"log_temperature": algorithm.log_temperature} if name == "sac" else {}
+        temperature = {"log_temperature": algorithm.log_temperature} if name != "td3" else {}
         return {"net.actor": algorithm.net.actor, "net.critics": algorithm.net.critics, **temperature}
 
     kind = algorithm_class(name)
