@@ -281,7 +281,7 @@ def test_bounded_rewards_are_divided_by_the_larger_of_the_deviation_and_the_larg
     life = lives(12, 2)
     scaler, columns = RewardScaler(GAMMA), columns_of(life)
     reward, ended, valid = life
-    for at, factor in ((0, 3), (6, 1)):
+    for at, factor in ((0, 10), (6, 0.1)):
         rows = slice(at, at + 6)
         reward[rows] *= np.float32(factor)
         scaler.count(batch(reward[rows], [0, 0], [at == 0] * 2, ended[rows], valid[at]))

@@ -13,7 +13,7 @@ from millrace.learner.algorithms.bodies.stacked_mlps import StackedMLPs
 from millrace.learner.algorithms.replay.off_policy import Transitions
 from millrace.protocol.arrays import Doubles
 from tests.learner.algorithms.bodies import plain_formula as plain
-from tests.learner.algorithms.test_continuous import made, sample_of
+from tests.learner.algorithms.test_continuous import batch, made, sample_of
 
 B = 6
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -240,6 +240,16 @@ def test_the_critic_loss_of_xqc_and_its_gradient_are_those_of_the_formula() -> N
     found = given.algorithm.critic_loss(given.rows).loss
     torch.testing.assert_close(found.detach(), expected, **ROUNDING)
     torch.testing.assert_close(gradient(found, given.algorithm.net.critics), by_critics, **ROUNDING)
+
+
+def test_xqc_learns_from_rewards_whose_returns_are_within_the_bound_of_the_categories() -> None:
+    algorithm, plainly = made("xqc"), made("xqc", normalize_rewards=False)
+    rows = batch(0)
+    for each in (algorithm, plainly):
+        each.count(rows)
+    assert np.array_equal(algorithm.scaled(rows.reward), algorithm.rewards.bounded(rows.reward, 5.0))
+    assert np.array_equal(plainly.scaled(rows.reward), rows.reward)
+    assert not np.array_equal(algorithm.scaled(rows.reward), rows.reward)
 
 
 def test_the_temperature_of_xqc_begins_in_units_of_scaled_rewards() -> None:
