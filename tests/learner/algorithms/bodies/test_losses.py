@@ -243,13 +243,13 @@ def test_the_critic_loss_of_xqc_and_its_gradient_are_those_of_the_formula() -> N
 
 
 def test_xqc_learns_from_rewards_whose_returns_are_within_the_bound_of_the_categories() -> None:
-    algorithm, plainly = made("xqc"), made("xqc", normalize_rewards=False)
+    algorithm, plainly = made("xqc", return_bound=0.5), made("xqc", normalize_rewards=False)
     rows = batch(0)
     for each in (algorithm, plainly):
         each.count(rows)
-    assert np.array_equal(algorithm.scaled(rows.reward), algorithm.rewards.bounded(rows.reward, 5.0))
+    assert np.array_equal(algorithm.scaled(rows.reward), algorithm.rewards.bounded(rows.reward, 0.5))
     assert np.array_equal(plainly.scaled(rows.reward), rows.reward)
-    assert not np.array_equal(algorithm.scaled(rows.reward), rows.reward)
+    assert not np.array_equal(algorithm.scaled(rows.reward), algorithm.rewards.scaled(rows.reward))
 
 
 def test_the_temperature_of_xqc_begins_in_units_of_scaled_rewards() -> None:
