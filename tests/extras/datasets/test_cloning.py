@@ -277,7 +277,7 @@ def test_weights_of_units_of_xqc_have_norm_1_after_each_step() -> None:
             torch.testing.assert_close(norms, torch.ones_like(norms))
 
     cloned(algorithm, episodes_of(CONTINUOUS), pulse)
-    assert algorithm.pretraining_steps == 3
+    assert algorithm.pretraining_steps == 4
 
 
 def test_a_step_with_a_loss_that_is_not_finite_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
