@@ -34,7 +34,9 @@ def contests(console: Console) -> list[Contest]:
     from benchmarks import update_stable_baselines3 as peer
 
     found += [peer.dqn(64, 0.35), peer.dqn(256, 0.35), peer.a2c(5, 0.35), peer.a2c(16, 0.35)]
-    return [*found, *(peer.continuous(name, width, None) for name in ("SAC", "TD3") for width in (64, 256))]
+    found += [peer.continuous(name, width, None) for name in ("SAC", "TD3") for width in (64, 256)]
+    found += [peer.continuous("TQC", 256, None), peer.continuous("CrossQ", 256, None), peer.continuous("CrossQ", 1024, None)]
+    return [*found, *(peer.beside_sac(name, 256) for name in ("TQC", "CrossQ", "XQC"))]
 
 
 def main() -> None:

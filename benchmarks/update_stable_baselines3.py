@@ -1,19 +1,22 @@
-"""A gradient step of DQN, SAC and TD3, and an update of A2C, against Stable-Baselines3's, with the same settings and shapes.
+"""Gradient steps of off-policy algorithms and updates of A2C against Stable-Baselines3's, with the same settings and shapes.
 
 DQN: draw 64 transitions, targets by the target network, Huber loss, gradient clipped by its norm, Adam. A2C: 8 env copies;
 theirs is given the values that it keeps from acting, ours computes them anew, and both compute advantages, losses, one
-step of RMSProp and what they log. SAC and TD3: the shapes of Pendulum, 256 transitions.
+step of RMSProp and what they log. Continuous actions: the shapes of Pendulum, 256 transitions; TQC and CrossQ are those of
+sb3-contrib.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import msgspec
 import numpy as np
 import torch
+from sb3_contrib import TQC as TheirTQC
+from sb3_contrib import CrossQ as TheirCrossQ
 from stable_baselines3 import A2C as TheirA2C
 from stable_baselines3 import DQN as TheirDQN
 from stable_baselines3 import SAC as TheirSAC
@@ -22,18 +25,29 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.contest import Contest, passes_in_torch, repeated
 from millrace.learner.algorithms.a2c import A2C
+from millrace.learner.algorithms.crossq import CrossQ
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.algorithms.td3 import TD3
-from millrace.learner.config.hyperparameters import A2CConfig, DQNConfig, SACConfig, TD3Config
+from millrace.learner.algorithms.tqc import TQC
+from millrace.learner.algorithms.xqc import XQC
+from millrace.learner.config.hyperparameters import (
+    A2CConfig,
+    CrossQConfig,
+    DQNConfig,
+    SACConfig,
+    TD3Config,
+    TQCConfig,
+    XQCConfig,
+)
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
-OFF_POLICY = {"SAC": (SAC, SACConfig, TheirSAC), "TD3": (TD3, TD3Config, TheirTD3)}
-
 OBSERVATION = (Leaf("", "box", (4,), "float32"),)
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
-COPIES, NEVER = 8, 10**9
+PENDULUM = (Leaf("", "box", (3,), "float32"),)
+PUSH = ActionSpec("box", (1,), "float32", low=(-2.0,), high=(2.0,))
+COPIES, NEVER, ROWS = 8, 10**9, 256
 PLAYED = 500  # transitions that Stable-Baselines3 draws from; it learns nothing while it collects them
 STEPS = 8  # gradient steps, or updates, that are timed together
 
@@ -94,39 +108,74 @@ def dqn(width: int, target: float) -> Contest:
     return Contest(f"DQN, {width} units", rows, "SB3", target, runs)
 
 
-def continuous(name: str, width: int, target: float | None) -> Contest:
-    """A gradient step of SAC or TD3 on 256 transitions."""
-    algorithm, settings, peer = OFF_POLICY[name]
-    rows, size = 256, 10_000
-    config = settings(net=(width, width), batch_size=rows, replay_size=size)
-    observation, action = (Leaf("", "box", (3,), "float32"),), ActionSpec("box", (1,), "float32", low=(-2.0,), high=(2.0,))
+class Continuous(NamedTuple):
+    """An algorithm for continuous actions, and what Stable-Baselines3 or sb3-contrib has of it."""
 
-    def ours(graph: bool) -> Callable[[], float]:
-        with passes_in_torch(graph):
-            made = algorithm(config, algorithm.policy_spec(config, observation, action), total_steps=NEVER, seed=0)
+    algorithm: Any
+    config: Any
+    peer: Any = None
+    has_critic_net: bool = False
+
+    def settings(self, width: int) -> Any:
+        """Ours, with critics whose two layers have this width."""
+        replay = {"batch_size": ROWS, "replay_size": 10_000}
+        if self.has_critic_net:
+            return self.config(critic_net=(width, width), policy_delay=3, **replay)
+        return self.config(net=(width, width), **replay)
+
+    def peers(self, width: int) -> Any:
+        """Theirs, which has collected what it learns from."""
+        made = self.peer(
+            "MlpPolicy",
+            gymnasium.make("Pendulum-v1"),
+            batch_size=ROWS,
+            buffer_size=10_000,
+            learning_starts=PLAYED,
+            policy_kwargs={"net_arch": {"pi": [256, 256], "qf": [width, width]} if self.has_critic_net else [width, width]},
+            device="cpu",
+        )
+        made.learn(PLAYED)
+        return made
+
+    def steps(self, width: int, in_torch: bool = False) -> Callable[[], float]:
+        """What times our gradient steps."""
+        config = self.settings(width)
+        with passes_in_torch(in_torch):
+            policy = self.algorithm.policy_spec(config, PENDULUM, PUSH)
+            made = self.algorithm(config, policy, total_steps=NEVER, seed=0)
         generator = np.random.default_rng(0)
         for seed in range(20):
             batch = some_batch(32, seed)
             actions = generator.uniform(-1, 1, (*batch.reward.shape, 1)).astype(np.float32)
             made.replay.add(msgspec.structs.replace(batch, obs=(batch.obs[0][..., :3],), action=actions))
-        return lambda: repeated(lambda: made.step(made.transitions(made.replay.sample(rows))), STEPS)
+        return lambda: repeated(lambda: made.step(made.transitions(made.replay.sample(ROWS))), STEPS)
 
-    theirs = peer(
-        "MlpPolicy",
-        gymnasium.make("Pendulum-v1"),
-        batch_size=rows,
-        buffer_size=size,
-        learning_starts=PLAYED,
-        policy_kwargs={"net_arch": [width, width]},
-        device="cpu",
-    )
-    theirs.learn(PLAYED)
+
+CONTINUOUS = {
+    "SAC": Continuous(SAC, SACConfig, TheirSAC),
+    "TD3": Continuous(TD3, TD3Config, TheirTD3),
+    "TQC": Continuous(TQC, TQCConfig, TheirTQC),
+    "CrossQ": Continuous(CrossQ, CrossQConfig, TheirCrossQ, has_critic_net=True),
+    "XQC": Continuous(XQC, XQCConfig, has_critic_net=True),
+}
+
+
+def continuous(name: str, width: int, target: float | None) -> Contest:
+    """A gradient step on 256 transitions, against that of Stable-Baselines3 or sb3-contrib."""
+    one = CONTINUOUS[name]
+    theirs = one.peers(width)
     runs = {
-        "peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS,
-        "graph": ours(True),
-        "ours": ours(False),
+        "peer": lambda: repeated(lambda: theirs.train(STEPS, ROWS), 1) / STEPS,
+        "graph": one.steps(width, in_torch=True),
+        "ours": one.steps(width),
     }
-    return Contest(f"{name}, {width} units", rows, "SB3", target, runs)
+    return Contest(f"{name}, {width} units", ROWS, "SB3", target, runs)
+
+
+def beside_sac(name: str, width: int) -> Contest:
+    """A gradient step on 256 transitions, against one of our SAC with layers of 256 units."""
+    ours, sac = CONTINUOUS[name].steps(width), CONTINUOUS["SAC"].steps(256)
+    return Contest(f"{name}, {width} units", ROWS, "SAC", None, {"peer": sac, "graph": ours, "ours": ours})
 
 
 def a2c(steps: int, target: float) -> Contest:

@@ -12,6 +12,7 @@ import math
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
 from millrace.learner.algorithms.bodies.heads import Categories
@@ -46,16 +47,17 @@ class XQC(NormalizedSAC):
         if config.target_entropy is None:
             self.target_entropy = -0.5 * math.prod(policy.action.shape)
 
-    def networks(self, device: str) -> ActorWithCritics:
-        """See `Continuous`."""
+    def shapes(self) -> tuple[MLPShape, MLPShape]:
+        """Those of the actor and of the critics."""
         relu, (actor, critic) = self.policy.activation == "relu", self.sizes(outputs=self.config.atoms)
-        return ActorWithCritics(
+        return (
             MLPShape(1, actor, relu, Normalized.BEFORE, unit_rows=True),
             MLPShape(2, critic, relu, Normalized.BEFORE, unit_rows=True),
-            self.categories.mean,
-            device,
-            self.seed,
         )
+
+    def networks(self, device: str) -> ActorWithCritics:
+        """See `Continuous`."""
+        return ActorWithCritics(*self.shapes(), self.categories.mean, device, self.seed)
 
     def scaled(self, reward: Floats) -> Floats:
         """See `GradientDescent`: no discounted return so far is beyond `return_bound` after this."""
@@ -63,25 +65,32 @@ class XQC(NormalizedSAC):
             return reward
         return self.rewards.bounded(reward, self.config.return_bound)
 
-    def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """Σ E[w · cross-entropy] over both critics, of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)) on the categories.
+    def target_distribution(self, rows: Transitions, next_logits: Tensor, next_log_prob: Tensor) -> Tensor:
+        """The probabilities [B, O] of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)) on the categories, without a gradient.
 
-        Z′ are the returns of s′ and a′ as that target critic distributes them which expects less.
+        Z′ are the returns of s′ and a′ as that target critic of `next_logits` [2, B, O] distributes them which expects less.
         """
-        joint, size = self.joint(rows), len(rows.x)
-        with torch.no_grad():
-            next_logits = self.target.minibatch_outputs(joint.x, joint.action)[:, size:]  # [2, B, O]
-            pessimist = self.categories.mean(next_logits).argmin(0)
-            probabilities = next_logits[pessimist, torch.arange(size, device=pessimist.device)].softmax(-1)
-            reward = rows.reward - rows.discount * self.temperature * joint.next_log_prob
-            target = self.categories.shifted(probabilities, reward, rows.discount)  # [B, O]
-        logits = self.net.outputs(joint.x, joint.action)[:, :size]
+        pessimist = self.categories.mean(next_logits).argmin(0)
+        probabilities = next_logits[pessimist, torch.arange(len(pessimist), device=pessimist.device)].softmax(-1)
+        reward = rows.reward - rows.discount * self.temperature * next_log_prob
+        return self.categories.shifted(probabilities, reward, rows.discount)
+
+    def cross_entropy(self, rows: Transitions, logits: Tensor, target: Tensor) -> CriticLoss:
+        """Σ E[w · cross-entropy] over both critics, for their logits [2, B, O] and a target [B, O]."""
         loss = (rows.weight * self.categories.cross_entropy(logits, target)).mean(1).sum()
         with torch.no_grad():
             values = self.categories.mean(logits)
-            error = (values - target @ self.categories.atoms).abs().mean(0)
+            error = (values - target @ self.categories.atoms.to(target.dtype)).abs().mean(0)
         # The loss is finite even if a reward is not: a return beyond the bounds counts as the bound.
         return CriticLoss(loss, error, {"q_mean": values.mean(), "scaled_reward": rows.reward.mean()})
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """See `cross_entropy` and `target_distribution`: critics and targets see s, a and s′, a′ in one minibatch each."""
+        joint, size = self.joint(rows), len(rows.x)
+        with torch.no_grad():
+            next_logits = self.target.minibatch_outputs(joint.x, joint.action)[:, size:]
+            target = self.target_distribution(rows, next_logits, joint.next_log_prob)
+        return self.cross_entropy(rows, self.net.outputs(joint.x, joint.action)[:, :size], target)
 
     def move_target(self) -> None:
         """See `NormalizedSAC`. Statistics of the targets count nowhere."""

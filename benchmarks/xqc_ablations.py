@@ -1,0 +1,132 @@
+"""XQC without one of its parts each, to see what the part is worth.
+
+`python -m benchmarks.xqc_ablations` prints the commands that train them. Each part that is no setting is left out by a class
+of its own, `--algo benchmarks.xqc_ablations:WithoutTarget`.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+
+from benchmarks.wall_clock_programs import COPIES, EVAL_EPISODES, EVAL_EVERY
+from millrace.algorithms import CriticLoss, Transitions
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
+from millrace.learner.algorithms.xqc import XQC
+from millrace.protocol.arrays import Floats
+
+ENVS = ("HalfCheetah-v5", "Walker2d-v5")
+STEPS = 101_000
+
+
+class WithoutTarget(XQC):
+    """The newest critics value the next observations, as in CrossQ."""
+
+    def move_target(self) -> None:
+        """The targets are the critics."""
+        self.target.critics.copy_(self.net.critics)
+
+
+class WithoutJointPass(XQC):
+    """Observations and those that followed pass the critics apart, each normalized by its own statistics."""
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """As XQC's, in two passes."""
+        joint, size = self.joint(rows), len(rows.x)
+        with torch.no_grad():
+            next_logits = self.target.minibatch_outputs(joint.x[size:], joint.action[size:])
+            target = self.target_distribution(rows, next_logits, joint.next_log_prob)
+        return self.cross_entropy(rows, self.net.outputs(rows.x, rows.action), target)
+
+
+class WithoutWeightNorm(XQC):
+    """The norms of weights are free."""
+
+    def shapes(self) -> tuple[MLPShape, MLPShape]:
+        """See `XQC`."""
+        actor, critics = super().shapes()
+        return actor._replace(unit_rows=False, output_gain=0.01), critics._replace(unit_rows=False)
+
+
+class NormalizedAfter(XQC):
+    """Batch normalization after each activation, as in CrossQ."""
+
+    def shapes(self) -> tuple[MLPShape, MLPShape]:
+        """See `XQC`."""
+        actor, critics = super().shapes()
+        return actor._replace(normalized=Normalized.AFTER), critics._replace(normalized=Normalized.AFTER)
+
+
+class OneValue(XQC):
+    """Critics of one value in place of categories, with a squared loss."""
+
+    def networks(self, device: str) -> ActorWithCritics:
+        """See `Continuous`."""
+        actor, critics = self.shapes()
+        one = critics._replace(sizes=(*critics.sizes[:-1], 1))
+        return ActorWithCritics(actor, one, lambda outputs: outputs[..., 0], device, self.seed)
+
+    def critic_loss(self, rows: Transitions) -> CriticLoss:
+        """½ Σ E[w (Q(s, a) − y)²] over both critics."""
+        joint, size = self.joint(rows), len(rows.x)
+        with torch.no_grad():
+            next_values = self.target.minibatch_outputs(joint.x, joint.action)[:, size:, 0].amin(0)
+            y = rows.reward + rows.discount * (next_values - self.temperature * joint.next_log_prob)
+        values = self.net.outputs(joint.x, joint.action)[:, :size, 0]
+        error = values - y
+        loss = 0.5 * (rows.weight * error.square()).mean(1).sum()
+        return CriticLoss(loss, error.detach().abs().mean(0), {"q_mean": values.mean()})
+
+
+class ScaledByDeviation(XQC):
+    """Rewards are divided by the standard deviation of the discounted return alone, as XQC's authors do."""
+
+    def scaled(self, reward: Floats) -> Floats:
+        """See `GradientDescent`."""
+        return self.rewards.scaled(reward)
+
+
+def own(kind: type[XQC]) -> tuple[str]:
+    """The name of one of these classes for `--algo`."""
+    return (f"benchmarks.xqc_ablations:{kind.__name__}",)
+
+
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "XQC": ("xqc",),
+    "critics of 3 × 256": ("xqc", "--critic-net", "256", "256", "256"),
+    "critics of 2 × 512": ("xqc", "--critic-net", "512", "512"),
+    "two gradient steps an env step": ("xqc", "--updates-per-step", "2"),
+    "an actor that learns at every step": ("xqc", "--policy-delay", "1"),
+    "no target critics": own(WithoutTarget),
+    "two passes in place of one": own(WithoutJointPass),
+    "free norms of weights": own(WithoutWeightNorm),
+    "normalized after activations": own(NormalizedAfter),
+    "one value in place of categories": own(OneValue),
+    "rewards by their deviation alone": own(ScaledByDeviation),
+}
+"""What each is, and its `--algo` and further flags"""
+
+
+def command(env: str, flags: tuple[str, ...], seed: int, folder: str) -> str:
+    """The command that trains one, in a folder of its own."""
+    copies = f"--workers 2 --envs {COPIES} --lanes {COPIES} --rollout-steps 4 --max-lag 1"
+    evaluations = f"--eval-every {EVAL_EVERY} --eval-episodes {EVAL_EPISODES} --torch-threads 1"
+    words = f"millrace train {env} --algo {' '.join(flags)} --seed {seed} --steps {STEPS}"
+    return f"{words} {copies} {evaluations} --run-dir {folder} --resume auto"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="print the commands that train XQC without one of its parts each")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--out", default="runs/ablations")
+    given = parser.parse_args()
+    for seed in given.seeds:
+        for number, flags in enumerate(VARIANTS.values()):
+            for env in ENVS:
+                print(command(env, flags, seed, f"{given.out}/{number}"))
+
+
+if __name__ == "__main__":
+    main()
