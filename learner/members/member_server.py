@@ -55,7 +55,8 @@ AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its proc
 TURN_S = 0.2  # of reading messages, at most, before the caller may go on
 SHORT_TURN_S = 0.003  # at least so much, also in a short turn
 FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
-LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way
+LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way, after what it sent before that
+LAST_MESSAGES_TURNS = 10  # such waits, at most: other workers go on sending
 STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
 
 
@@ -283,8 +284,11 @@ class MemberServer:
     def _remove_ended_processes(self, last_messages_wait_s: float) -> None:
         """Remove the workers whose processes have ended, after what they sent last: it may say why."""
         ended = list(self._processes.ended())
-        if ended:
-            self.receive(last_messages_wait_s)
+        until_s = self._clock() + LAST_MESSAGES_TURNS * last_messages_wait_s
+        while ended and self._link.poll(last_messages_wait_s):
+            self.receive(0.0)
+            if self._clock() > until_s:
+                break
         for worker_exit in ended:
             self.send(self._coordinator.process_ended(worker_exit))
 

@@ -178,6 +178,32 @@ def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:
     assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0))
 
 
+def test_the_last_message_may_come_after_others_of_the_process() -> None:
+    served = Served()
+    served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
+    late = [Heartbeat(1, 0, (), (), 0, {}, 0), Goodbye(1, "told to stop", ())]
+    waiting = served.link.poll
+
+    def one_at_a_time(timeout_s: float) -> bool:
+        if not served.ended and late:
+            served.link.inbox.append((b"w0", late.pop(0)))
+        return waiting(timeout_s)
+
+    served.link.poll = one_at_a_time  # type: ignore[method-assign]
+    served.server.listen(POLL_S)
+    assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0))
+
+
+def test_others_that_send_without_end_do_not_hold_up_the_removal_of_a_process() -> None:
+    served = Served()
+    flood(served)
+    served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
+    began_s = served.link.now
+    served.server.listen(POLL_S)
+    assert not served.coordinator.members
+    assert served.link.now - began_s < 3.0
+
+
 @pytest.mark.parametrize("waits", [False, True], ids=["while it listens", "at the end"])
 def test_one_whose_key_was_revoked_is_shut_out(waits: bool) -> None:
     served = Served()
