@@ -162,26 +162,12 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
     assert len(hub.coordinator.members) == 0
 
 
-def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:
+@pytest.mark.parametrize("before", [0, 2])
+def test_the_last_messages_of_a_process_that_has_ended_are_received(before: int) -> None:
+    """Also if they come one by one, some after it is known that the process has ended."""
     served = Served()
     served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
-    waiting = served.link.poll
-
-    def comes_late(timeout_s: float) -> bool:
-        if not served.ended:
-            served.link.inbox.append((b"w0", Goodbye(1, "told to stop", ())))
-        return waiting(timeout_s)
-
-    served.link.poll = comes_late  # type: ignore[method-assign]
-    served.server.listen(POLL_S)
-    assert not served.coordinator.members
-    assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0))
-
-
-def test_the_last_message_may_come_after_others_of_the_process() -> None:
-    served = Served()
-    served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
-    late = [Heartbeat(1, 0, (), (), 0, {}, 0), Goodbye(1, "told to stop", ())]
+    late: list[ToLearner] = [*[Heartbeat(1, 0, (), (), 0, {}, 0)] * before, Goodbye(1, "told to stop", ())]
     waiting = served.link.poll
 
     def one_at_a_time(timeout_s: float) -> bool:
@@ -191,6 +177,7 @@ def test_the_last_message_may_come_after_others_of_the_process() -> None:
 
     served.link.poll = one_at_a_time  # type: ignore[method-assign]
     served.server.listen(POLL_S)
+    assert not served.coordinator.members
     assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0))
 
 
