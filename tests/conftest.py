@@ -33,8 +33,8 @@ import hypothesis
 import psutil
 import pytest
 
-from millrace.workers import copy_slots, slots
-from millrace.workers.slots import FILE_VARIABLE
+from millrace.workers import copy_slots, machine_slots
+from millrace.workers.machine_slots import FILE_VARIABLE
 from millrace.workers.supervise import worker_process
 from tests.layers import SELECTED, layer_of, may_hold, short_name
 from tests.support.examples import ALL, FEW
@@ -169,8 +169,10 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
-    own_slots: dict[int, slots.Slots] = {}
-    monkeypatch.setattr(slots, "_of_processes", own_slots)  # copies that a test does not close hold no slots of another test
+    own_slots: dict[int, machine_slots.Slots] = {}
+    monkeypatch.setattr(
+        machine_slots, "_of_processes", own_slots
+    )  # copies that a test does not close hold no slots of another test
     monkeypatch.setattr(copy_slots, "_slots", {})
     copy_slots._of_process.cache_clear()
     threads = set(threading.enumerate())

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from millrace.protocol.envs.which_copy import EnvCopy, being_made
 from millrace.protocol.errors import UsageError
 from millrace.workers.activity import CLOSING, activity
-from millrace.workers.slots import slots
+from millrace.workers.machine_slots import slots
 
 _slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
 Made = TypeVar("Made")

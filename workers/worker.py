@@ -52,8 +52,8 @@ from millrace.workers.conversation.worker_states import WorkerState
 from millrace.workers.described_copy import describing
 from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
+from millrace.workers.machine_slots import NoSlot, slots
 from millrace.workers.shared_weights import SharedWeightsReader
-from millrace.workers.slots import NoSlot, slots
 from millrace.workers.vector_env.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")

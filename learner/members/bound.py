@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 
 import zmq
 
-from millrace.learner.members.bind_settings import Listening, join_lines, keyring_for
+from millrace.learner.members.who_may_connect import Listening, join_lines, keyring_for
 from millrace.protocol.env_spec import FACTORY, REGISTER_IT
 from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import Keyring

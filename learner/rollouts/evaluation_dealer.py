@@ -6,9 +6,9 @@ one without a lane. A ticket whose worker is lost goes to another. The numbers o
 above those of rollouts, and the ledger does not count them.
 
 Rule: a worker that claims to play and never answers must not hold the learner for ever, and nobody can tell it from one that
-is slow. So `share` gives the ticket of one that takes long to a second worker as well. The seeds say what is played, so it
-does not matter who answers first: that answer counts. Who was late gets tickets only if nobody else can play, until it
-joins again.
+is slow. So `share` gives the ticket of one that takes long (`stall_watch.py` says when) to a second worker as well. The
+seeds say what is played, so it does not matter who answers first: that answer counts. Who was late gets tickets only if
+nobody else can play, until it joins again.
 
 Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
 an answer that could not be used, is dropped, and its ticket is played again from the start.

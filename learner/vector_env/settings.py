@@ -12,7 +12,7 @@ from typing import Any, Literal
 from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
-from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
 from millrace.protocol.envs.wrappers import WrapperLike

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from millrace.launch.local_worker_options import FlagsOfWorker, private_address, temporary_keys
-from millrace.learner.members.bind_settings import BindSettings
 from millrace.learner.members.bound import Bound, bind, listen
 from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.protocol.keys.keys import Token
 from millrace.protocol.wire.shared_memory import InheritedDescriptors
 from millrace.workers.conversation.connection_rules import LEARNER_STARTED_IT_S
-from millrace.workers.slots import copies_per_machine
+from millrace.workers.machine_slots import copies_per_machine
 from millrace.workers.supervise.supervisor import STOP_WITHIN_S, Running, Supervisor
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from millrace.workers.worker_thread import WorkerThread

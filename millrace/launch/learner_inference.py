@@ -22,8 +22,8 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.validation import workers_to_wait_for
 from millrace.learner.conversations import describe_settings
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.bind_settings import BindSettings
 from millrace.learner.members.describe_coordinator import Accept
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.resume_checks import Resumption
 from millrace.learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from millrace.learner.torch_setup import one_thread, torch_device

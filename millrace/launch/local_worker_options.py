@@ -16,7 +16,7 @@ from pathlib import Path
 
 from millrace.learner.config.config import Config
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.members.bind_settings import generate_run_keys
+from millrace.learner.members.who_may_connect import generate_run_keys
 from millrace.learner.run_folder.regular_files import open_regular, reason, subfolder
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.keys.key_folder import Keyring, chosen_key_folder

@@ -19,7 +19,7 @@ from millrace.launch.vector import listen
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.conversations import describe_settings
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy
 from millrace.learner.torch_setup import one_thread
 from millrace.learner.vector_env.settings import VectorEnvSettings

@@ -14,8 +14,8 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import workers_to_wait_for
 from millrace.learner.conversations import describe_settings, describe_spec, open_hub, rollout_spec
 from millrace.learner.env_spaces import EnvSpaces
-from millrace.learner.members.bind_settings import BindSettings
 from millrace.learner.members.describe import described_by_workers
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.own_policy import OwnPolicy

@@ -16,7 +16,7 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
 from millrace.learner.extras import check_packages
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.resume_checks import Resumption, unless_finished
 from millrace.learner.run_setup import (
     RunSetup,
@@ -28,7 +28,7 @@ from millrace.learner.run_setup import (
 )
 from millrace.learner.torch_setup import one_thread
 from millrace.protocol.env_spec import EnvSpec
-from millrace.workers.slots import LIMIT_VARIABLE, copies_per_machine
+from millrace.workers.machine_slots import LIMIT_VARIABLE, copies_per_machine
 from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 log = logging.getLogger("millrace.learner")

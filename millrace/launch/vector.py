@@ -20,11 +20,11 @@ from gymnasium.vector import AutoresetMode
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker, no_flags
-from millrace.learner.members.bind_settings import BindSettings
 from millrace.learner.members.describe import DescribeSettings, described_by_workers
 from millrace.learner.members.describe_coordinator import Accept, accept_any
 from millrace.learner.members.events import Failed
 from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
 from millrace.learner.vector_env.shared_steps import SharedSteps

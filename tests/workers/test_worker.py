@@ -38,13 +38,13 @@ from millrace.protocol.wire.codec import Buffer, decode_to_learner, decode_to_wo
 from millrace.protocol.wire.compression import Packing
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 from millrace.protocol.wire.worker_link import WorkerLink
-from millrace.workers import slots as slot_file
+from millrace.workers import machine_slots as slot_file
 from millrace.workers.activity import ActivityReader, activity
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.session import Leave, Session
 from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.machine_slots import Slots
 from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
-from millrace.workers.slots import Slots
 from millrace.workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of
 

@@ -25,7 +25,7 @@ from millrace.protocol.bounds import escaped, one_line
 from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
 from millrace.protocol.keys.keys import Token
 from millrace.workers.activity import STACK_SIGNAL, ActivityReader
-from millrace.workers.slots import free_all, open_slots, touch
+from millrace.workers.machine_slots import free_all, open_slots, touch
 from millrace.workers.supervise.ending import Ending
 from millrace.workers.supervise.process_group import kill, live_members, process_stat
 from millrace.workers.supervise.short_log import keep_short

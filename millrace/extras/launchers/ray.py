@@ -20,7 +20,7 @@ from millrace.extras.launchers.ray_worker import WorkerHost
 from millrace.launch.training import train
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.command_line import read_config
-from millrace.learner.members.bind_settings import keyring_for
+from millrace.learner.members.who_may_connect import keyring_for
 from millrace.protocol.errors import UsageError, first_line, refusals_of
 from millrace.protocol.keys.key_folder import Keyring, read_token
 

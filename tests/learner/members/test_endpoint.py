@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from millrace.learner.config.config import Config
-from millrace.learner.members.bind_settings import generate_run_keys, join_lines, keyring_for
+from millrace.learner.members.who_may_connect import generate_run_keys, join_lines, keyring_for
 from millrace.protocol.address import advertised_address, check_address, is_local, needs_ipv6, own_address, resolves
 from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable
 from millrace.protocol.errors import UsageError
@@ -85,7 +85,7 @@ def test_insecure_is_spelt_out_and_says_what_it_risks(home: Path, bind: str, cap
 
 
 def test_the_line_to_paste_is_the_whole_command(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("millrace.learner.members.bind_settings.socket.gethostname", lambda: "gpu-box")
+    monkeypatch.setattr("millrace.learner.members.who_may_connect.socket.gethostname", lambda: "gpu-box")
     keyring = keyring_for(Config(bind="tcp://0.0.0.0:5555"), NOW)
     first, second = join_lines("tcp://0.0.0.0:5555", "", keyring)
     assert first == "waiting for workers; start one with: millrace worker tcp://gpu-box:5555 --token default.token"

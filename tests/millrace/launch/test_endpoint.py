@@ -12,7 +12,7 @@ import pytest
 from millrace.flags.parse import parse_flags
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags
-from millrace.learner.members.bind_settings import BindSettings
+from millrace.learner.members.who_may_connect import BindSettings
 from millrace.workers import worker_thread
 from millrace.workers.conversation.connection_rules import wait_limits_s
 from millrace.workers.conversation.session import Session, WorkerIdentity

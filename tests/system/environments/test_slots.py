@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from millrace.workers.slots import FILE_VARIABLE, Slots
+from millrace.workers.machine_slots import FILE_VARIABLE, Slots
 from tests.system.stage.network import Host, Network
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, Stage, Worker, wait_for

@@ -15,7 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-from millrace.workers.slots import FILE_VARIABLE
+from millrace.workers.machine_slots import FILE_VARIABLE
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
 from tests.system.stage.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within

@@ -32,7 +32,7 @@ from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
 from millrace.learner.run_folder.run_format import check_format
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
-from millrace.workers.slots import LIMIT_VARIABLE
+from millrace.workers.machine_slots import LIMIT_VARIABLE
 from tests.support.envs.toy import Countdown
 from tests.support.in_process.saved_policies import load_policy
 from tests.system.stage import preloaded

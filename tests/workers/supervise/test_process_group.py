@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from millrace.workers.slots import Slots
+from millrace.workers.machine_slots import Slots
 from millrace.workers.supervise import worker_process
 from millrace.workers.supervise.process_group import kill, live_members, process_stat
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
@@ -72,9 +72,8 @@ def test_what_a_dead_process_started_is_not_gone(start: str) -> None:
 def test_the_slots_of_a_killed_worker_stay_taken_until_its_simulator_is_gone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, gives_up: bool
 ) -> None:
-    program = (
-        f"import os, subprocess, sys; from millrace.workers.slots import Slots; Slots(int(sys.argv[1])).take(); {SIMULATOR}"
-    )
+    imports = "import os, subprocess, sys; from millrace.workers.machine_slots import Slots"
+    program = f"{imports}; Slots(int(sys.argv[1])).take(); {SIMULATOR}"
 
     def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
         taker = [sys.executable, "-c", f"{program}; print(simulator.pid, flush=True); os.kill(os.getpid(), 9)"]

@@ -21,8 +21,17 @@ from threading import Barrier
 import pytest
 
 from millrace.protocol.errors import UsageError
-from millrace.workers import slots as module
-from millrace.workers.slots import FILE_VARIABLE, LIMIT_VARIABLE, NoSlot, Slots, free_all, open_slots, share_slots, slots
+from millrace.workers import machine_slots as module
+from millrace.workers.machine_slots import (
+    FILE_VARIABLE,
+    LIMIT_VARIABLE,
+    NoSlot,
+    Slots,
+    free_all,
+    open_slots,
+    share_slots,
+    slots,
+)
 
 
 @pytest.fixture
@@ -34,7 +43,7 @@ def own_file() -> Path:
 @contextmanager
 def other_process(code: str, *fds: int) -> Iterator[subprocess.Popen[str]]:
     """A process that runs this code and then waits, with these descriptors; it has printed a line when this returns."""
-    program = f"import sys, time; from millrace.workers.slots import *; {code}; print(flush=True); time.sleep(100)"
+    program = f"import sys, time; from millrace.workers.machine_slots import *; {code}; print(flush=True); time.sleep(100)"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, pass_fds=fds) as process:
         try:
             assert process.stdout is not None
