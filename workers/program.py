@@ -23,12 +23,12 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.wire.shared_memory import InheritedDescriptors
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.workers.activity import Activity, ActivityReader, activity, share_activity
+from millrace.workers.allowed_code import allowed_code
 from millrace.workers.conversation.connection_rules import wait_limits_s
 from millrace.workers.conversation.session import NO_LEARNER, Session
 from millrace.workers.exit_codes import EXIT_NO_LEARNER
 from millrace.workers.flags import WorkerFlags
 from millrace.workers.machine_slots import share_slots
-from millrace.workers.security import allowed_code
 from millrace.workers.shared_weights import SharedWeightsReader
 from millrace.workers.supervise.process_group import kill, live_members
 from millrace.workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S

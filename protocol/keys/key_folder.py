@@ -1,5 +1,7 @@
 """The key folder, which only its owner can enter: the learner's key, the list of clients, and their tokens.
 
+`read_token` finds the token of a worker: in a file, or in an environment variable, which it removes.
+
     server.key      the secret half of the learner's key, hexadecimal
     allowed.toml    the clients that may connect: public halves, names, dates
     NAME.token      the join token of a client that was made here: secret

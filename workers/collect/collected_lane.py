@@ -1,5 +1,7 @@
 """One lane that a worker collects on: its env copies, the return and length of their running episodes, its random generator.
 
+`finish` says which rows are valid: all but resets; with seats, `seat_rows.py` does.
+
 It keeps what one rollout passes on to the next: the last observations, which copies have ended, the running episodes. The
 collector steps it.
 """

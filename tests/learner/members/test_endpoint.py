@@ -17,8 +17,8 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import KeyFolder
 from millrace.protocol.keys.keys import ClientList, Key, Token
 from millrace.protocol.specs import StepSpec
+from millrace.workers.allowed_code import allowed_code
 from millrace.workers.conversation.connection_rules import checked_token
-from millrace.workers.security import allowed_code
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 TOKEN = Token(Key.new().public, Key.new())
