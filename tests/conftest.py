@@ -170,9 +170,8 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
     own_slots: dict[int, machine_slots.Slots] = {}
-    monkeypatch.setattr(
-        machine_slots, "_of_processes", own_slots
-    )  # copies that a test does not close hold no slots of another test
+    # Copies that a test does not close hold no slots of another test.
+    monkeypatch.setattr(machine_slots, "_of_processes", own_slots)
     monkeypatch.setattr(copy_slots, "_slots", {})
     copy_slots._of_process.cache_clear()
     threads = set(threading.enumerate())

@@ -6,14 +6,12 @@ and are normalized alike. `NormalizedSAC` has what XQC shares.
 
 from __future__ import annotations
 
-from typing import Any
-
-from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics, layer_sizes
 from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from millrace.learner.config.hyperparameters import CrossQConfig
-from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.specs import PolicySpec
 
 
 class CrossQ(NormalizedSAC):
@@ -21,13 +19,7 @@ class CrossQ(NormalizedSAC):
 
     Config = CrossQConfig
     ADAM = {"betas": (0.5, 0.999)}
-    batch_normalization = "after activations"
     config: CrossQConfig
-
-    @staticmethod
-    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
-        return CrossQ.bounded_policy_spec(config, observation, action, head="squashed")
 
     def __init__(
         self, config: CrossQConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
@@ -38,7 +30,8 @@ class CrossQ(NormalizedSAC):
 
     def networks(self, device: str) -> ActorWithCritics:
         """See `Continuous`."""
-        relu, (actor, critic) = self.policy.activation == "relu", self.sizes(outputs=1)
+        relu = self.policy.activation == "relu"
+        actor, critic = layer_sizes(self.policy, self.config.critic_net, 1)
         return ActorWithCritics(
             MLPShape(1, actor, relu, Normalized.AFTER, output_gain=0.01),
             MLPShape(2, critic, relu, Normalized.AFTER),

@@ -7,7 +7,6 @@ update is `OffPolicy.update`, which calls `step` for each gradient step that is 
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,8 +26,6 @@ class SAC(Continuous):
     """An actor, two critics with their targets, and the temperature."""
 
     Config = SACConfig
-    batch_normalization: ClassVar[str] = "none"
-    """Where the actor has it: the parameters of one kind of actor mean something else in another"""
 
     @staticmethod
     def policy_spec(config: SACConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
@@ -43,6 +40,11 @@ class SAC(Continuous):
             self.tensors["log_temperature"] = self.log_temperature
             self.optimizers["ent_coef_optimizer"] = make_optimizer("adam", self.log_temperature)
         self.target_entropy = -math.prod(policy.action.shape) if config.target_entropy is None else config.target_entropy
+
+    @property
+    def batch_normalization(self) -> str:
+        """Where the actor has it: the parameters of one kind of actor mean something else in another."""
+        return "none"
 
     @property
     def temperature(self) -> float:

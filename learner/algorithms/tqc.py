@@ -6,20 +6,18 @@ together are cut off at the top, which can be done in finer steps.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics, layer_sizes
 from millrace.learner.algorithms.bodies.heads import lowest, quantile_huber
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import TQCConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.features import feature_size
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -42,10 +40,14 @@ class TQC(SAC):
     def networks(self, device: str) -> ActorWithCritics:
         """See `Continuous`."""
         config, relu = self.config, self.policy.activation == "relu"
-        features, size = feature_size(self.policy), math.prod(self.policy.action.shape)
-        actor = MLPShape(1, (features, *config.net, 2 * size), relu, output_gain=0.01)
-        critics = MLPShape(config.critics, (features + size, *config.net, config.quantiles), relu)
-        return ActorWithCritics(actor, critics, lambda quantiles: quantiles.mean(-1), device, self.seed)
+        actor, critic = layer_sizes(self.policy, config.net, config.quantiles)
+        return ActorWithCritics(
+            MLPShape(1, actor, relu, output_gain=0.01),
+            MLPShape(config.critics, critic, relu),
+            lambda quantiles: quantiles.mean(-1),
+            device,
+            self.seed,
+        )
 
     @torch.no_grad()
     def targets(self, rows: Transitions) -> Tensor:

@@ -9,19 +9,18 @@ shares.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics, layer_sizes
 from millrace.learner.algorithms.bodies.heads import Categories
 from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
 from millrace.learner.config.hyperparameters import XQCConfig
 from millrace.protocol.arrays import Floats
-from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.specs import PolicySpec
 
 INITIAL_TEMPERATURE = 0.01
 """in units of scaled rewards"""
@@ -31,13 +30,7 @@ class XQC(NormalizedSAC):
     """An actor, two critics of categories with their targets, and the temperature."""
 
     Config = XQCConfig
-    batch_normalization = "before activations"
     config: XQCConfig
-
-    @staticmethod
-    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
-        return XQC.bounded_policy_spec(config, observation, action, head="squashed")
 
     def __init__(self, config: XQCConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         self.categories = Categories(config.atoms, config.return_bound, device)
@@ -49,7 +42,8 @@ class XQC(NormalizedSAC):
 
     def shapes(self) -> tuple[MLPShape, MLPShape]:
         """Those of the actor and of the critics."""
-        relu, (actor, critic) = self.policy.activation == "relu", self.sizes(outputs=self.config.atoms)
+        relu = self.policy.activation == "relu"
+        actor, critic = layer_sizes(self.policy, self.config.critic_net, self.config.atoms)
         return (
             MLPShape(1, actor, relu, Normalized.BEFORE, unit_rows=True),
             MLPShape(2, critic, relu, Normalized.BEFORE, unit_rows=True),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from millrace.protocol.policy.features import critic_size, feature_size
 from millrace.protocol.policy.recurrent import core_shapes
 from millrace.protocol.specs import Leaf, PolicySpec
 
+FlatT = TypeVar("FlatT", bound=Any)
+"""a numpy array, or a torch tensor where torch is imported anyway"""
 IMAGE_FEATURES = 128  # width of the layer between the convolutions of one image and the rest
 
 
@@ -147,9 +149,9 @@ def total_size(fields: Sequence[Field]) -> int:
     return sum(math.prod(field.shape) for field in fields)
 
 
-def named_views(flat: Array, fields: Sequence[Field]) -> dict[str, Array]:
-    """A view of each field of a flat array, by name."""
-    found, at = {}, 0
+def named_views(flat: FlatT, fields: Sequence[Field]) -> dict[str, FlatT]:
+    """A view of each field of a flat array or tensor, by name."""
+    found, at = dict[str, FlatT](), 0
     for field in fields:
         count = math.prod(field.shape)
         found[field.name] = flat[at : at + count].reshape(field.shape)

@@ -27,6 +27,7 @@ from millrace.protocol.policy.layout import (
     Field,
     convolutions,
     hidden_names,
+    named_views,
     parameter_layout,
     total_size,
 )
@@ -201,13 +202,10 @@ class FlatNetwork:
         self.flat = _initial(self.fields, seed).to(device)  # [P] float32: give this to the optimizer
         self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
         self.flat.grad = self.flat_grad
-        self.parameters: dict[str, Tensor] = {}  # leaves of the graph: views of `flat`, gradients are views of `flat_grad`
-        at = 0
-        for field in self.fields:
-            end = at + math.prod(field.shape)
-            values, gradient = (each[at:end].view(field.shape) for each in (self.flat, self.flat_grad))
-            self.parameters[field.name] = trainable(values, gradient)
-            at = end
+        gradients = named_views(self.flat_grad, self.fields)
+        self.parameters: dict[str, Tensor] = {
+            name: trainable(values, gradients[name]) for name, values in named_views(self.flat, self.fields).items()
+        }  # leaves of the graph: views of `flat`, gradients are views of `flat_grad`
         self._relu = spec.activation == "relu"
         self._encoder = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
         self._images = self._convolutions()

@@ -7,6 +7,7 @@ for it as they are written.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -14,11 +15,13 @@ from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
+from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS
 from millrace.protocol.policy.malloc import keep_freed_memory
 from millrace.protocol.policy.networks import trainable
 from millrace.protocol.policy.torch_distributions import squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.specs import PolicySpec
 
 
 class ActorWithCritics:
@@ -82,3 +85,9 @@ class ActorWithCritics:
     def acting_parameters(self) -> Floats:
         """A copy of the parameters [P] that workers act with: those of a plain MLP."""
         return self.actor_body.folded().cpu().numpy().copy()
+
+
+def layer_sizes(policy: PolicySpec, critic_net: tuple[int, ...], outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The sizes of the layers of the policy's actor, and of each critic with these hidden layers and outputs."""
+    features, size = feature_size(policy), math.prod(policy.action.shape)
+    return (features, *policy.net, 2 * size), (features + size, *critic_net, outputs)

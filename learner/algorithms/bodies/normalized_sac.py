@@ -6,8 +6,6 @@ distribution; passed alone, they would be normalized by other means, and values 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -15,15 +13,14 @@ from torch import Tensor
 
 from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
-from millrace.learner.algorithms.bodies.stacked_mlps import size_of
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.replay.off_policy import Transitions
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import NormalizedConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.features import feature_size
+from millrace.protocol.policy.layout import total_size
 from millrace.protocol.policy.networks import trainable
-from millrace.protocol.specs import PolicySpec
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Joint(NamedTuple):
@@ -44,16 +41,21 @@ class NormalizedSAC(SAC):
     target: ActorWithCritics
     config: NormalizedConfig
 
+    @classmethod
+    def policy_spec(cls, config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        return cls.bounded_policy_spec(config, observation, action, head="squashed")
+
     def __init__(
         self, config: NormalizedConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
         self.tensors["statistics"] = self.net.statistics
 
-    def sizes(self, outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The sizes of the layers of the actor, and of each critic."""
-        features, size = feature_size(self.policy), math.prod(self.policy.action.shape)
-        return (features, *self.config.net, 2 * size), (features + size, *self.config.critic_net, outputs)
+    @property
+    def batch_normalization(self) -> str:
+        """See `SAC`."""
+        return self.net.actor_body.shape.normalized.value
 
     @torch.no_grad()
     def joint(self, rows: Transitions) -> Joint:
@@ -61,16 +63,13 @@ class NormalizedSAC(SAC):
         action, log_prob = self.sample(rows.next_x)
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
 
-    def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
-        """See `Continuous`. Afterwards weights that are to have norm 1 have it again."""
-        measured = super().descend(name, loss, numbers)
-        if name != "ent_coef":
-            (self.net.actor_body if name == "actor" else self.net.critic_bodies).project()
-        return measured
-
-    def project_actor(self) -> None:
-        """See `Continuous`."""
-        self.net.actor_body.project()
+    def after_step(self, name: str) -> None:
+        """See `Continuous`: weights that are to have norm 1 have it again."""
+        match name:
+            case "actor":
+                self.net.actor_body.project()
+            case "critic":
+                self.net.critic_bodies.project()
 
     def move_target(self) -> None:
         """After each step of the critics: move their targets, if there are any."""
@@ -105,6 +104,6 @@ class NormalizedSAC(SAC):
                 "start_from: expected a run of the same algorithm with a checkpoint, got a policy without the statistics of "
                 "batch normalization"
             )
-        actor, statistics = len(self.net.actor), size_of(self.net.actor_body.shape.statistics())
+        actor, statistics = len(self.net.actor), total_size(self.net.actor_body.shape.statistics())
         super().start_from(start._replace(acting=actor))
         self.net.statistics[:statistics].copy_(start.state["statistics"][:statistics])

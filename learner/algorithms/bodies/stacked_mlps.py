@@ -11,7 +11,6 @@ With `Normalized.BEFORE` an MLP is BN, then linear, BN, activation for each hidd
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -19,17 +18,17 @@ import torch
 from torch import Tensor
 
 from millrace.learner.algorithms.bodies.normalized_pass import EPS, Layer, NormalizedPass, Plan, RunningStatistics
-from millrace.protocol.policy.layout import Field
+from millrace.protocol.policy.layout import Field, named_views, total_size
 from millrace.protocol.policy.networks import DTYPE, StackedMLP
 
 
 class Normalized(Enum):
     """Where an MLP normalizes."""
 
-    NOWHERE = "nowhere"
-    BEFORE = "before"
+    NOWHERE = "none"
+    BEFORE = "before activations"
     """its input, and before each activation; hidden layers have no biases, which the means would take away"""
-    AFTER = "after"
+    AFTER = "after activations"
     """its input, and after each activation"""
 
 
@@ -73,28 +72,23 @@ class MLPShape(NamedTuple):
         return [Field(f"{i}.{kind}", shape, 0) for i, shape in enumerate(shapes) for kind in ("mean", "variance")]
 
 
-def size_of(fields: Sequence[Field]) -> int:
-    """The numbers that these fields hold."""
-    return sum(math.prod(field.shape) for field in fields)
-
-
 def initial(shape: MLPShape, generator: torch.Generator) -> Tensor:
     """Parameters [P] to begin with: orthogonal weights, gains of 1, and zeros."""
-    flat = torch.zeros(size_of(shape.fields()), dtype=DTYPE)
-    for name, view in _views(flat, shape.fields()).items():
-        if name.endswith("gain"):
+    fields = shape.fields()
+    flat = torch.zeros(total_size(fields), dtype=DTYPE)
+    for field, view in zip(fields, named_views(flat, fields).values(), strict=True):
+        if field.name.endswith("gain"):
             view.fill_(1)
-        elif name.endswith("weight"):
-            gain = next(field.gain for field in shape.fields() if field.name == name)
+        elif field.name.endswith("weight"):
             for weight in view:
-                torch.nn.init.orthogonal_(weight, gain, generator)
+                torch.nn.init.orthogonal_(weight, field.gain, generator)
     return flat
 
 
 def initial_statistics(shape: MLPShape) -> Tensor:
     """Means of 0 and variances of 1, flat."""
-    flat = torch.zeros(size_of(shape.statistics()), dtype=DTYPE)
-    for name, view in _views(flat, shape.statistics()).items():
+    flat = torch.zeros(total_size(shape.statistics()), dtype=DTYPE)
+    for name, view in named_views(flat, shape.statistics()).items():
         view.fill_(float(name.endswith("variance")))
     return flat
 
@@ -105,40 +99,42 @@ class StackedMLPs:
     def __init__(self, shape: MLPShape, parameters: Tensor, statistics: Tensor) -> None:
         """`parameters`: a leaf of the graph. `statistics`: as `initial_statistics`, changed in place."""
         self.shape = shape
+        self._fields, self._folded_fields = shape.fields(), shape.folded().fields()
         self._trained, self._constant = parameters, parameters.detach()
-        found = _views(statistics, shape.statistics())
+        found = named_views(statistics, shape.statistics())
         norms = len(found) // 2
         self._running = [RunningStatistics(found[f"{i}.mean"], found[f"{i}.variance"]) for i in range(norms)]
         self._plan = Plan(self._layers, shape.relu, shape.normalized is Normalized.BEFORE)
         self._normalizes = norms > 0
+        self._now = self._layers(self._constant) if self._normalizes else []
 
     def trained(self, x: Tensor, *, renormalizes: bool = False) -> Tensor:
         """Outputs [K, B, O] of rows [B, D]. The parameters get a gradient, and running statistics move."""
         if not self._normalizes:
-            return self._plain(x, self._trained, self.shape)
+            return self._plain(x, self._trained)
         out: Tensor = NormalizedPass.apply(x, self._trained, self._plan, self._running, renormalizes)  # type: ignore[no-untyped-call]
         return out
 
     def of_minibatch(self, x: Tensor) -> Tensor:
         """As `trained` without renormalization, but nothing gets a gradient or moves: for target networks."""
         if not self._normalizes:
-            return self._plain(x, self._constant, self.shape)
+            return self._plain(x, self._constant)
         out: Tensor = NormalizedPass.apply(x, self._constant, self._plan, None, False)  # type: ignore[no-untyped-call]
         return out
 
     def evaluated(self, x: Tensor) -> Tensor:
         """Outputs [K, B, O] of rows [B, D], with the running statistics. Only x gets a gradient."""
-        return self._plain(x, self.folded(), self.shape.folded())
+        return self._plain(x, self.folded())
 
     @torch.no_grad()
     def folded(self) -> Tensor:
         """The parameters [P′] of plain MLPs with the outputs of `evaluated`: of each layer weight and bias, [K, …] each."""
         if not self._normalizes:
             return self._constant
-        flat = self._constant.new_zeros(size_of(self.shape.folded().fields()))
-        into = _views(flat, self.shape.folded().fields())
-        scales, shifts = zip(*(self._linear(i) for i in range(len(self._running))), strict=True)
-        for i, layer in enumerate(self._layers(self._constant)):
+        flat = self._constant.new_zeros(total_size(self._folded_fields))
+        into = named_views(flat, self._folded_fields)
+        scales, shifts = zip(*map(_linear, self._now, self._running), strict=True)
+        for i, layer in enumerate(self._now):
             weight, bias = into[f"{i}.weight"], into[f"{i}.bias"]
             weight.copy_(layer.weight)
             if layer.bias is not None:
@@ -151,14 +147,8 @@ class StackedMLPs:
                 bias.mul_(scales[i + 1]).add_(shifts[i + 1])
         return flat
 
-    def _linear(self, i: int) -> tuple[Tensor, Tensor]:
-        """Scale and shift [K, n, 1] of a normalization by running statistics."""
-        layer, running = self._layers(self._constant)[i], self._running[i]
-        scale = layer.gain * (running.variance + EPS).rsqrt()
-        return scale, layer.shift - running.mean * scale
-
     def _layers(self, flat: Tensor) -> list[Layer]:
-        views = _views(flat, self.shape.fields())
+        views = named_views(flat, self._fields)
         return [
             Layer(views[f"{i}.gain"], views[f"{i}.shift"], views[f"{i}.weight"], views.get(f"{i}.bias"))
             for i in range(len(self.shape.sizes) - 1)
@@ -168,23 +158,22 @@ class StackedMLPs:
     def project(self) -> None:
         """With `unit_rows`: scale the weights of each unit to norm 1. Called after each step of an optimizer."""
         if self.shape.unit_rows:
-            for name, view in _views(self._constant, self.shape.fields()).items():
+            for name, view in named_views(self._constant, self._fields).items():
                 if name.endswith("weight"):
                     view.div_(torch.linalg.vector_norm(view, dim=-1, keepdim=True))
 
-    @staticmethod
-    def _plain(x: Tensor, flat: Tensor, shape: MLPShape) -> Tensor:
-        """Outputs [K, B, O] of MLPs that normalize nothing."""
-        fields = shape.fields()
+    def _plain(self, x: Tensor, flat: Tensor) -> Tensor:
+        """Outputs [K, B, O] of MLPs that normalize nothing, with these parameters [P′]."""
 
         def layers_of(flat: Tensor) -> list[Tensor]:
-            return [view.squeeze(-1) if name.endswith("bias") else view for name, view in _views(flat, fields).items()]
+            views = named_views(flat, self._folded_fields)
+            return [view.squeeze(-1) if name.endswith("bias") else view for name, view in views.items()]
 
-        out: Tensor = StackedMLP.apply(x, shape.relu, flat, layers_of)  # type: ignore[no-untyped-call]
+        out: Tensor = StackedMLP.apply(x, self.shape.relu, flat, layers_of)  # type: ignore[no-untyped-call]
         return out
 
 
-def _views(flat: Tensor, fields: Sequence[Field]) -> dict[str, Tensor]:
-    """A view of each field of a flat tensor, by name."""
-    parts = torch.split(flat, [math.prod(field.shape) for field in fields])
-    return {field.name: part.view(field.shape) for field, part in zip(fields, parts, strict=True)}
+def _linear(layer: Layer, running: RunningStatistics) -> tuple[Tensor, Tensor]:
+    """Scale and shift [K, n, 1] of a normalization by running statistics."""
+    scale = layer.gain * (running.variance + EPS).rsqrt()
+    return scale, layer.shift - running.mean * scale

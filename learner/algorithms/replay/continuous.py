@@ -110,8 +110,8 @@ class Continuous(OffPolicy):
         """New networks, the same each time: those that are trained, then their targets."""
         return actor_and_critics(self.policy, device, self.seed)
 
-    def project_actor(self) -> None:
-        """After each step of the actor: return its weights to where the algorithm holds them, if it does."""
+    def after_step(self, name: str) -> None:
+        """Called after each step of NAME_optimizer, also in cloning: returns weights to where an algorithm holds them."""
 
     def begin_with_actor(self) -> None:
         """The actor was trained before the first rollouts: it acts from the first env step, and its target equals it."""
@@ -142,6 +142,7 @@ class Continuous(OffPolicy):
         optimizer = self.optimizers[f"{name}_optimizer"]
         found = self.differentiate(loss, optimizer, {**numbers, f"{name}_loss": loss})
         take_step(optimizer)
+        self.after_step(name)
         del found["grad_norm"]
         return found
 

@@ -59,7 +59,7 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
             optimizer.param_groups[0]["lr"] = LEARNING_RATE
             take_step(optimizer)
             if isinstance(algorithm, Continuous):
-                algorithm.project_actor()
+                algorithm.after_step("actor")
             algorithm.pretraining_steps += 1
             pulse()
     if isinstance(algorithm, Continuous):

@@ -16,8 +16,8 @@ from millrace.learner.algorithms.bodies.stacked_mlps import (
     StackedMLPs,
     initial,
     initial_statistics,
-    size_of,
 )
+from millrace.protocol.policy.layout import total_size
 from millrace.protocol.policy.networks import trainable
 from tests.learner.algorithms.bodies import plain_formula as plain
 from tests.support.variants import variants
@@ -36,7 +36,7 @@ class Made:
     def __init__(self, normalized: Normalized, *, relu: bool = True, unit_rows: bool = False) -> None:
         generator = torch.Generator().manual_seed(0)
         self.shape = MLPShape(2, SIZES, relu, normalized, unit_rows)
-        noise = torch.randn(size_of(self.shape.fields()), generator=generator, dtype=torch.float64)
+        noise = torch.randn(total_size(self.shape.fields()), generator=generator, dtype=torch.float64)
         self.flat = initial(self.shape, generator).double() + 0.3 * noise
         self.gradient = torch.zeros_like(self.flat)
         self.statistics = initial_statistics(self.shape).double()
