@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,6 +51,7 @@ DQN = COMMON | {
     "target_every": 128, "double": False, "epsilon_steps": 8000, "epsilon_end": 0.04, "max_grad_norm": 10.0,
 }  # fmt: skip
 LEAST_S = 0.05  # between two calls of `look`
+OUTPUT = "out"  # the file in a folder of a program that holds what it prints
 LONGEST_S = 300.0
 
 
@@ -139,6 +140,31 @@ def missing() -> list[str]:
     return [name for name in install.PEERS if name not in install.installed()]
 
 
+@contextlib.contextmanager
+def started(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A program that runs in this folder, with one thread for numpy, and writes into its file `OUTPUT`.
+
+    In the end the program and its child processes are killed.
+    """
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    with (folder / OUTPUT).open("w") as file:
+        process = subprocess.Popen(
+            command,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=os.environ | threads | {"PYTHONPATH": path},
+            cwd=folder,
+            start_new_session=True,  # so that its child processes can be ended with it
+        )
+        try:
+            yield process
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
 def run(
     name: str,
     settings: dict[str, Any],
@@ -154,31 +180,17 @@ def run(
     each = contender or CONTENDERS[name]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         command = _ours(each, settings, target, folder) if each.ours else _theirs(each, settings, target)
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        out = Path(folder) / "out"
-        with out.open("w") as file:
-            began_s = time.monotonic()
-            process = subprocess.Popen(
-                [str(install.python(each.peer)) if each.peer else sys.executable, "-m", each.module, *command],
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env=os.environ | threads | {"PYTHONPATH": path},
-                cwd=folder,
-                start_new_session=True,  # so that its child processes can be ended with it
-            )
-            try:
-                while process.poll() is None and time.monotonic() - began_s < LONGEST_S:
-                    look(process.pid)
-                    try:
-                        process.wait(LEAST_S)
-                    except subprocess.TimeoutExpired:
-                        continue
-                wall_s = time.monotonic() - began_s
-            finally:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+        words = [str(install.python(each.peer)) if each.peer else sys.executable, "-m", each.module, *command]
+        out = Path(folder) / OUTPUT
+        began_s = time.monotonic()
+        with started(words, Path(folder)) as process:
+            while process.poll() is None and time.monotonic() - began_s < LONGEST_S:
+                look(process.pid)
+                try:
+                    process.wait(LEAST_S)
+                except subprocess.TimeoutExpired:
+                    continue
+            wall_s = time.monotonic() - began_s
         if process.returncode:
             raise RuntimeError(f"{name} ended with {process.returncode}: {out.read_text()[-500:]}")
         if each.ours:

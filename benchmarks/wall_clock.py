@@ -14,9 +14,11 @@ import argparse
 import shlex
 import sys
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
-from benchmarks import wall_clock_curves, wall_clock_rates
+from benchmarks import wall_clock_curves
+from benchmarks.kept_records import merged
 from benchmarks.wall_clock_curves import Curve, read_curves, write_curves
 from benchmarks.wall_clock_programs import ALGORITHMS, ENVS, NAMES, PROGRAMS, Program, curve_command, rate_command
 from benchmarks.wall_clock_rates import Rate, can_be_measured, measure, read_rates, write_rates
@@ -50,7 +52,7 @@ def table() -> None:
 def collect(folders: list[Path], made_on: str | None) -> None:
     """Add the curves of all runs in these folders to those that are kept."""
     found = [curve for folder in folders for curve in wall_clock_curves.found_in(folder, made_on) if curve.points]
-    kept = wall_clock_curves.merged(read_curves(), found)
+    kept = merged(read_curves(), found)
     for curve in found:
         last, returned = curve.points[-1]
         print(f"{curve.env} {curve.system} {curve.algo} seed {curve.seed}: {returned:,.1f} after {last:,} env steps")
@@ -73,38 +75,29 @@ def rates(arguments: argparse.Namespace) -> None:
     """Measure rates, and keep each as soon as it is there."""
     made_on = arguments.processor or processor()
     found: dict[tuple[Program, str, float], Rate] = {}
-    for turn in range(1, arguments.rounds + 1):
-        for env in arguments.env:
-            for program in chosen(arguments):
-                for step_s in arguments.step_s:
-                    if not can_be_measured(program, env, step_s, arguments.seconds):
-                        continue  # it is computed
-                    try:
-                        rate = measure(
-                            program,
-                            env,
-                            step_s,
-                            turn,
-                            seconds=arguments.seconds,
-                            threads=arguments.threads,
-                            device=arguments.device,
-                        )
-                    except RuntimeError as error:
-                        print(f"left out: {error}", file=sys.stderr)
-                        continue
-                    print(f"{env} {program.system} {program.algo}, {step_s:g} s: {rate:,.1f} env steps/s", flush=True)
-                    words = rate_command(program, env, step_s, "S", arguments.threads, arguments.device)
-                    old = found.get((program, env, step_s))
-                    found[program, env, step_s] = Rate(
-                        env=env,
-                        system=program.system,
-                        algo=program.algo,
-                        step_s=step_s,
-                        processor=made_on,
-                        command=shlex.join(["python", *words[1:]]),
-                        rates=[*(old.rates if old else []), round(rate, 2)],
-                    )
-                    write_rates(wall_clock_rates.merged(read_rates(), found.values()))
+    turns = range(1, arguments.rounds + 1)
+    for turn, env, program, step_s in product(turns, arguments.env, chosen(arguments), arguments.step_s):
+        if not can_be_measured(program, env, step_s, arguments.seconds):
+            continue  # it is computed
+        how = {"threads": arguments.threads, "device": arguments.device}
+        try:
+            rate = measure(program, env, step_s, turn, seconds=arguments.seconds, **how)
+        except RuntimeError as error:
+            print(f"left out: {error}", file=sys.stderr)
+            continue
+        print(f"{env} {program.system} {program.algo}, {step_s:g} s: {rate:,.1f} env steps/s", flush=True)
+        words = rate_command(program, env, step_s, "S", **how)
+        old = found.get((program, env, step_s))
+        found[program, env, step_s] = Rate(
+            env=env,
+            system=program.system,
+            algo=program.algo,
+            step_s=step_s,
+            processor=made_on,
+            command=shlex.join(["python", *words[1:]]),
+            rates=[*(old.rates if old else []), round(rate, 2)],
+        )
+        write_rates(merged(read_rates(), found.values()))
 
 
 def chosen(arguments: argparse.Namespace) -> list[Program]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks import results
+from benchmarks import kept_records, results
 from benchmarks.wall_clock_programs import OURS
 from benchmarks.writing import processor
 from millrace.learner.config.layers import config_of_run
@@ -52,18 +52,12 @@ class _Point(msgspec.Struct):
 
 def read_curves() -> list[Curve]:
     """The curves that are kept."""
-    return msgspec.json.decode(CURVES.read_bytes(), type=list[Curve])
+    return kept_records.read(CURVES, Curve)
 
 
 def write_curves(curves: Iterable[Curve]) -> None:
-    """Keep these curves, one a line."""
-    ordered = sorted(curves, key=lambda curve: curve.key)
-    CURVES.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, ordered)) + b"\n]\n")
-
-
-def merged(old: Iterable[Curve], new: Iterable[Curve]) -> list[Curve]:
-    """The new curves, and the old ones of other runs."""
-    return list({curve.key: curve for curve in (*old, *new)}.values())
+    """Keep these curves."""
+    kept_records.write(CURVES, curves)
 
 
 def found_in(folder: Path, made_on: str | None) -> Iterator[Curve]:

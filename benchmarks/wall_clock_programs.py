@@ -7,6 +7,7 @@ gradient steps begin earlier (`LEARNING_STARTS`). A curve is trained by two work
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from millrace.learner.config.layers import resolve
@@ -60,9 +61,14 @@ def curve_command(program: Program, env: str, seed: int, out: str) -> list[str]:
     if program.system == THEIRS:
         folder = f"{out}/{env}-sb3-{program.algo}-s{seed}"
         return ["python", "-m", THEIR_PROGRAM, env, program.algo, str(seed), "--steps", steps, "--out", folder]
+    return ["nice", "-n", "19", *training(env, [program.algo], seed, steps, out)]
+
+
+def training(env: str, algo: Sequence[str], seed: int, steps: str, out: str) -> list[str]:
+    """Our command that trains a curve. `algo`: the name of the algorithm, and flags of its own."""
+    words = ["millrace", "train", env, "--algo", *algo, "--seed", str(seed), "--steps", steps]
     evaluations = ["--eval-every", str(EVAL_EVERY), "--eval-episodes", str(EVAL_EPISODES)]
-    words = ["nice", "-n", "19", "millrace", "train", env, "--algo", program.algo, "--seed", str(seed), "--steps", steps]
-    return [*words, "--workers", "2", *_flags(program.algo), *evaluations, "--run-dir", out]
+    return [*words, "--workers", "2", *_flags(algo[0]), *evaluations, "--run-dir", out]
 
 
 def rate_command(program: Program, env: str, step_s: float, seed: int | str, threads: int, device: str) -> list[str]:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import signal
 import statistics
 import subprocess
 import tempfile
@@ -21,10 +19,11 @@ from typing import NamedTuple
 
 import msgspec
 
+from benchmarks import kept_records
+from benchmarks.programs import OUTPUT, started
 from benchmarks.wall_clock_programs import COPIES, OURS, Program, rate_command
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 
-ROOT = Path(__file__).parents[1]
 RATES = Path(__file__).with_name("rates.json")
 LOOK_S, LONGEST_S = 0.5, 600.0
 LEAST_UPDATES = 2
@@ -65,18 +64,12 @@ class RateAt(NamedTuple):
 
 def read_rates() -> list[Rate]:
     """The rates that are kept."""
-    return msgspec.json.decode(RATES.read_bytes(), type=list[Rate])
+    return kept_records.read(RATES, Rate)
 
 
 def write_rates(rates: Iterable[Rate]) -> None:
-    """Keep these rates, one a line."""
-    ordered = sorted(rates, key=lambda rate: rate.key)
-    RATES.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, ordered)) + b"\n]\n")
-
-
-def merged(old: Iterable[Rate], new: Iterable[Rate]) -> list[Rate]:
-    """The new rates, and the old ones of other programs, step times and processors."""
-    return list({rate.key: rate for rate in (*old, *new)}.values())
+    """Keep these rates."""
+    kept_records.write(RATES, rates)
 
 
 def rate_at(step_s: float, rates: Sequence[Rate]) -> RateAt | None:
@@ -118,36 +111,23 @@ def measure(
 ) -> float:
     """Env steps/s over at least so many seconds after the warm-up. Raises `RuntimeError`."""
     command = rate_command(program, env, step_s, seed, threads, device)
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder, began_s = Path(name), time.monotonic()
-        with (folder / "out").open("w") as out:
-            process = subprocess.Popen(
-                command,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                env=os.environ | one_thread | {"PYTHONPATH": path},
-                cwd=folder,
-                start_new_session=True,  # so that its child processes can be ended with it
-            )
-        try:
-            while True:
-                found = rate_of(updates(program, folder), program.warm_up_steps(env), seconds)
-                if found is not None:
-                    return found
+        with started(command, folder) as process:
+            try:
+                while True:
+                    found = rate_of(updates(program, folder), program.warm_up_steps(env), seconds)
+                    if found is not None:
+                        return found
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(LOOK_S)
+                    if process.returncode is not None or time.monotonic() - began_s > LONGEST_S + seconds:
+                        said = (folder / OUTPUT).read_text()[-500:]
+                        raise RuntimeError(f"{program.system}, {program.algo}, {env}: no rate was found: {said}")
+            finally:
+                process.terminate()
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(LOOK_S)
-                if process.returncode is not None or time.monotonic() - began_s > LONGEST_S + seconds:
-                    said = (folder / "out").read_text()[-500:]
-                    raise RuntimeError(f"{program.system}, {program.algo}, {env}: no rate was found: {said}")
-        finally:
-            process.terminate()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(10)
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+                    process.wait(10)
 
 
 def updates(program: Program, folder: Path) -> list[tuple[int, float]]:
@@ -158,7 +138,7 @@ def updates(program: Program, folder: Path) -> list[tuple[int, float]]:
             for table in folder.rglob(METRICS_FILE)
             for row in read_rows(table)
         ]
-    *lines, _ = (folder / "out").read_text().split("\n")
+    *lines, _ = (folder / OUTPUT).read_text().split("\n")
     read = [json.loads(line) for line in lines if line.startswith('{"env_steps"')]
     return [(line["env_steps"], line["at_s"]) for line in read]
 

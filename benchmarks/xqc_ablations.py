@@ -7,10 +7,11 @@ of its own, `--algo benchmarks.xqc_ablations:WithoutTarget`.
 from __future__ import annotations
 
 import argparse
+import shlex
 
 import torch
 
-from benchmarks.wall_clock_programs import COPIES, EVAL_EPISODES, EVAL_EVERY
+from benchmarks.wall_clock_programs import training
 from millrace.algorithms import CriticLoss, Transitions
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
@@ -111,10 +112,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 def command(env: str, flags: tuple[str, ...], seed: int, folder: str) -> str:
     """The command that trains one, in a folder of its own."""
-    copies = f"--workers 2 --envs {COPIES} --lanes {COPIES} --rollout-steps 4 --max-lag 1"
-    evaluations = f"--eval-every {EVAL_EVERY} --eval-episodes {EVAL_EPISODES} --torch-threads 1"
-    words = f"millrace train {env} --algo {' '.join(flags)} --seed {seed} --steps {STEPS}"
-    return f"{words} {copies} {evaluations} --run-dir {folder} --resume auto"
+    return shlex.join([*training(env, flags, seed, str(STEPS), folder), "--torch-threads", "1", "--resume", "auto"])
 
 
 def main() -> None:

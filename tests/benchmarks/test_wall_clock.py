@@ -15,6 +15,7 @@ import gymnasium
 import pytest
 
 from benchmarks import slow_env, wall_clock, wall_clock_curves, wall_clock_rates
+from benchmarks.kept_records import merged
 from benchmarks.wall_clock_curves import Curve, read_curves, write_curves
 from benchmarks.wall_clock_programs import COPIES, ENVS, OURS, PROGRAMS, THEIRS, Program, curve_command, rate_command
 from benchmarks.wall_clock_rates import Rate, can_be_measured, largest_error, rate_at, rate_of, read_rates, write_rates
@@ -197,7 +198,7 @@ def test_the_part_of_the_page_has_what_there_is() -> None:
 def test_a_newer_curve_takes_the_place_of_that_of_the_same_seed() -> None:
     old, new = curve(SAC, 1, (1, 1.0)), curve(SAC, 1, (2, 2.0), command="d")
     other = curve(SAC, 2, (3, 3.0))
-    kept = wall_clock_curves.merged([old, other], [new])
+    kept = merged([old, other], [new])
     assert sorted(kept, key=lambda each: each.seed) == [new, other]
     (line,) = wall_clock.different(kept)
     assert "HalfCheetah-v5 millrace sac: the seeds have different commands" in line
