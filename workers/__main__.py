@@ -17,8 +17,8 @@ from millrace.flags.parse import parse_flags
 from millrace.protocol.address import check_worker_name
 from millrace.protocol.bounds import MAX_NAME, one_line
 from millrace.protocol.errors import UsageError, UserFacingError
-from millrace.protocol.keys.key_folder import read_token
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.worker_token import read_token
 from millrace.workers.conversation.connection_rules import checked_token
 from millrace.workers.flags import WorkerFlags
 from millrace.workers.shared_weights import SUPPORTED, SharedWeights

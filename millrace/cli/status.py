@@ -28,8 +28,9 @@ from millrace.learner.run_folder.run_lock import learner_of_run
 from millrace.learner.run_folder.sentences import bottleneck, lag_in_words, per_second, went_wrong
 from millrace.learner.run_lines import RunLine, in_sentences, read_line
 from millrace.protocol.errors import Refused, RunError, UsageError
-from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
+from millrace.protocol.keys.key_folder import KeyFolder
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE, read_token
 from millrace.protocol.messages import Inquire, Status, WorkerStatus
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink

@@ -1,7 +1,5 @@
 """The key folder, which only its owner can enter: the learner's key, the list of clients, and their tokens.
 
-`read_token` finds the token of a worker: in a file, or in an environment variable, which it removes.
-
     server.key      the secret half of the learner's key, hexadecimal
     allowed.toml    the clients that may connect: public halves, names, dates
     NAME.token      the join token of a client that was made here: secret
@@ -29,7 +27,7 @@ from millrace.protocol.keys.keys import KEY_BYTES, ClientList, Key, Token, check
 log = logging.getLogger("millrace.cli.keys")
 
 DEFAULT_FOLDER = "~/.config/millrace/keys"
-FOLDER_VARIABLE, TOKEN_VARIABLE = "MILLRACE_KEYS", "MILLRACE_TOKEN"
+FOLDER_VARIABLE = "MILLRACE_KEYS"
 FIRST_CLIENT = "default"
 OTHERS_MODE = 0o077  # permission bits of group and others
 
@@ -67,7 +65,7 @@ class KeyFolder:
             with suppress(FileExistsError):
                 _create(path, Key.new().secret.hex() + "\n")
         try:
-            secret = bytes.fromhex(_read_secret(path, "key"))
+            secret = bytes.fromhex(read_secret(path, "key"))
         except ValueError:
             secret = b""
         if len(secret) != KEY_BYTES:
@@ -198,30 +196,7 @@ class Keyring:
         return found.st_ino, found.st_mtime_ns, found.st_size, found.st_mode
 
 
-def read_token(flag: str) -> Token | None:
-    """The token from the flag's file, or else from the environment variable; None if neither is set.
-
-    The environment variable holds a file name or the token itself. It is removed, so that processes
-    that an environment starts do not inherit it. Raises `UsageError`.
-    """
-    given = os.environ.pop(TOKEN_VARIABLE, "").strip()
-    if flag.startswith("millrace1."):
-        raise UsageError(
-            f"--token: expected a file, got the token itself, which others can now see; put it in a file or {TOKEN_VARIABLE}"
-        )
-    if flag:
-        return Token.from_text(_read_secret(expanded(flag, "token"), "token"), f"token {flag}")
-    if not given:
-        return None
-    text = (
-        given
-        if given.startswith("millrace") and not os.path.exists(given)  # Path.exists raises for a name that is too long
-        else _read_secret(expanded(given, "token"), "token")
-    )
-    return Token.from_text(text, TOKEN_VARIABLE)
-
-
-def _read_secret(path: Path, what: str) -> str:
+def read_secret(path: Path, what: str) -> str:
     """The text of a file that only its owner can read. A pipe, such as `<(pass show millrace)`, is accepted."""
     try:
         with path.open("rb") as file:

@@ -10,8 +10,8 @@ import math
 
 from millrace.protocol.address import check_address, is_local
 from millrace.protocol.errors import UsageError
-from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 
 REJOIN_TIMEOUT_S = 600.0
 """How long, at least, a worker that had joined waits for its learner to come back."""

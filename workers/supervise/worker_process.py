@@ -22,8 +22,8 @@ from typing import BinaryIO
 
 from millrace.protocol.alive import CALLS, OF_POLICY, OUR_CODE, WorkerActivity
 from millrace.protocol.bounds import escaped, one_line
-from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers.activity import STACK_SIGNAL, ActivityReader
 from millrace.workers.machine_slots import free_all, open_slots, touch
 from millrace.workers.supervise.ending import Ending

@@ -37,8 +37,9 @@ from millrace.extras.conformance.script import (
 from millrace.learner.members.bound import bind
 from millrace.protocol.bounds import escaped
 from millrace.protocol.errors import UsageError
-from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring
+from millrace.protocol.keys.key_folder import KeyFolder, Keyring
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.protocol.wire.learner_link import LearnerLink
 
 ADDRESS_VARIABLE = "MILLRACE_ADDRESS"

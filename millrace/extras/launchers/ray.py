@@ -22,7 +22,8 @@ from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.command_line import read_config
 from millrace.learner.members.who_may_connect import keyring_for
 from millrace.protocol.errors import UsageError, first_line, refusals_of
-from millrace.protocol.keys.key_folder import Keyring, read_token
+from millrace.protocol.keys.key_folder import Keyring
+from millrace.protocol.keys.worker_token import read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:

@@ -18,8 +18,9 @@ from millrace.learner.run_folder.lease import Listens, Owner, decoded
 from millrace.learner.run_folder.metrics_log import METRICS_FILE
 from millrace.learner.run_folder.run_lock import LOCK_FILE, RunLock
 from millrace.protocol.errors import UsageError
-from millrace.protocol.keys.key_folder import KeyFolder, read_token
+from millrace.protocol.keys.key_folder import KeyFolder
 from millrace.protocol.keys.keys import Key, Token
+from millrace.protocol.keys.worker_token import read_token
 from tests.support.run_folders import a_run
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.protocol.errors import UsageError
-from millrace.protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring, chosen_key_folder, read_token
+from millrace.protocol.keys.key_folder import KeyFolder, Keyring, chosen_key_folder
 from millrace.protocol.keys.keys import (
     TOKEN_CHARACTERS,
     TOKEN_PREFIX,
@@ -25,6 +25,7 @@ from millrace.protocol.keys.keys import (
     fingerprint,
     public_key,
 )
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE, read_token
 from millrace.protocol.logs.log_rate_limiter import LogRateLimiter
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)

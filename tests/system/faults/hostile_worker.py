@@ -16,7 +16,7 @@ from pathlib import Path
 
 import zmq
 
-from millrace.protocol.keys.key_folder import read_token
+from millrace.protocol.keys.worker_token import read_token
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,

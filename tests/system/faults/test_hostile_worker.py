@@ -31,7 +31,8 @@ import pytest
 from millrace.cli.status import as_table, ask, in_json, observer_name
 from millrace.extras.monitoring.report.page import write_page
 from millrace.protocol.bounds import Stage as WorkerStage
-from millrace.protocol.keys.key_folder import KeyFolder, read_token
+from millrace.protocol.keys.key_folder import KeyFolder
+from millrace.protocol.keys.worker_token import read_token
 from millrace.protocol.wire.worker_link import WorkerLink
 from tests.support.conversation.extreme_messages import MARK
 from tests.system.faults.hostile_worker import FLOODS, NAME, Hostile, sayings

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from millrace.protocol.alive import CallTimeouts, Doing
-from millrace.protocol.keys.key_folder import TOKEN_VARIABLE
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers import activity, program
 from millrace.workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
 from millrace.workers.supervise import worker_process
