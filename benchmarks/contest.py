@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
+from benchmarks.arithmetic import products_ms
 from millrace.learner.algorithms.kernels import trained_networks
 
 
@@ -21,6 +22,8 @@ class Contest(NamedTuple):
     rows: int
     peer: str
     """the system behind the run `peer`; the other runs are `graph` (ours by autograd) and `ours` (what millrace chooses)"""
+    repeats: int
+    """the updates of one run"""
     target: float | None
     """our time should be at most this fraction of the peer's"""
     runs: Mapping[str, Callable[[], float]]
@@ -61,4 +64,5 @@ def measure(contest: Contest, rounds: int) -> dict[str, object]:
 
     medians = {f"{name}_ms": statistics.median(found) for name, found in times.items()}
     about = {"update": contest.title, "rows": contest.rows, "peer": contest.peer, "target": contest.target}
+    about["products_ms"] = products_ms(contest.runs["graph"], contest.repeats)
     return about | medians | {"ratio": ratio("peer"), "ratio_to_graph": ratio("graph")}

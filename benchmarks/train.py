@@ -4,7 +4,7 @@
 Stable-Baselines3. Env steps/s are measured from the third update on. The time to solve is from the command (with imports,
 start and evaluations) until the mean return of a greedy evaluation is 475; there is an evaluation of 20 episodes every
 5,000 env steps. For millrace it lasts until the program has ended. Each run is a process tree of its own with a cold start;
-all take turns. A run that fails is reported and left out.
+all take turns. A run that fails is reported and left out. The last row of the table is what the arithmetic would allow.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.arithmetic import products_ms
 from benchmarks.memory import Tree
 from benchmarks.programs import A2C, CONTENDERS, DQN, DUMMY, LARGE, OURS, OURS_OWN, SUBPROC, ZOO, contenders, missing, run
+from benchmarks.update_ppo import contest
 from benchmarks.writing import bars, write
 
 WARM_UP = 2  # updates
@@ -144,6 +146,20 @@ def _cell(median: float | None, found: list[float]) -> str:
     return f"{middle} ({min(reached):,.{places}f} to {max(reached):,.{places}f}{unsolved})" if len(found) > 1 else middle
 
 
+def products_alone() -> dict[str, Any]:
+    """A row: env steps/s of a learner that waits for nothing, and whose updates are their matrix products on one core."""
+    rates = {}
+    for column, settings in ((SMALL_RATE, ZOO), (LARGE_RATE, LARGE)):
+        minibatch = contest(settings["batch_size"], None)
+        seconds = products_ms(minibatch.runs["graph"], minibatch.repeats) / 1e3
+        rates[column] = settings["batch_size"] / (settings["n_epochs"] * seconds)
+    return {
+        "contender": "products of the updates alone",
+        "median": rates,
+        "of": {name: [rate] for name, rate in rates.items()},
+    }
+
+
 def against(rows: list[dict[str, Any]]) -> list[str]:
     """Lines that compare millrace with the best peer. Contenders with their own settings are only compared by seconds."""
     lines = []
@@ -177,7 +193,7 @@ def main() -> None:
         charts = [(column, _bars(rows, column)) for column in (SMALL_RATE, LARGE_RATE, SECONDS)]
         write("train", {"rows": _without_nan(rows)}, charts)  # after each turn, in case a later one fails
     console = Console(width=140)
-    console.print(table(rows, f"PPO, CartPole-v1, medians of {arguments.rounds} (least to most)"))
+    console.print(table([*rows, products_alone()], f"PPO, CartPole-v1, medians of {arguments.rounds} (least to most)"))
     if arguments.peers:
         for algo in ("A2C", "DQN"):
             console.print(table(rows, f"{algo}, CartPole-v1, RL Zoo's settings", algo))

@@ -21,7 +21,7 @@ from benchmarks import update_ppo
 from benchmarks.contest import Contest, measure
 from benchmarks.writing import write
 
-COLUMNS = ("update", "rows", "peer", "its ms", "graph ms", "ours ms", "ratio", "target", "to graph")
+COLUMNS = ("update", "rows", "peer", "its ms", "graph ms", "ours ms", "products ms", "ratio", "target", "to graph")
 
 
 def contests(console: Console) -> list[Contest]:
@@ -50,7 +50,7 @@ def main() -> None:
     load = f"load {load_before:.1f} before, {os.getloadavg()[0]:.1f} after"
     table = Table(*COLUMNS, title=f"CPU time of an update, medians of {rounds} turns; {load}")
     for r in results:
-        numbers = (f"{r[key]:.3f}" for key in ("peer_ms", "graph_ms", "ours_ms", "ratio"))
+        numbers = (f"{r[key]:.3f}" for key in ("peer_ms", "graph_ms", "ours_ms", "products_ms", "ratio"))
         target = "" if r["target"] is None else f"≤ {r['target']}"
         table.add_row(str(r["update"]), str(r["rows"]), str(r["peer"]), *numbers, target, f"{r['ratio_to_graph']:.3f}")
     console.print(table)

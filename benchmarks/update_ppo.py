@@ -102,4 +102,4 @@ def contest(size: int, target: float | None, width: int = 64) -> Contest:
         return lambda: repeated(lambda: update(next(order)), repeats)
 
     runs = {name: run(update) for name, update in updates.items()}
-    return Contest(f"PPO, {width} units", size, "usual", target, runs)
+    return Contest(f"PPO, {width} units", size, "usual", repeats, target, runs)

@@ -105,7 +105,7 @@ def dqn(width: int, target: float) -> Contest:
         "graph": ours(True),
         "ours": ours(False),
     }
-    return Contest(f"DQN, {width} units", rows, "SB3", target, runs)
+    return Contest(f"DQN, {width} units", rows, "SB3", STEPS, target, runs)
 
 
 class Continuous(NamedTuple):
@@ -169,13 +169,18 @@ def continuous(name: str, width: int, target: float | None) -> Contest:
         "graph": one.steps(width, in_torch=True),
         "ours": one.steps(width),
     }
-    return Contest(f"{name}, {width} units", ROWS, "SB3", target, runs)
+    return Contest(f"{name}, {width} units", ROWS, "SB3", STEPS, target, runs)
 
 
 def beside_sac(name: str, width: int) -> Contest:
     """A gradient step on 256 transitions, against one of our SAC with layers of 256 units."""
-    ours, sac = CONTINUOUS[name].steps(width), CONTINUOUS["SAC"].steps(256)
-    return Contest(f"{name}, {width} units", ROWS, "SAC", None, {"peer": sac, "graph": ours, "ours": ours})
+    one = CONTINUOUS[name]
+    runs = {
+        "peer": CONTINUOUS["SAC"].steps(256),
+        "graph": one.steps(width, in_torch=True),
+        "ours": one.steps(width),
+    }
+    return Contest(f"{name}, {width} units", ROWS, "SAC", STEPS, None, runs)
 
 
 def a2c(steps: int, target: float) -> Contest:
@@ -207,4 +212,4 @@ def a2c(steps: int, target: float) -> Contest:
         return taken / STEPS
 
     runs = {"peer": run, "graph": ours(True), "ours": ours(False)}
-    return Contest("A2C, 64 units", steps * COPIES, "SB3", target, runs)
+    return Contest("A2C, 64 units", steps * COPIES, "SB3", STEPS, target, runs)

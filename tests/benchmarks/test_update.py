@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.arithmetic import flop_per_s, products_ms
 from benchmarks.contest import Contest
 from benchmarks.update_ppo import contest
 from millrace.learner.algorithms.kernels.mlp import SmallMLP
@@ -32,3 +33,12 @@ def test_ours_passes_in_numpy_and_graph_in_torch(monkeypatch: pytest.MonkeyPatch
             passes.clear()
             made.runs[name]()
             assert (len(passes) > 0) == (name == "ours"), made.title
+
+
+def test_the_products_of_an_update_are_counted() -> None:
+    """Forward, weights and inputs of three layers of an actor and a critic; features have no gradient."""
+    rows, units = 64, 8
+    made = contest(rows, None, width=units)
+    forward = [(4, units), (units, units), (units, 2), (4, units), (units, units), (units, 1)]
+    products = sum(3 * inputs * outputs for inputs, outputs in forward) - 2 * 4 * units
+    assert products_ms(made.runs["graph"], made.repeats) == pytest.approx(2 * rows * products / flop_per_s() * 1e3)
