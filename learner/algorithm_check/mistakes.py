@@ -132,7 +132,8 @@ def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
 
 def _with_batches(subject: Subject, found: list[str]) -> Subject:
     """The subject with batches that its own policy collected. Adds mistakes about gradient steps to `found`."""
-    algorithm, generator = subject.new(), np.random.default_rng(1)
+    algorithm = subject.new()
+    generator = np.random.default_rng(1)
     batches: list[Batch] = []
     pulses = [0]
 
@@ -171,7 +172,8 @@ def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
 def weights_are_copies(subject: Subject) -> Iterator[str]:
     """A worker may still be sent weights while the next update changes those of the learner."""
     algorithm = subject.new()
-    given, kept = algorithm.weights(), _weights(algorithm)
+    given = algorithm.weights()
+    kept = _weights(algorithm)
     for batch in subject.copies():
         algorithm.update(batch, _no_pulse)
     if first_difference(given, kept) is not None:
@@ -202,7 +204,8 @@ def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:
 
 def an_update_changes_no_batch(subject: Subject) -> Iterator[str]:
     """The recorder counts the batch after the update."""
-    algorithm, changed = subject.new(), set[str]()
+    algorithm = subject.new()
+    changed = set[str]()
     for batch, kept in zip(subject.copies(), subject.batches, strict=True):
         algorithm.update(batch, _no_pulse)
         for name in batch.__struct_fields__:
@@ -214,7 +217,9 @@ def an_update_changes_no_batch(subject: Subject) -> Iterator[str]:
 
 def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
     """They are the steps in which a finished copy is reset."""
-    one, other, generator = subject.new(), subject.new(), np.random.default_rng(2)
+    one = subject.new()
+    other = subject.new()
+    generator = np.random.default_rng(2)
     for batch in subject.copies():
         pairs = (
             one.update(copy.deepcopy(batch), _no_pulse),
@@ -254,11 +259,13 @@ def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[s
 def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterator[str]:
     """Save, load into a new object, and learn on: bit for bit as the one that was saved."""
     *first, second, third = subject.copies()
-    saved, restored = subject.new(), subject.new()
+    saved = subject.new()
+    restored = subject.new()
     for batch in first:
         saved.update(batch, _no_pulse)
     state = saved.state_dict()
-    kept, file = copy.deepcopy(state), io.BytesIO()
+    kept = copy.deepcopy(state)
+    file = io.BytesIO()
     if odd := _not_plain(state):
         yield f"state_dict{odd}: expected tensors, numbers, text, and lists and dicts of these; a checkpoint takes no more"
         return
@@ -292,11 +299,13 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
 def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
     """`roll_back` after a whole update and after one that stopped in the middle, and then the update that follows."""
     *first, second, third = subject.copies()
-    disturbed, undisturbed = subject.new(), subject.new()
+    disturbed = subject.new()
+    undisturbed = subject.new()
     for batch in first:
         disturbed.update(copy.deepcopy(batch), _no_pulse)
         undisturbed.update(batch, _no_pulse)
-    before, weights = copy.deepcopy(disturbed.state_dict()), _weights(disturbed)
+    before = copy.deepcopy(disturbed.state_dict())
+    weights = _weights(disturbed)
     disturbed.remember()
     for stop in (False, True, False):
         pulse = _stopping() if stop else _no_pulse
@@ -345,8 +354,10 @@ def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
 
 def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
     """The right action is what is observed. Random actions get a quarter of the reward of right ones."""
-    algorithm, generator = subject.new(LEARNING_STEPS), np.random.default_rng(4)
-    env_steps, rewards = 0, list[float]()
+    algorithm = subject.new(LEARNING_STEPS)
+    generator = np.random.default_rng(4)
+    env_steps = 0
+    rewards = list[float]()
     box = subject.policy.action.kind == "box"
     goal = math.nan
     while env_steps < LEARNING_STEPS:
@@ -420,7 +431,9 @@ def _seed_everything(seed: int) -> None:
 @contextmanager
 def _undisturbed() -> Iterator[None]:
     """One thread; afterwards the number of threads and all global random numbers are what they were."""
-    of_torch, of_numpy, of_python = torch.get_rng_state(), np.random.get_state(), random.getstate()
+    of_torch = torch.get_rng_state()
+    of_numpy = np.random.get_state()
+    of_python = random.getstate()
     try:
         with one_thread():
             yield

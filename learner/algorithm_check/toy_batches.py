@@ -24,7 +24,8 @@ ACTIONS = (
     ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2),
 )
 """The action spaces that an algorithm is tried with; the first that it can use is taken"""
-LANES, COPIES = 2, 4
+LANES = 2
+COPIES = 4
 GARBAGE_REWARD = 50.0  # on rows that are not valid
 
 
@@ -146,10 +147,12 @@ class _OtherColumns(NamedTuple):
 def _batch(acting: ToyActor, generator: np.random.Generator, obs: Array, rows: _OtherColumns, fresh: bool) -> Batch:
     """A batch in which the policy acts on these observations [T+1, ΣN, CHOICES]."""
     steps, columns = rows.valid.shape
-    policy, over = make_policy(acting.spec), distribution(acting.spec)
+    policy = make_policy(acting.spec)
+    over = distribution(acting.spec)
     policy.load(acting.parameters, acting.buffers)
     first = generator.uniform(-0.5, 0.5, (columns, acting.spec.state_size)).astype(np.float32)
-    state, params = first[None].copy(), []
+    state = first[None].copy()
+    params = []
     for observed, valid in zip(obs, rows.valid, strict=False):
         params.append(policy([observed[None]], state)[0])
         state[0, ~valid] = 0

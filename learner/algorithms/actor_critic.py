@@ -73,7 +73,8 @@ class ActorCritic(GradientDescent):
         self, config: PolicyGradientConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps)
-        self.net, self.seed = actor_critic_network(policy, device, seed), seed
+        self.net = actor_critic_network(policy, device, seed)
+        self.seed = seed
         if policy.action.kind == "box":
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
@@ -246,7 +247,9 @@ class ActorCritic(GradientDescent):
 
 def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> RecurrentInput:
     """The states before all T+1 steps. An episode begins after a step that resets; rows between those of a seat pass."""
-    begins, first, advances = ~batch.valid, np.zeros_like(batch.valid[:1]), None
+    begins = ~batch.valid
+    first = np.zeros_like(batch.valid[:1])
+    advances = None
     if batch.resets is not None:
         begins = np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
         advances = tensor(np.concatenate([batch.valid, first]))

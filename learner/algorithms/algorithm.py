@@ -42,7 +42,8 @@ class Start(NamedTuple):
         `weights` and `optimizers`: their names in the state. Of `parameters` and `target`, the first P act. Raises
         `ValueError` if a tensor has another shape or dtype than in the new algorithm.
         """
-        state, taken = self.state, dict[str, Any]()
+        state = self.state
+        taken = dict[str, Any]()
         if "observations" in state:
             taken["observations"] = state["observations"]
         if "rewards" in state and "rewards" in fresh:
@@ -51,7 +52,8 @@ class Start(NamedTuple):
             own = taken[name] = fresh[name].clone()
             found = state[name if self.critic else "parameters"]
             if not self.critic:
-                own, found = own[: self.acting], found[: self.acting]
+                own = own[: self.acting]
+                found = found[: self.acting]
             if (found.shape, found.dtype) != (own.shape, own.dtype):
                 raise ValueError(f"{name}: expected {own.dtype} {list(own.shape)}, got {found.dtype} {list(found.shape)}")
             own.copy_(found)

@@ -46,9 +46,11 @@ class CrossQ(NormalizedSAC):
         y is a constant; the statistics of the minibatch, to which s′ contributes, are not.
         """
         self.net.renormalizes = self.gradient_steps >= self.config.renormalize_after
-        joint, size = self.joint(rows), len(rows.x)
+        joint = self.joint(rows)
+        size = len(rows.x)
         both = self.net.outputs(joint.x, joint.action)[..., 0]  # [2, 2 B]
-        values, next_values = both[:, :size], both[:, size:].detach()
+        values = both[:, :size]
+        next_values = both[:, size:].detach()
         y = rows.reward + rows.discount * (next_values.amin(0) - self.temperature * joint.next_log_prob)
         error = values - y
         loss = 0.5 * (rows.weight * error.square()).mean(1).sum()

@@ -32,7 +32,9 @@ LOSSES = {"huber": losses.huber_loss, "squared": losses.squared_loss}
 
 def exploration_rate(config: DQNConfig, env_steps: int) -> float:
     """ε after `env_steps` env steps, summed over all env copies."""
-    start, end, done = config.epsilon_start, config.epsilon_end, env_steps / config.epsilon_steps
+    start = config.epsilon_start
+    end = config.epsilon_end
+    done = env_steps / config.epsilon_steps
     return end + (start - end) * (max(0.0, 1 - done) if config.epsilon_schedule == "linear" else math.exp(-done))
 
 
@@ -97,7 +99,8 @@ class DQN(OffPolicy):
         return metrics, found.error
 
     def _clip_gradient(self, norm: float) -> None:
-        config, gradient = self.config, self.net.flat_grad
+        config = self.config
+        gradient = self.net.flat_grad
         if config.max_grad_value is not None:
             gradient.clamp_(-config.max_grad_value, config.max_grad_value)
             norm = gradient.norm().item() if config.max_grad_norm is not None else norm

@@ -30,7 +30,8 @@ from millrace.protocol.specs import PolicySpec
 TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
 FAR = 100.0  # standard deviations
 FEW = 100  # rows: before there are so many, the scale is not known
-ROUNDING_32, ROUNDING_64 = 1e-6, 1e-12  # of float32 and float64: the same, as a fraction of the mean
+ROUNDING_32 = 1e-6  # of float32: the same, as a fraction of the mean
+ROUNDING_64 = 1e-12  # of float64
 
 
 class RunningMoments:
@@ -48,7 +49,8 @@ class RunningMoments:
         if not len(rows):
             return
         mean = rows.mean(0, dtype=np.float64)
-        distance, total = mean - self.mean, self.count + len(rows)
+        distance = mean - self.mean
+        total = self.count + len(rows)
         self._squares = self._squares + ((rows - mean) ** 2).sum(0) + distance**2 * (self.count * len(rows) / total)
         self.mean = self.mean + distance * (len(rows) / total)
         self.count = total
@@ -59,7 +61,8 @@ class RunningMoments:
 
         If the mean is so large that this rounding may be more than 1, it stands in place of 1.
         """
-        variance, rounding = self._squares / max(self.count, 1), self._rounding * abs(self.mean)
+        variance = self._squares / max(self.count, 1)
+        rounding = self._rounding * abs(self.mean)
         return np.where(variance > rounding**2 + TINY**2, np.sqrt(variance), np.maximum(rounding, 1.0))
 
     def state_dict(self) -> dict[str, Any]:
@@ -68,7 +71,8 @@ class RunningMoments:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self.count, shape = int(state["count"]), self.mean.shape
+        self.count = int(state["count"])
+        shape = self.mean.shape
         self.mean, self._squares = (np.broadcast_to(state[name].numpy(), shape).copy() for name in ("mean", "squares"))
 
 
@@ -153,7 +157,8 @@ class ObservationNormalizer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state)
-        first, D = state.get("first", torch.empty(0)), len(self._is_wide)
+        first = state.get("first", torch.empty(0))
+        D = len(self._is_wide)
         if len(first) and (len(first) >= FEW or first.shape[1:] != (D,)):
             raise ValueError(f"observations: expected fewer than {FEW} first rows of {D} numbers, got {list(first.shape)}")
         self._first = first.numpy().astype(np.float64).reshape(len(first), D)

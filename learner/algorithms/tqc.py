@@ -39,7 +39,8 @@ class TQC(SAC):
 
     def networks(self, device: str) -> ActorWithCritics:
         """See `Continuous`."""
-        config, relu = self.config, self.policy.activation == "relu"
+        config = self.config
+        relu = self.policy.activation == "relu"
         actor, critic = layer_sizes(self.policy, config.net, config.quantiles)
         return ActorWithCritics(
             MLPShape(1, actor, relu, output_gain=0.01),

@@ -80,7 +80,8 @@ class XQC(NormalizedSAC):
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
         """See `cross_entropy` and `target_distribution`: critics and targets see s, a and s′, a′ in one minibatch each."""
-        joint, size = self.joint(rows), len(rows.x)
+        joint = self.joint(rows)
+        size = len(rows.x)
         with torch.no_grad():
             next_logits = self.target.minibatch_outputs(joint.x, joint.action)[:, size:]
             target = self.target_distribution(rows, next_logits, joint.next_log_prob)

@@ -35,13 +35,18 @@ class BatchArrays:
         self.terminated: Array  # [N] bool
         self.truncated: Array  # [N] bool
         if memory is not None:
-            self._leaves, self.reward = memory.obs, memory.reward
-            self.terminated, self.truncated = memory.terminated, memory.truncated
+            self._leaves = memory.obs
+            self.reward = memory.reward
+            self.terminated = memory.terminated
+            self.truncated = memory.truncated
         else:
             self._leaves = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in spec.leaves)
-            self.reward, self.terminated, self.truncated = np.zeros(N), np.zeros(N, bool), np.zeros(N, bool)
+            self.reward = np.zeros(N)
+            self.terminated = np.zeros(N, bool)
+            self.truncated = np.zeros(N, bool)
         count = len(spec.observation)
-        self._observation, self._seats = self._leaves[:count], self._leaves[count:]
+        self._observation = self._leaves[:count]
+        self._seats = self._leaves[count:]
 
     def store(self, lane: int, answer: Stepped) -> None:
         """Write what a lane sent as a message."""

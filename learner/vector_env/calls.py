@@ -27,7 +27,9 @@ class CopyCalls:
 
     def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, known: Mapping[str, Any]) -> None:
         """`known`: attributes of every copy that are no plain data, and so cannot travel."""
-        self.known, self._send_recv, self._parts = known, send_recv, parts
+        self.known = known
+        self._send_recv = send_recv
+        self._parts = parts
 
     def call(self, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
         """Call, or get, the attribute of these copies. The results are in ascending order of the copies.
@@ -119,7 +121,8 @@ def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
     """What each of a lane's `count` copies is; None where the client cannot say it. Raises `BadMessage`."""
     if answer.error:
         return [None] * count
-    sent, found = unpack(answer.results.data), dict[tuple[bytes, ...], DescribedEnv]()
+    sent = unpack(answer.results.data)
+    found = dict[tuple[bytes, ...], DescribedEnv]()
     for frames in sent:
         if not isinstance(frames, list) or not all(type(frame) is bytes for frame in frames):
             raise BadMessage(f"expected the frames of a message, got {type(frames).__name__}")

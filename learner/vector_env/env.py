@@ -84,7 +84,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.DEFAULT
         self._info_reader = InfoReader(self._layout, hub.refuse_owner)
         count = self._layout.count
-        seeds, ever_reset = list[int | None]([None] * count), np.zeros(count, bool)
+        seeds = list[int | None]([None] * count)
+        ever_reset = np.zeros(count, bool)
         parts = VectorEnvParts(
             hub, self._layout, self._batch, LostLanes(), step.autoreset, seeds, ever_reset, on_worker_loss
         )
@@ -279,7 +280,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def _rows(self, ready: Ready, copies: list[int] | None = None) -> GymnasiumStep:
         """The rows of these copies, which came back, or of all."""
-        batch, some = self._batch, None if copies is None else self._layout.rows_of(copies)
+        batch = self._batch
+        some = None if copies is None else self._layout.rows_of(copies)
         rows = slice(None) if some is None else some
         truncated = batch.truncated.copy()
         if ready.losses:

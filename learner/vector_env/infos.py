@@ -31,7 +31,8 @@ class InfoReader:
 
     def __init__(self, layout: BatchLayout, refuse: Callable[[int, str], None]) -> None:
         """`refuse` is called with a lane whose infos cannot be read, and why."""
-        self._layout, self._refuse = layout, refuse
+        self._layout = layout
+        self._refuse = refuse
         self._warned: set[str] = set()  # keys of infos that arrived as their repr
 
     def by_row(self, ready: Ready) -> dict[int, Infos]:

@@ -83,13 +83,15 @@ class OrderCoordinator(Coordinator[Member]):
 
     def take_lost(self) -> dict[int, str]:
         """Lanes whose env copies were lost since the last call, and why."""
-        lost, self.lost = self.lost, {}
+        lost = self.lost
+        self.lost = {}
         return lost
 
     def raise_failures(self) -> None:
         """Raise `EnvironmentFailed` if an environment raised."""
         if self.failures:
-            failure, self.failures = self.failures[0], []
+            failure = self.failures[0]
+            self.failures = []
             raise EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
 
     def forget(self, lane: int) -> None:
@@ -118,7 +120,8 @@ class OrderCoordinator(Coordinator[Member]):
 
     def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
         """Send an order to a lane that was placed."""
-        member, record = self.owner(lane), self.lanes[lane]
+        member = self.owner(lane)
+        record = self.lanes[lane]
         assert member is not None
         self._tickets += 1
         order = make_order(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))

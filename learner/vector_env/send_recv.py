@@ -87,7 +87,9 @@ class SendRecv:
         Raises `TypeError` for options that are no plain data, and `UsageError` for a part of a lane whose copies were lost,
         with SameStep: no step resets them before their first episode.
         """
-        parts, layout, hub = self._parts, self._parts.layout, self._parts.hub
+        parts = self._parts
+        layout = self._parts.layout
+        hub = self._parts.hub
         layout.check(copies)
         by_lane = layout.by_lane(sorted(copies))
         self._check_back(by_lane)
@@ -119,12 +121,15 @@ class SendRecv:
         Raises `UsageError` for copies that must be reset first, and with `on_worker_loss="raise"` `WorkerLost` for copies
         that were lost. Then nothing is sent.
         """
-        parts, hub, lost_lanes = self._parts, self._parts.hub, self._parts.lost_lanes
+        parts = self._parts
+        hub = self._parts.hub
+        lost_lanes = self._parts.lost_lanes
         self._check_back(lanes)
         lost_lanes.add(hub.coordinator.take_lost())
         self._check_steppable(lanes)
         now, (arrays, fit), shared = self._watched.look(hub.now()), actions, []
-        unreported, awaiting_reset = lost_lanes.unreported, lost_lanes.awaiting_reset
+        unreported = lost_lanes.unreported
+        awaiting_reset = lost_lanes.awaiting_reset
         self._sent.send(lanes, Sent(Asked.STEP, now))
         for lane in lanes:
             if lane in unreported:
@@ -160,7 +165,8 @@ class SendRecv:
 
         Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`; then lanes that are ready stay so for the next call.
         """
-        sent, hub = self._sent, self._parts.hub
+        sent = self._sent
+        hub = self._parts.hub
         if not (out := sent.copies):
             raise NoAsyncCallError("recv without send before it", "send")
         if not 0 <= min_envs <= len(out):
@@ -176,7 +182,8 @@ class SendRecv:
 
     def recv_all(self, timeout_s: float | None = None) -> Ready:
         """Wait until every lane is ready, and take them. Raises as `recv`; then nothing is waited for any more."""
-        sent, hub = self._sent, self._parts.hub
+        sent = self._sent
+        hub = self._parts.hub
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         try:
             if self._parts.lost_lanes.unreported:
@@ -227,7 +234,8 @@ class SendRecv:
                 )
 
     def _check_steppable(self, lanes: Sequence[int]) -> None:
-        parts, lost_lanes = self._parts, self._parts.lost_lanes
+        parts = self._parts
+        lost_lanes = self._parts.lost_lanes
         if not self._all_were_reset:
             if never := [n for n in parts.layout.copies_of(lanes) if not parts.ever_reset[n]]:
                 raise UsageError(f"step before reset of copies {never}: call reset(), or reset_async() and recv(), first")
@@ -266,7 +274,8 @@ class SendRecv:
 
     def _stored(self, lane: int, answer: Stepped) -> bytes:
         """Write results that came as a message to the batch. Packed infos."""
-        parts, asked = self._parts, self._sent.sent[lane].asked
+        parts = self._parts
+        asked = self._sent.sent[lane].asked
         parts.batch.store(lane, answer)
         parts.lost_lanes.answered({lane})
         if isinstance(asked, AskedReset):
@@ -285,11 +294,14 @@ class SendRecv:
 
     def _handle_losses(self) -> None:
         """What becomes of the lanes that were lost while they were under way."""
-        parts, sent = self._parts, self._sent
+        parts = self._parts
+        sent = self._sent
         parts.lost_lanes.add(parts.hub.coordinator.take_lost())
-        unreported, under_way = parts.lost_lanes.unreported, sent.under_way if parts.lost_lanes.unreported else ()
+        unreported = parts.lost_lanes.unreported
+        under_way = sent.under_way if parts.lost_lanes.unreported else ()
         for lane in [lane for lane in unreported if lane in under_way and not parts.hub.is_ordered(lane)]:
-            copies, asked = parts.layout.copies(lane), sent.sent[lane].asked
+            copies = parts.layout.copies(lane)
+            asked = sent.sent[lane].asked
             match after_loss(sent.sent[lane], parts.autoreset, parts.on_worker_loss):
                 case AfterLoss.RAISE:
                     self._to_raise[lane] = parts.lost_lanes.unreported[lane]
@@ -312,7 +324,8 @@ class SendRecv:
 
     def _raise_losses(self) -> None:
         if self._to_raise:
-            lost, self._to_raise = self._to_raise, {}
+            lost = self._to_raise
+            self._to_raise = {}
             raise worker_lost(lost, self._parts.layout)
 
     def _warn(self, lane: int, why: str) -> None:

@@ -157,7 +157,9 @@ class SentLanes:
     def clear(self) -> list[int]:
         """Nothing is waited for any more. Returns the lanes that were under way."""
         dropped = self.under_way
-        self.sent, self._results, self._losses = {}, {}, {}
+        self.sent = {}
+        self._results = {}
+        self._losses = {}
         return dropped
 
     def overdue(self, now: float, timeout_s: float) -> list[int]:
@@ -167,7 +169,8 @@ class SentLanes:
     def take(self) -> Ready:
         """The lanes that are ready. They have come back now."""
         ready = Ready(dict(sorted(self._results.items())), self._losses)
-        self._results, self._losses = {}, {}
+        self._results = {}
+        self._losses = {}
         for lane in ready.results:
             del self.sent[lane]
         return ready

@@ -96,5 +96,6 @@ class VectorEnvSettings:
     @property
     def lane_sizes(self) -> tuple[int, ...]:
         """Number of copies of each lane."""
-        N, lanes = len(self.envs), self.lane_count
+        N = len(self.envs)
+        lanes = self.lane_count
         return (*(N // lanes + (lane < N % lanes) for lane in range(lanes)), *[1] * self.single_lanes)

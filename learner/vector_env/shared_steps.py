@@ -27,7 +27,9 @@ class SharedSteps:
         self.memory = memory
         self.under_way: dict[int, int] = {}
         """by lane: number of its order"""
-        self._to_workers, self._to_learner, self._spin_s = to_workers, to_learner, spin_s
+        self._to_workers = to_workers
+        self._to_learner = to_learner
+        self._spin_s = spin_s
         self.pipes: dict[int, WakePipe | None] = {}
         """by lane: what wakes its worker, if that worker has the memory"""
         self._spin = SpinWait()

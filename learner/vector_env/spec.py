@@ -97,7 +97,8 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
 
     `learner_timeout_s`: a worker that hears nothing from the learner for this long joins again. Raises `UsageError`.
     """
-    envs, lanes = settings.envs, settings.lane_count
+    envs = settings.envs
+    lanes = settings.lane_count
     N = len(envs)
     if not envs or (settings.num_envs is not None and settings.num_envs != N):
         raise UsageError(f"num_envs: expected at least 1 and, with a list, its length ({N}), got {settings.num_envs}")

@@ -94,7 +94,8 @@ def action_arrays(
     `read` takes the actions apart into one value for each of `leaves`. Raises `TypeError` for what are not numbers,
     `ValueError` for a wrong number of actions.
     """
-    arrays, fit = [], True
+    arrays = []
+    fit = True
     for leaf, value in zip(leaves, read(actions), strict=True):
         array = np.asarray(value)
         if array.ndim == 0 or len(array) != rows:

@@ -122,7 +122,8 @@ class StepHub:
 
         It has one if the wait for the answer was interrupted. The worker might execute it after the step.
         """
-        shared, coordinator = self.shared, self.coordinator
+        shared = self.shared
+        coordinator = self.coordinator
         if shared is None or (coordinator.orders and any(order.lane == lane for order in coordinator.orders.values())):
             return False
         if lane not in shared.pipes:
@@ -184,7 +185,8 @@ class StepHub:
         """
         self._patience_s = min(PATIENCE_S, timeout_s / 2)
         self._send_waiting_orders()
-        shared, due = self.shared, self.now() > self._listen_due_s
+        shared = self.shared
+        due = self.now() > self._listen_due_s
         if shared is None or not self._under_way or self._infos_to_come:
             self._turn(POLL_S)
             return

@@ -15,7 +15,8 @@ def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], 
 
     `of_run`: the status of the run that acts on its copies, if there is one: its figures, and the workers here.
     """
-    workers, members = coordinator.membership.status(now), coordinator.members.values()
+    workers = coordinator.membership.status(now)
+    members = coordinator.members.values()
     if of_run is not None:
         return replace(of_run(now), workers=workers)
     return Status(

@@ -54,7 +54,8 @@ class CalledPolicy:
         """Make it. `extras` are those of the run. `called`: what errors call it."""
         assert spec.own is not None
         self._called = called
-        self._spec, self._own = spec, spec.own
+        self._spec = spec
+        self._own = spec.own
         self._fields, _ = parameter_layout(spec)
         self._paths = [leaf.path for leaf in spec.observation]
         self._extras = (*extras, LOG_PROB) if spec.own.has_log_prob else extras

@@ -134,7 +134,8 @@ class Gaussian:
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """Log π(action) [...], summed over dimensions: −½ z² − log σ − ½ log 2π."""
-        mean, log_std = params[..., : self._size], params[..., self._size :]
+        mean = params[..., : self._size]
+        log_std = params[..., self._size :]
         z = (action.reshape(mean.shape) - mean) * np.exp(-log_std)
         return np.asarray((np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)).sum(-1))
 

@@ -79,7 +79,8 @@ class Squashed(_Bounded):
 
     def _latent(self, params: Floats, noise: Floats) -> Floats:
         """[..., D] the action before the tangent."""
-        mean, log_std = params[..., : self._size], params[..., self._size : -1]
+        mean = params[..., : self._size]
+        log_std = params[..., self._size : -1]
         return np.asarray(mean + np.exp(log_std) * noise[..., : self._size])
 
     def sample(self, params: Floats, noise: Floats) -> Array:
@@ -98,7 +99,8 @@ class Squashed(_Bounded):
         """
         if noise is None:
             raise ValueError("log_prob of a squashed action: expected the noise that it was sampled with, got none")
-        z, log_std = noise[..., : self._size], params[..., self._size : -1]
+        z = noise[..., : self._size]
+        log_std = params[..., self._size : -1]
         normal = np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)
         found = (normal - log_tanh_slope(self._latent(params, noise))).sum(-1)
         return np.where(params[..., -1] > 0, np.float32(-self._size * math.log(2)), found)

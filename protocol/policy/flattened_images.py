@@ -12,7 +12,8 @@ from millrace.protocol.specs import Leaf, PolicySpec
 
 LEAST_SIDE = 36  # pixels, from which on an image goes through three convolutions
 COLORS = (1, 3, 4)
-GRAY, STACKED = "gymnasium.wrappers:GrayscaleObservation", '"gymnasium.wrappers:FrameStackObservation(stack_size=4)"'
+GRAY = "gymnasium.wrappers:GrayscaleObservation"
+STACKED = '"gymnasium.wrappers:FrameStackObservation(stack_size=4)"'
 
 
 def flattened_images(policy: PolicySpec) -> Iterator[str]:

@@ -61,7 +61,8 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
     stack = NATURE if min(chw[1:]) >= 36 else SMALL
     height, width = chw[1:]
     for conv in stack:
-        height, width = conv.output_side(height), conv.output_side(width)
+        height = conv.output_side(height)
+        width = conv.output_side(width)
     return stack, (chw[0], chw[1], chw[2]), stack[-1].channels * height * width
 
 
@@ -151,7 +152,8 @@ def total_size(fields: Sequence[Field]) -> int:
 
 def named_views(flat: FlatT, fields: Sequence[Field]) -> dict[str, FlatT]:
     """A view of each field of a flat array or tensor, by name."""
-    found, at = dict[str, FlatT](), 0
+    found = dict[str, FlatT]()
+    at = 0
     for field in fields:
         count = math.prod(field.shape)
         found[field.name] = flat[at : at + count].reshape(field.shape)

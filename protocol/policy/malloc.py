@@ -11,7 +11,9 @@ import ctypes
 
 KEEP = 256 << 20  # bytes at the heap's end that are not given back
 LARGEST = 32 << 20  # bytes of an allocation that comes from the heap at all: the most that glibc takes
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+# The numbers that malloc.h gives these parameters.
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
 
 
 def keep_freed_memory() -> bool:

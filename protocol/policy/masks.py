@@ -58,7 +58,8 @@ class MaskedEpsilonGreedy(EpsilonGreedy):
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """log(ε / m + (1 − ε) [action is the best]) [...] with m allowed actions, at least −69."""
-        epsilon, count = params[..., -1], _allowed(params).sum(-1).astype(np.float32)
+        epsilon = params[..., -1]
+        count = _allowed(params).sum(-1).astype(np.float32)
         chance = epsilon / count + (1 - epsilon) * (action == self.mode(params))
         return np.asarray(np.log(np.maximum(chance, _TINY)), np.float32)
 

@@ -100,7 +100,8 @@ class MLPNode(torch.autograd.Function):
         refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
-        inputs, weights = ctx.saved_tensors[:half], ctx.saved_tensors[half:]
+        inputs = ctx.saved_tensors[:half]
+        weights = ctx.saved_tensors[half:]
         found: list[Tensor | None] = []
         for i in range(half - 1, 0, -1):
             found += [g.sum(0), g.t() @ inputs[i]]
@@ -125,7 +126,9 @@ class StackedMLP(torch.autograd.Function):
         for w, b in zip(hidden[::2], hidden[1::2], strict=True):
             x = torch.baddbmm(b.unsqueeze(1), x, w.mT)
             inputs.append(x.relu_() if relu else x.tanh_())
-        ctx.relu, ctx.layers_of, ctx.size = relu, layers_of, len(flat)
+        ctx.relu = relu
+        ctx.layers_of = layers_of
+        ctx.size = len(flat)
         ctx.save_for_backward(*inputs, *layers[::2])
         return torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
 
@@ -135,7 +138,8 @@ class StackedMLP(torch.autograd.Function):
         refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
-        inputs, weights = ctx.saved_tensors[:half], ctx.saved_tensors[half:]
+        inputs = ctx.saved_tensors[:half]
+        weights = ctx.saved_tensors[half:]
         _, _, trains, _ = ctx.needs_input_grad
         by_flat = g.new_zeros(ctx.size) if trains else None
         by_layers = [] if by_flat is None else ctx.layers_of(by_flat)
@@ -198,7 +202,8 @@ class FlatNetwork:
         acting, critic = parameter_layout(spec)
         self.spec = spec
         self.fields = (*acting, *critic)
-        self.acting_size, self.acting_fields = total_size(acting), len(acting)
+        self.acting_size = total_size(acting)
+        self.acting_fields = len(acting)
         self.flat = _initial(self.fields, seed).to(device)  # [P] float32: give this to the optimizer
         self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
         self.flat.grad = self.flat_grad
@@ -218,7 +223,8 @@ class FlatNetwork:
             view = self.parameters[f"encoder.{name}"]
             with torch.no_grad():
                 view.copy_(parameter)
-            parameter.data, parameter.grad = view.data, view.grad
+            parameter.data = view.data
+            parameter.grad = view.grad
             self.parameters[f"encoder.{name}"] = parameter
         return encoder
 
@@ -271,7 +277,9 @@ class FlatNetwork:
     def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
         """Inputs [T · C, D] -> the core's outputs [T · C, H] and its last state [C, S]; see `recurrent.py`."""
         weights = [self.parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
-        found, state, advances = [], recurrent.initial_state, recurrent.advances
+        found = []
+        state = recurrent.initial_state
+        advances = recurrent.advances
         keeps = recurrent.keep_state.unsqueeze(-1)
         for t, (step, keep) in enumerate(zip(x.view(*recurrent.keep_state.shape, -1), keeps, strict=True)):
             before = state = state * keep
@@ -291,7 +299,8 @@ class ActorCriticNetwork(FlatNetwork):
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
-        trunk, self._acting_features = hidden_names(spec), feature_size(spec)
+        trunk = hidden_names(spec)
+        self._acting_features = feature_size(spec)
         self._trunk = self.layers(trunk) if spec.shared_net else []
         self._actor = self.layers(["actor.out"] if spec.shared_net else [*trunk, "actor.out"])
         self._critic = self.layers(["critic.out"] if spec.shared_net else [*hidden_names(spec, "critic"), "critic.out"])
@@ -407,7 +416,8 @@ class ActorAndCritics(FlatNetwork):
     def _stacked(self, critics: int, flat: Tensor) -> list[Tensor]:
         """Weight [critics, out, in] and bias [critics, out] of each layer of the critics, as views of `flat` [C]."""
         each = flat.view(len(CRITICS), -1)[:critics]
-        views, at = [], 0
+        views = []
+        at = 0
         for field in self.fields:
             if field.name.startswith(f"{CRITICS[0]}."):
                 end = at + math.prod(field.shape)
@@ -435,7 +445,8 @@ class ActorAndCritics(FlatNetwork):
 
         `constant`: the critics get no gradient; the actions do. Use it for the loss of the actor.
         """
-        flat, layers = self.critics if constant else self._critics, partial(self._stacked, critics)
+        flat = self.critics if constant else self._critics
+        layers = partial(self._stacked, critics)
         out: Tensor = StackedMLP.apply(torch.cat((x, action), -1), self._relu, flat, layers)  # type: ignore[no-untyped-call]
         return out[..., 0]
 

@@ -20,7 +20,8 @@ MOST_LAYERS = 64
 
 def why_impossible(spec: PolicySpec) -> str:
     """Why no policy can be made of this, in one line; empty if one can."""
-    leaves, action = spec.observation, spec.action
+    leaves = spec.observation
+    action = spec.action
     paths = {leaf.path for leaf in leaves}
     if not leaves or len(leaves) > MAX_LEAVES or len(paths) < len(leaves):
         return f"observation: expected 1 to {MAX_LEAVES} arrays of different names, got {len(leaves)}"

@@ -47,7 +47,8 @@ def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Flo
 
     H = spec.core_size
     h = state[..., :H]
-    gates, remembered = linear("core.input", x), linear("core.state", h)
+    gates = linear("core.input", x)
+    remembered = linear("core.state", h)
     if spec.core == "lstm":
         gates += remembered
         take, forget, new, out = (gates[..., i * H : (i + 1) * H] for i in range(4))
@@ -56,7 +57,8 @@ def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Flo
         h[...] = _sigmoid(out) * np.tanh(c)
     else:
         both = _sigmoid(gates[..., : 2 * H] + remembered[..., : 2 * H])
-        reset, keep = both[..., :H], both[..., H:]
+        reset = both[..., :H]
+        keep = both[..., H:]
         new = np.tanh(gates[..., 2 * H :] + reset * remembered[..., 2 * H :])
         h[...] = new + keep * (h - new)
     return h.copy()

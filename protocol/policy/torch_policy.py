@@ -29,7 +29,8 @@ class TorchPolicy:
         """`together`: compute all lanes at once; the caller always passes all. `images`: precision for images."""
         self.spec = spec
         self._images_dtype = images
-        self._device, self._together = device, together
+        self._device = device
+        self._together = together
         with defaults_of_thread():
             self._net = network_of(spec, device)
         self._buffers: dict[str, Floats] = {}

@@ -172,7 +172,8 @@ class Continuous(OffPolicy):
         super().load_other_state(state)
         self._generator.set_state(state["noise"].clone())
         self._acts_at_once = state["acts_at_once"]
-        counted, config = dict(state["counted"]), self.config
+        counted = dict(state["counted"])
+        config = self.config
         self._learning_starts = counted.pop("learning_starts")
         self._counted = counted
         if (counted["updates_per_step"], self._learning_starts) != (config.updates_per_step, config.learning_starts):

@@ -26,7 +26,8 @@ def check_dataset_fits_memory(
     observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
 ) -> None:
     """Raise `UsageError` if a dataset of this size does not fit the free memory. It takes its own size, once."""
-    needed, free = memory_bytes(observation, size, prioritized, action, choices), available_bytes()
+    needed = memory_bytes(observation, size, prioritized, action, choices)
+    free = available_bytes()
     if free is not None and needed > free:
         raise UsageError(
             f"prior: {size} observations of the dataset take {needed / GIB:.1f} GiB, "
@@ -59,7 +60,8 @@ class MixedReplay(ReplayBuffer):
         )
         for batch in batches:
             prior.add(batch)
-        self.prior, self._prior_share = prior, share
+        self.prior = prior
+        self._prior_share = share
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
         """Draw transitions with replacement: all prior ones while there are no others. `beta`: as in `ReplayBuffer`."""
@@ -106,7 +108,8 @@ class MixedReplay(ReplayBuffer):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`, bit for bit. Raises ValueError if it has another size, or other prior data."""
-        had, has = state.get("prior", {}).get("rows", 0), 0 if self.prior is None else len(self.prior)
+        had = state.get("prior", {}).get("rows", 0)
+        has = 0 if self.prior is None else len(self.prior)
         if had != has:
             raise ValueError(f"prior: expected the dataset of the run with {had} transitions, got {has}")
         super().load_state_dict(state)

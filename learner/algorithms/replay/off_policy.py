@@ -167,7 +167,8 @@ class OffPolicy(GradientDescent):
     def load_other_state(self, state: dict[str, Any]) -> None:
         """See `GradientDescent`."""
         super().load_other_state(state)
-        self.gradient_steps, self.prior_gradient_steps = state["gradient_steps"], state["prior_gradient_steps"]
+        self.gradient_steps = state["gradient_steps"]
+        self.prior_gradient_steps = state["prior_gradient_steps"]
 
     def state_dict(self) -> dict[str, Any]:
         """See `GradientDescent`; with the replay buffer."""

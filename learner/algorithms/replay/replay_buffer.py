@@ -80,7 +80,8 @@ def check_fits_memory(
 
     A checkpoint makes such a copy. Arguments: see `memory_bytes`.
     """
-    needed, free = 2 * memory_bytes(observation, size, prioritized, action, choices), available_bytes()
+    needed = 2 * memory_bytes(observation, size, prioritized, action, choices)
+    free = available_bytes()
     if free is None or needed <= free:
         return
     fits = size * free // needed
@@ -148,7 +149,10 @@ class ReplayBuffer:
         self._check_memory(*self._content)
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
-        self._n_step, self._gamma, self._alpha, self._seed = n_step, gamma, alpha, seed
+        self._n_step = n_step
+        self._gamma = gamma
+        self._alpha = alpha
+        self._seed = seed
         self.generator = generator(seed, self._purpose)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], as `_obs`; made when the first masks come
@@ -181,7 +185,8 @@ class ReplayBuffer:
 
     def _add(self, batch: Batch, columns: slice, lane: int) -> None:
         obs = [leaf[:, columns] for leaf in batch.obs]  # [T+1, N, *leaf] each
-        valid, terminated = batch.valid[:, columns], batch.terminated[:, columns]
+        valid = batch.valid[:, columns]
+        terminated = batch.terminated[:, columns]
         most = valid.size + valid.shape[1]
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
@@ -287,7 +292,9 @@ class ReplayBuffer:
 
     def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
         """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot."""
-        reward, discount, at = row["reward"].astype(np.float64), self._gamma * ~row["terminated"], row["follows"]
+        reward = row["reward"].astype(np.float64)
+        discount = self._gamma * ~row["terminated"]
+        at = row["follows"]
         for _ in range(self._n_step - 1):
             row = self._row[at]
             going = row["is_row"]  # without a row, stay at this slot; a terminated row follows itself with discount 0
@@ -363,7 +370,8 @@ class ReplayBuffer:
         """Continue from a `state_dict`, bit for bit. Raises ValueError if it has another size."""
         if state["size"] != self.size:
             raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
-        self._written, self._highest = state["written"], state["highest"]
+        self._written = state["written"]
+        self._highest = state["highest"]
         used = min(self._written, self.size)
         self._is_row[used:] = False
         if "mask" in state["arrays"]:

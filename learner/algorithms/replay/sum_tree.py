@@ -42,7 +42,8 @@ class SumTree:
 
     def set(self, index: Ints, weight: npt.NDArray[Any] | float) -> None:
         """Set these weights, which must not be negative. If an index occurs twice, its last weight counts."""
-        nodes, i = self._nodes, index + self._size
+        nodes = self._nodes
+        i = index + self._size
         nodes[i] = weight
         for _ in range(self._depth):
             i = np.maximum(i >> 1, 1)
@@ -50,11 +51,14 @@ class SumTree:
 
     def find(self, mass: Doubles) -> Ints:
         """The indices where the cumulative sum of weights exceeds `mass` [B], each in [0, total); never one of weight 0."""
-        nodes, i, mass = self._nodes, np.ones(len(mass), np.int64), mass.copy()
+        nodes = self._nodes
+        i = np.ones(len(mass), np.int64)
+        mass = mass.copy()
         for _ in range(self._depth):
             inner = i < self._size
             child = np.where(inner, 2 * i, i)
-            left, right = nodes[child], nodes[np.where(inner, child + 1, child)]
+            left = nodes[child]
+            right = nodes[np.where(inner, child + 1, child)]
             to_right = inner & (mass >= left) & (right > 0)
             mass -= np.where(to_right, left, 0)
             i = child + to_right

@@ -58,7 +58,8 @@ from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
 STEPS = 32  # T of most checks
 TIMED_STEPS = 200  # T of a rollout that tells how fast the client is
-LONG_S, LONGEST_STEPS = 1.0, 50_000  # duration of a long rollout; its most steps
+LONG_S = 1.0  # duration of a long rollout
+LONGEST_STEPS = 50_000  # T of a long rollout, at most
 NET = (16, 16)
 LONG_NET = (256, 256)  # of long rollouts: a compiled client would make 50,000 steps by a small one in a few milliseconds
 EVALUATED_STEPS = 40
@@ -69,7 +70,8 @@ class Collecting:
     """A session of the collector profile, with the messages that checks need."""
 
     def __init__(self, learner: Learner, run: RunSpec) -> None:
-        self.learner, self.run = learner, run
+        self.learner = learner
+        self.run = run
         self._sequences = Counter[tuple[int, int]]()  # of the next permit, by lane and incarnation
 
     def random_parameters(self, seed: int) -> Floats:
@@ -194,7 +196,8 @@ def acts_as_its_policy_says(learner: Learner) -> Script[None]:
     session = yield from collecting(learner, normalize_observations=True)
     permit = session.permit()
     session.order(permit)
-    policy, drawn = session.run.policy, np.random.default_rng(1)
+    policy = session.run.policy
+    drawn = np.random.default_rng(1)
     of_boxes = np.array([leaf.kind == "box" for leaf in leaf_of_features(policy)])
     mean = np.where(of_boxes, drawn.normal(0, 0.05, of_boxes.size), 0)
     std = np.where(of_boxes, drawn.choice([0.003, 0.3], of_boxes.size), 1)
@@ -203,7 +206,8 @@ def acts_as_its_policy_says(learner: Learner) -> Script[None]:
 
 
 def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
-    text, within_s = f"the rollout of ticket {permit.ticket}", 2 * learner.settings.patience_s
+    text = f"the rollout of ticket {permit.ticket}"
+    within_s = 2 * learner.settings.patience_s
     yield from learner.takes_part(Rollout, rules.TICKETS, text, within_s=within_s)
 
 
@@ -242,7 +246,8 @@ def _repeats(one: Rollout, other: Rollout) -> bool:
 def keeps_rows(learner: Learner) -> Script[None]:
     """Rollouts in which episodes end."""
     session = yield from collecting(learner, steps=7)
-    ends, between = 0, False  # between: an episode ended in the last row of a rollout
+    ends = 0
+    between = False  # whether an episode ended in the last row of a rollout
     around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
     for _ in range(40):
         rollout = yield from session.collect()
@@ -338,7 +343,8 @@ def waits_for_weights(learner: Learner) -> Script[None]:
 def acts_under_the_named_version(learner: Learner) -> Script[None]:
     """The weights that a permit names were lost and come after newer ones. The watch compares the versions."""
     session = yield from collecting(learner)
-    older, newer = session.permit(), session.permit()
+    older = session.permit()
+    newer = session.permit()
     session.order(older, version=3)
     session.give(session.weights(5))
     text = f"no rollout of ticket {older.ticket} before the Weights of version 3, which it names"
@@ -352,7 +358,8 @@ def acts_under_the_named_version(learner: Learner) -> Script[None]:
 def holds_two_versions(learner: Learner) -> Script[None]:
     """Two permits of one lane under two versions; the weights of the second come first."""
     session = yield from collecting(learner)
-    first, second = session.permit(), session.permit()
+    first = session.permit()
+    second = session.permit()
     session.order(first, version=1)
     session.deal(second, version=2)
     session.give(session.weights(1))
@@ -364,7 +371,8 @@ def collects_in_order(learner: Learner) -> Script[None]:
     """The Collect of a rollout was lost; that of the next one has come, under weights that are held."""
     session = yield from collecting(learner)
     yield from session.collect()
-    lost, later = session.permit(), session.permit()
+    lost = session.permit()
+    later = session.permit()
     session.deal(later)
     text = f"no rollout of sequence {later.sequence} before that of sequence {lost.sequence}"
     yield from learner.quiet(Rollout, rules.IN_ORDER, text)
@@ -481,7 +489,8 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
 
 def _did(rollouts: Sequence[Rollout], n: int, seats: int) -> tuple[list[bytes], list[bytes]]:
     """The actions of a copy's first seat, empty in rows that are not valid, and the first observations of its episodes."""
-    actions, first = list[bytes](), n * seats
+    actions = list[bytes]()
+    first = n * seats
     firsts = [b"".join(leaf[0, first].tobytes() for leaf in rollouts[0].obs)]
     for rollout in rollouts:
         for t, resets in enumerate(resets_of(rollout)[:-1, n]):
@@ -499,7 +508,8 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     if _repeats(before, after):
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
         raise Broken(rules.INDEPENDENT, "other episodes in incarnation 2", got)
-    _, old = session.permit(incarnation=1), session.permit(incarnation=1)  # `old`: of the sequence that is next
+    session.permit(incarnation=1)
+    old = session.permit(incarnation=1)  # of the sequence that is next
     session.deal(old)
     yield from learner.quiet(Rollout, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
@@ -509,7 +519,8 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     """A lane goes to another worker while a ticket of it waits for weights."""
     session = yield from collecting(learner)
     yield from session.collect(session.permit(0))
-    lost, kept = session.permit(0), session.permit(1)
+    lost = session.permit(0)
+    kept = session.permit(1)
     session.order(lost, kept, version=2)
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     session.give(session.weights(2))
@@ -524,7 +535,8 @@ def releases_a_lane(learner: Learner) -> Script[None]:
 def closes_unlisted_lanes(learner: Learner) -> Script[None]:
     """A Release was lost; the next HeartbeatReply does not list the lane."""
     session = yield from collecting(learner)
-    lost, kept = session.permit(0), session.permit(1)
+    lost = session.permit(0)
+    kept = session.permit(1)
     session.order(lost, kept, version=2)
     learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
     yield from heartbeats(learner, 3)
@@ -674,7 +686,8 @@ def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
 def ends_evaluations(learner: Learner) -> Script[None]:
     """The order of a later evaluation ends the one before, whose weights never came. An older evaluation is of use too."""
     session = yield from collecting(learner)
-    over, order = _evaluation(learner, version=3), _evaluation(learner, version=2)
+    over = _evaluation(learner, version=3)
+    order = _evaluation(learner, version=2)
     learner.send(over)
     yield from _evaluate(session, order)
     found = yield from heartbeats(learner, 1)
@@ -699,7 +712,8 @@ def _evaluation(
     send_rows: bool = False,
     seeds: tuple[int, ...] = (1, 2),
 ) -> Evaluate:
-    kept, ticket = learner.watch.to_keep(version), next(learner.tickets)
+    kept = learner.watch.to_keep(version)
+    ticket = next(learner.tickets)
     return Evaluate(learner.session, ticket, version, seeds, greedy, most_steps, send_rows, False, keep=kept)
 
 
@@ -723,7 +737,9 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     waits = session.permit(1)
     session.order(waits, version=9)
     learner.send(Drain("the run is over"))
-    early, drained_s, beat_s = set(learner.watch.answers), learner.now, learner.settings.heartbeat_s
+    early = set(learner.watch.answers)
+    drained_s = learner.now
+    beat_s = learner.settings.heartbeat_s
     within_s = 2 * learner.settings.patience_s
     text = "Goodbye after Drain"
     goodbye = yield from learner.expect((Rollout, Goodbye), rules.DRAIN, text, within_s=within_s)

@@ -43,7 +43,8 @@ from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.protocol.wire.learner_link import LearnerLink
 
 ADDRESS_VARIABLE = "MILLRACE_ADDRESS"
-ADDRESS_WORD, TOKEN_WORD = "{address}", "{token}"
+ADDRESS_WORD = "{address}"
+TOKEN_WORD = "{token}"
 POLL_S = 0.05
 STOP_WITHIN_S = 4.0  # after SIGTERM, before SIGKILL
 LISTEN_WITHIN_S = 3.0  # the port of a socket that was closed may be taken for a moment
@@ -107,7 +108,8 @@ class _Port:
     """The learner's socket, which can be closed and opened again at the same address."""
 
     def __init__(self, with_keys: bool) -> None:
-        self._resources, self._socket = ExitStack(), ExitStack()
+        self._resources = ExitStack()
+        self._socket = ExitStack()
         self.token: Path | None = None
         self._keyring: Keyring | None = None
         if with_keys:

@@ -131,7 +131,8 @@ class Examiner:
     ) -> None:
         name = self._checks[len(self.results)].name
         self.results.append(CheckResult(name, outcome, self.learner.now - self._began_s, rule, expected, got, note))
-        self._script, self._due_s = None, self.learner.now
+        self._script = None
+        self._due_s = self.learner.now
         if self.done and self.learner.runs:
             self.learner.do(EndClient())
 

@@ -46,7 +46,8 @@ class LaneRows:
         last = self._last
         ended = np.zeros(self._run.copies, bool) if last is None else resets_of(last)[-1]
         if (wrong := resets_of(rollout)[0] != ended).any():
-            n, flag = int(np.argmax(wrong)), "resets" if self._run.seats else "valid"
+            n = int(np.argmax(wrong))
+            flag = "resets" if self._run.seats else "valid"
             raise Broken(
                 rules.FIRST_RESETS if self._run.seats else rules.FIRST_VALID,
                 f"{flag}[0] {ended[n] == bool(self._run.seats)} in copy {n} of sequence {rollout.sequence}: "
@@ -65,7 +66,8 @@ class LaneRows:
             raise Broken(rules.ROWS, "reward 0 in rows that are not valid", f"{rollout.reward[~rollout.valid].max()}")
 
     def _check_episodes(self, rollout: Rollout) -> None:
-        run, expected = self._run, list[tuple[float, int]]()
+        run = self._run
+        expected = list[tuple[float, int]]()
         reward = np.where(rollout.valid, rollout.reward.astype(np.float64), 0.0).reshape(-1, run.copies, run.seats_of_copy)
         for of_step, resets, over in zip(reward, resets_of(rollout), resets_of(rollout)[1:], strict=False):
             self._return += of_step.sum(1)
@@ -97,7 +99,8 @@ class LaneRows:
         # What a seat did that waited when the rollout began may be of older weights.
         known = rollout.valid & (rollout.valid.cumsum(0) > 1) if self._run.takes_turns else rollout.valid
         params = params_of(self._run, weights, [leaf[:-1][known][None] for leaf in rollout.obs])
-        action, got = rollout.action[known], rollout.log_prob[known]
+        action = rollout.action[known]
+        got = rollout.log_prob[known]
         expected = distribution(self._run.policy).log_prob(params, action[None])[0]
         apart = np.abs(expected - got)
         if (apart > LOG_PROB_TOLERANCE * np.maximum(1.0, np.abs(expected))).any():

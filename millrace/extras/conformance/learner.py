@@ -137,7 +137,8 @@ class Learner:
         for effect in effects:
             match effect:
                 case StartClient():
-                    self.runs, self.is_mute = True, not self.peer
+                    self.runs = True
+                    self.is_mute = not self.peer
                 case EndClient():
                     self._forget_process()
                 case CutConnection() if self._watch is not None:
@@ -158,7 +159,9 @@ class Learner:
                 raise Broken(_rule_of_unreadable(str(error)), "a message that can be read", str(error))
             case Heard(peer, Hello() as hello) if self.runs and (self.hello is None or peer == self.peer):
                 self._take_hello(hello, is_wanted=wanted(event))
-                self.peer, self.hello, self.is_mute = peer, hello, False
+                self.peer = peer
+                self.hello = hello
+                self.is_mute = False
                 return wanted(event)
             case Heard(_, Hello() | Alive() | Inquire() | BadMessage()):
                 return False  # of a supervisor, of a process that was ended, or of a second worker of the same command
@@ -167,8 +170,12 @@ class Learner:
         return False
 
     def _forget_process(self) -> None:
-        self.runs, self.hello, self._watch = False, None, None
-        self.may_leave, self._had_a_session, self._steps = False, False, 0
+        self.runs = False
+        self.hello = None
+        self._watch = None
+        self.may_leave = False
+        self._had_a_session = False
+        self._steps = 0
 
     def _take_hello(self, hello: Hello, is_wanted: bool) -> None:
         if self.hello is not None and hello.process_nonce != self.hello.process_nonce and not self.may_leave:
@@ -178,7 +185,8 @@ class Learner:
         if self.hello is not None and hello.attempt == self.hello.attempt:
             self.send(self._watch.welcome)
         elif self.may_leave or is_wanted:
-            self._watch, self.may_leave = None, False
+            self._watch = None
+            self.may_leave = False
         else:
             raise Broken(rules.SILENT, "the client to stay in its session while the learner answers", brief(hello))
 

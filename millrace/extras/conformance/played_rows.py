@@ -28,7 +28,9 @@ class PlayedRows:
         """whether its Evaluated has come"""
         self.rows: list[list[EpisodeRows]] = [[] for _ in order.seeds]
         """by episode"""
-        self._order, self._run, self._weights = order, run, weights
+        self._order = order
+        self._run = run
+        self._weights = weights
 
     def see_rows(self, rows: EpisodeRows) -> None:
         """Check the next rows of an episode. Raises `Broken`."""
@@ -50,7 +52,8 @@ class PlayedRows:
 
     def see_answer(self, answer: Evaluated) -> None:
         """Check the end of the answer. Raises `Broken`."""
-        order, k = self._order, len(self.rows)
+        order = self._order
+        k = len(self.rows)
         if not len(answer.episodes) == len(answer.cut) == k:
             raise Broken(rules.EVALUATE, f"{k} episodes for {k} seeds", f"{len(answer.episodes)}")
         for n, (episode, cut) in enumerate(zip(answer.episodes, answer.cut, strict=True)):
@@ -96,9 +99,11 @@ class PlayedRows:
     def _against_the_best(self, rows: EpisodeRows) -> tuple[Array, Array, Array]:
         """For each row: the largest log-probability, how much lower that of the action is, and whether it is the mode."""
         params = params_of(self._run, self._weights, [leaf[:-1, None] for leaf in rows.obs])
-        policy, action = distribution(self._run.policy), rows.action[:, None]
+        policy = distribution(self._run.policy)
+        action = rows.action[:, None]
         mode = policy.mode(params)
-        best, found = policy.log_prob(params, mode)[:, 0], policy.log_prob(params, action)[:, 0]
+        best = policy.log_prob(params, mode)[:, 0]
+        found = policy.log_prob(params, action)[:, 0]
         return best, best - found, np.isclose(action, mode).reshape(len(action), -1).min(-1)
 
     def first_observation(self, n: int) -> bytes:

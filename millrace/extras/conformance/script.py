@@ -23,7 +23,9 @@ class Broken(Exception):
 
     def __init__(self, rule: Rule, expected: str, got: str) -> None:
         super().__init__(f"{rule.text}: expected {expected}, got {got}")
-        self.rule, self.expected, self.got = rule, expected, got
+        self.rule = rule
+        self.expected = expected
+        self.got = got
 
 
 class Skipped(Exception):

@@ -193,13 +193,16 @@ def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
     So the last observation of an episode and the first one of the next are known.
     """
     steps = yield from stepping(learner)
-    row, actions = (yield from steps.do(steps.reset())), list[tuple[Array, ...]]()
+    row = yield from steps.do(steps.reset())
+    actions = list[tuple[Array, ...]]()
     while not (ended := row.terminated | row.truncated).any():
         if len(actions) > WALK_STEPS:
             raise Skipped(f"no episode ended in {WALK_STEPS} steps")
         actions.append(steps.random_actions(steps.spec.lanes[0]))
         row = yield from steps.do(steps.step(actions=actions[-1]))
-    n, last, first = int(np.argmax(ended)), row, (yield from steps.do(steps.step(actions=actions[-1])))
+    n = int(np.argmax(ended))
+    last = row
+    first = yield from steps.do(steps.step(actions=actions[-1]))
     steps = yield from stepping(learner, mode=mode)
     order = steps.reset()
     learner.send(order)
@@ -276,7 +279,8 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
     row = yield from steps.do(steps.reset())
     length = np.zeros(steps.spec.lanes[0], int)
     for _ in range(3 * longest):
-        before, row = row, (yield from steps.do(steps.step(actions=act(row))))
+        before = row
+        row = yield from steps.do(steps.step(actions=act(row)))
         length = np.where(before.terminated | before.truncated, 0, length + 1)
         _within(longest, length, row)
         early = row.truncated & ~row.terminated & (length < longest) & (length > 0)
@@ -334,7 +338,8 @@ def keeps_copies_apart(learner: Learner) -> Script[None]:
         )
         return [first, *rest]
 
-    first, second = (yield from play([0] * N)), (yield from play([1] * N))
+    first = yield from play([0] * N)
+    second = yield from play([1] * N)
     alone = (first, second)
     mixed = yield from play([n % 2 for n in range(N)])
     for t, row in enumerate(mixed):

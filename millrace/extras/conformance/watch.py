@@ -68,7 +68,8 @@ class WatchedSession:
     def __init__(self, welcome: Welcome, now: float, steps: int = 0, *, is_first: bool = True) -> None:
         """`steps`: env steps that the process has reported in earlier sessions. `is_first`: it had none."""
         self.welcome = welcome
-        self.session, self.run = welcome.session, welcome.run
+        self.session = welcome.session
+        self.run = welcome.run
         self._is_first_session = is_first
         self.heard_heartbeat_s = now
         self.heartbeat: Heartbeat | None = None
@@ -219,7 +220,8 @@ class WatchedSession:
 
     def _see_heartbeat(self, message: Heartbeat, now: float) -> None:
         self.heard_heartbeat_s = now
-        before, self.heartbeat = self.heartbeat, message
+        before = self.heartbeat
+        self.heartbeat = message
         if message.replies > self.replies:
             raise Broken(
                 rules.HEARTBEAT_REPLIES, f"at most {self.replies}, the last reply of this session", f"{message.replies}"
@@ -280,7 +282,8 @@ class WatchedSession:
 
     def _see_played(self, message: Evaluated | EpisodeRows, order: Evaluate) -> None:
         assert isinstance(self.run, RunSpec)
-        ticket, is_answer = order.ticket, isinstance(message, Evaluated)
+        ticket = order.ticket
+        is_answer = isinstance(message, Evaluated)
         if self._answered[ticket] == self._asked[ticket]:
             rule = rules.EVALUATE_ONCE if is_answer else rules.ROWS_FIRST
             raise Broken(
@@ -328,7 +331,8 @@ class WatchedSession:
         """Whether its ticket was not answered before. The rules: for too many answers, and for one that differs."""
         ticket = message.ticket
         self._answered[ticket] += 1
-        asked, answered = self._asked[ticket], self._answered[ticket]
+        asked = self._asked[ticket]
+        answered = self._answered[ticket]
         if answered > asked:
             raise Broken(too_often, f"answers to ticket {ticket} as often as it was sent: {asked}", f"{answered} answers")
         first = self.answers.setdefault(ticket, message)

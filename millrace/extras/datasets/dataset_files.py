@@ -30,9 +30,11 @@ from millrace.protocol.envs.spaces import STORED_KINDS, action_spec, observation
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import ActionSpec, Leaf
 
-METADATA, ARRAYS = "metadata.json", "main_data.hdf5"
+METADATA = "metadata.json"
+ARRAYS = "main_data.hdf5"
 MOST_METADATA_BYTES = 1 << 24  # it has two bounds of each element of a space
-REWARD, END = Leaf("", "box", (), "float32"), Leaf("", "box", (), "bool")
+REWARD = Leaf("", "box", (), "float32")
+END = Leaf("", "box", (), "bool")
 
 
 class StoredEpisode(NamedTuple):
@@ -62,7 +64,8 @@ class DatasetFiles:
 
     def __init__(self, name: str, folder: Path) -> None:
         """`name` begins each message; `folder` has the two files. Raises `UsageError` if the dataset cannot be used."""
-        self._name, self._folder = name, folder
+        self._name = name
+        self._folder = folder
         with self._as_usage_error(METADATA):
             if not stat.S_ISDIR(folder.lstat().st_mode):
                 raise ValueError(f"{folder}: expected a folder, got a link or a file")
@@ -73,7 +76,8 @@ class DatasetFiles:
             self._action_space = self._space("action_space", metadata.action_space)
         self.observation = observation_leaves(self._observation_space)
         self.action = action_spec(self._action_space)
-        self.rows, self.episodes = metadata.total_steps, metadata.total_episodes
+        self.rows = metadata.total_steps
+        self.episodes = metadata.total_episodes
         """number of steps, and of episodes"""
         self._has_jpeg = metadata.jpeg_encoding
         self._check_counts()
@@ -167,7 +171,8 @@ def _read(stored: Any, rows: int, leaf: Leaf | ActionSpec) -> Array:
     shape = (rows, *leaf.shape)
     dtype = stored.dtype
     if stored.shape != shape or dtype.kind not in STORED_KINDS:
-        expected, got = f"{leaf.dtype}{list(shape)}", f"{dtype}{list(stored.shape)}"
+        expected = f"{leaf.dtype}{list(shape)}"
+        got = f"{dtype}{list(stored.shape)}"
         raise UnfitFile(f"{stored.name}: expected {expected}, got {got}")
     raw: Array = stored[()]
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
@@ -193,7 +198,8 @@ def _read_images(stored: Any, shape: tuple[int, ...]) -> Array:
         except UnidentifiedImageError:
             raise UnfitFile(f"{stored.name}: expected JPEG images, got others") from None
         if (image.size, image.mode) != ((width, height), mode):
-            expected, got = f"{mode} of {width} × {height}", f"{image.mode} of {image.width} × {image.height}"
+            expected = f"{mode} of {width} × {height}"
+            got = f"{image.mode} of {image.width} × {image.height}"
             raise UnfitFile(f"{stored.name}: expected images {expected} pixels, got {got}")
         images[row] = np.asarray(image)
     return images

@@ -38,7 +38,8 @@ class Demonstrations(NamedTuple):
         rows: list[tuple[Array, ...]] = []
         start = 0
         for batch in batches:
-            steps, nothing = np.arange(len(batch.action)), np.zeros((len(batch.action) + 1, 1), np.float32)
+            steps = np.arange(len(batch.action))
+            nothing = np.zeros((len(batch.action) + 1, 1), np.float32)
             end = start + len(steps)
             returns = gae(scaled(batch.reward), nothing, EpisodeEnds.of(batch), gamma, 1.0)[:, 0]
             discount = (~batch.terminated[-1] * gamma ** (len(steps) - steps)).astype(np.float32)

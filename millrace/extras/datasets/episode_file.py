@@ -97,7 +97,8 @@ class _RememberingFile(io.RawIOBase):
         found = os.pread(self._descriptor, len(wanted), self._at)
         wanted[:] = found.ljust(len(wanted), b"\0")
         for at, data in self._unwritten:
-            begin, end = max(at, self._at), min(at + len(data), self._at + len(wanted))
+            begin = max(at, self._at)
+            end = min(at + len(data), self._at + len(wanted))
             if begin < end:
                 wanted[begin - self._at : end - self._at] = data[begin - at : end - at]
         return len(wanted)

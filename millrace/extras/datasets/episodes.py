@@ -104,7 +104,8 @@ class EpisodeAssembler:
             lane = _LaneState(incarnation, rollout.sequence, [[] if one else None for one in begins])
             self._lanes[rollout.lane] = lane
         else:
-            waiting, continued = lane.waiting, lane.continued_by(rollout)
+            waiting = lane.waiting
+            continued = lane.continued_by(rollout)
             lane.running = [one if continued[n] else None for n, one in enumerate(lane.running)]
             self.left_out += waiting - lane.waiting
         ends = [end for n in range(len(lane.running)) for end in self._column(rollout, lane, n)]
@@ -116,8 +117,10 @@ class EpisodeAssembler:
     def _column(self, rollout: Rollout, lane: _LaneState, n: int) -> list[tuple[int, RecordedEpisode]]:
         """The episodes of env copy `n` that end in this rollout, each with the step of its end."""
         done = []
-        start, steps = 0, len(rollout.reward)
-        valid, ended = rollout.valid[:, n], rollout.terminated[:, n] | rollout.truncated[:, n]
+        start = 0
+        steps = len(rollout.reward)
+        valid = rollout.valid[:, n]
+        ended = rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
             if not valid[t]:  # the next row begins an episode; after the first row, only if it was to reset the copy
                 lane.running[n], start = [] if t else lane.running[n], t + 1

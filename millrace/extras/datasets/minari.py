@@ -48,12 +48,15 @@ class MinariDataset:
             ) from None
         if slashed := next((key for key in _keys(env.observation_space) if "/" in key), None):
             raise UsageError(f"dataset {dataset_id}: Minari cannot keep an observation whose key has a slash, {slashed}")
-        root, self._folder = get_dataset_path(), get_dataset_path(dataset_id)
+        root = get_dataset_path()
+        self._folder = get_dataset_path(dataset_id)
         if self._folder.exists():
             raise UsageError(f"dataset {dataset_id} is there already, at {self._folder}; choose another name or version")
         self._namespaces = self._folder.parents[: len(self._folder.relative_to(root).parts) - 1]  # innermost first
         self._new_folders = [folder for folder in self._namespaces if not folder.exists()]
-        self._id, self._env, self._about = dataset_id, env, about
+        self._id = dataset_id
+        self._env = env
+        self._about = about
         self._storage: Any = None  # the dataset's files, once an episode is to be written
         self._episodes = self._steps = 0  # that are in them
         self._chunk: list[Any] = []
@@ -118,7 +121,8 @@ class MinariDataset:
         except Exception as error:
             says = first_line(error, "")
             raise RunError(f"dataset {self._id} was not written: {type(error).__name__}: {says}") from error
-        self._chunk, self._chunk_bytes = [], 0
+        self._chunk = []
+        self._chunk_bytes = 0
 
     def _new_storage(self) -> Any:
         """The dataset's files, without an episode."""

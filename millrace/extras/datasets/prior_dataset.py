@@ -31,7 +31,8 @@ class PriorDataset(PriorData):
 
     def __init__(self, dataset_id: str, policy: PolicySpec) -> None:
         """Raises `UsageError` if there is no such dataset, if it does not fit the policy, or if Minari is not installed."""
-        self._id, self._policy = dataset_id, policy
+        self._id = dataset_id
+        self._policy = policy
         self._files = _open(dataset_id)
         self._check_spaces()
         if not self.rows:
@@ -92,7 +93,8 @@ class PriorDataset(PriorData):
         )
 
     def _check_spaces(self) -> None:
-        files, policy = self._files, self._policy
+        files = self._files
+        policy = self._policy
         for what, expected, got in (
             ("observations", policy.observation, files.observation),
             ("actions", (policy.action,), (files.action,)),

@@ -81,7 +81,9 @@ class EnvironmentOfDataset(gymnasium.Env[Any, Any]):
 
     def __init__(self, env: DescribedEnv, *, masked: bool = False) -> None:
         """`env`: the environment as a worker described it. `masked`: a mask in its observations is not recorded."""
-        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.observation_space = env.observation_space
+        self.action_space = env.action_space
         if masked:
             self.observation_space = without_mask(env.observation_space, env.action_space)
-        self.metadata, self.spec = env.metadata, env.spec
+        self.metadata = env.metadata
+        self.spec = env.spec

@@ -25,7 +25,9 @@ from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, fi
 AT_ONCE = 2  # episodes whose frames are in memory
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
 FRAMES_PER_S = 30  # if the environment names no rate
-LEAST_FRAMES_PER_S, MOST_FRAMES_PER_S = 0.01, 1_000  # what it names is what a worker says; moviepy writes two decimals
+# Bounds of the rate that an environment names, which a worker sends. moviepy writes two decimals.
+LEAST_FRAMES_PER_S = 0.01
+MOST_FRAMES_PER_S = 1_000
 FOLDER = "videos"
 
 

@@ -22,9 +22,12 @@ from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObserva
 
 from millrace.protocol.errors import UsageError
 
-FRAMES, SKIP, SIDE = 4, 4, 84
+FRAMES = 4
+SKIP = 4
+SIDE = 84
 MAX_FRAMES = 108_000  # in a game: half an hour of play
-NOOP, FIRE = 0, 1  # actions
+NOOP = 0  # an action
+FIRE = 1  # an action
 JOYSTICK_FIRE = np.array([0, 0, 1], np.float32)  # of a game with continuous actions: radius, angle, fire
 
 
@@ -138,12 +141,14 @@ class _FiresAfterLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         first = self.env.reset(seed=seed, options=options)
-        self._lives, self._fires = _lives_left(self.env), False
+        self._lives = _lives_left(self.env)
+        self._fires = False
         return first
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         result = self.env.step(FIRE if self._fires else action)
-        before, self._lives = self._lives, _lives_left(self.env)
+        before = self._lives
+        self._lives = _lives_left(self.env)
         self._fires = self._lives < before
         return result
 
@@ -181,7 +186,8 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._goes_on = False  # whether a life was lost in the newest step, and the game did not end
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        goes_on, self._goes_on = self._goes_on and seed is None, False
+        goes_on = self._goes_on and seed is None
+        self._goes_on = False
         if goes_on:
             observation, _, terminated, truncated, info = self.env.step(NOOP)
             goes_on = not (terminated or truncated)
@@ -192,7 +198,8 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        before, self._lives = self._lives, _lives_left(self.env)
+        before = self._lives
+        self._lives = _lives_left(self.env)
         life_lost = self._lives < before
         self._goes_on = life_lost and not (terminated or truncated)
         return observation, reward, terminated or life_lost, truncated, info
@@ -216,9 +223,12 @@ class _StepAfterLives(VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        plays, ends = ~self._ended, terminated | truncated
-        terminated, truncated = (terminated & plays) | self._hidden, truncated & plays
-        self._ended, self._hidden = terminated | truncated, ends & ~plays
+        plays = ~self._ended
+        ends = terminated | truncated
+        terminated = (terminated & plays) | self._hidden
+        truncated = truncated & plays
+        self._ended = terminated | truncated
+        self._hidden = ends & ~plays
         return observation, np.where(plays, reward, 0), terminated, truncated, info
 
 

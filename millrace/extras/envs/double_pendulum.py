@@ -54,25 +54,40 @@ class Physics:
 
 def accelerations(physics: Physics) -> Accelerations:
     """The function (θ, φ, ẋ, θ̇, φ̇, F) -> (ẍ, θ̈, φ̈): solves M(q) q̈ = (F − friction · ẋ, 0, 0) − c(q, q̇)."""
-    sin, cos, friction = math.sin, math.cos, physics.friction_Ns_m
+    sin = math.sin
+    cos = math.cos
+    friction = physics.friction_Ns_m
     ml = physics.link_kg * physics.link_m
-    ml2, mgl = ml * physics.link_m, ml * physics.gravity_m_s2
-    m11, m22, m33 = physics.cart_kg + 2 * physics.link_kg, 2 * ml2 + physics.inertia_kgm2, ml2 + physics.inertia_kgm2
+    ml2 = ml * physics.link_m
+    mgl = ml * physics.gravity_m_s2
+    m11 = physics.cart_kg + 2 * physics.link_kg
+    m22 = 2 * ml2 + physics.inertia_kgm2
+    m33 = ml2 + physics.inertia_kgm2
     m22_m33 = m22 * m33
 
     def solve(
         theta: float, phi: float, x_dot: float, theta_dot: float, phi_dot: float, force: float
     ) -> tuple[float, float, float]:
-        sin_theta, cos_theta, sin_phi, cos_phi = sin(theta), cos(theta), sin(phi), cos(phi)
-        m12, m13 = 2 * ml * cos_theta, ml * cos_phi
+        sin_theta = sin(theta)
+        cos_theta = cos(theta)
+        sin_phi = sin(phi)
+        cos_phi = cos(phi)
+        m12 = 2 * ml * cos_theta
+        m13 = ml * cos_phi
         m23 = ml2 * (cos_theta * cos_phi + sin_theta * sin_phi)
         turning = ml2 * (sin_theta * cos_phi - cos_theta * sin_phi)
-        theta_dot2, phi_dot2 = theta_dot * theta_dot, phi_dot * phi_dot
+        theta_dot2 = theta_dot * theta_dot
+        phi_dot2 = phi_dot * phi_dot
         f1 = force - friction * x_dot + ml * (2 * sin_theta * theta_dot2 + sin_phi * phi_dot2)
         f2 = 2 * mgl * sin_theta - turning * phi_dot2
         f3 = mgl * sin_phi + turning * theta_dot2
-        a11, a12, a13 = m22_m33 - m23 * m23, m13 * m23 - m12 * m33, m12 * m23 - m13 * m22  # cofactors: M is symmetric
-        a22, a23, a33 = m11 * m33 - m13 * m13, m12 * m13 - m11 * m23, m11 * m22 - m12 * m12
+        # The cofactors of M, which is symmetric.
+        a11 = m22_m33 - m23 * m23
+        a12 = m13 * m23 - m12 * m33
+        a13 = m12 * m23 - m13 * m22
+        a22 = m11 * m33 - m13 * m13
+        a23 = m12 * m13 - m11 * m23
+        a33 = m11 * m22 - m12 * m12
         scale = 1 / (m11 * a11 + m12 * a12 + m13 * a13)
         return (
             (a11 * f1 + a12 * f2 + a13 * f3) * scale,
@@ -86,8 +101,11 @@ def accelerations(physics: Physics) -> Accelerations:
 def mass_matrix(physics: Physics, theta_rad: float = 0.0, phi_rad: float = 0.0) -> Doubles:
     """M(q) [3, 3] of (ẍ, θ̈, φ̈)."""
     ml = physics.link_kg * physics.link_m
-    ml2, inertia = ml * physics.link_m, physics.inertia_kgm2
-    m12, m13, m23 = 2 * ml * math.cos(theta_rad), ml * math.cos(phi_rad), ml2 * math.cos(theta_rad - phi_rad)
+    ml2 = ml * physics.link_m
+    inertia = physics.inertia_kgm2
+    m12 = 2 * ml * math.cos(theta_rad)
+    m13 = ml * math.cos(phi_rad)
+    m23 = ml2 * math.cos(theta_rad - phi_rad)
     cart = physics.cart_kg + 2 * physics.link_kg
     return np.array([[cart, m12, m13], [m12, 2 * ml2 + inertia, m23], [m13, m23, ml2 + inertia]])
 
@@ -131,11 +149,17 @@ def advance(solve: Accelerations, state: PendulumState, force: float, h: float) 
     x, t, p, u1, v1, w1 = state
     half = h / 2
     a1, b1, c1 = solve(t, p, u1, v1, w1, force)
-    u2, v2, w2 = u1 + half * a1, v1 + half * b1, w1 + half * c1
+    u2 = u1 + half * a1
+    v2 = v1 + half * b1
+    w2 = w1 + half * c1
     a2, b2, c2 = solve(t + half * v1, p + half * w1, u2, v2, w2, force)
-    u3, v3, w3 = u1 + half * a2, v1 + half * b2, w1 + half * c2
+    u3 = u1 + half * a2
+    v3 = v1 + half * b2
+    w3 = w1 + half * c2
     a3, b3, c3 = solve(t + half * v2, p + half * w2, u3, v3, w3, force)
-    u4, v4, w4 = u1 + h * a3, v1 + h * b3, w1 + h * c3
+    u4 = u1 + h * a3
+    v4 = v1 + h * b3
+    w4 = w1 + h * c3
     a4, b4, c4 = solve(t + h * v3, p + h * w3, u4, v4, w4, force)
     sixth = h / 6
     return (
@@ -187,8 +211,12 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
             raise ValueError(f"start_spread: expected from 0 to below track_m and angle_limit_rad, got {start_spread}")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / dt_s)}
-        self.force_limit_N, self.dt_s, self.substeps = force_limit_N, dt_s, substeps
-        self.track_m, self.angle_limit_rad, self.start_spread = track_m, angle_limit_rad, start_spread
+        self.force_limit_N = force_limit_N
+        self.dt_s = dt_s
+        self.substeps = substeps
+        self.track_m = track_m
+        self.angle_limit_rad = angle_limit_rad
+        self.start_spread = start_spread
         # Twice the limits of x and the angles, so that the last observation of an episode is inside, too.
         self._high = np.array([2 * track_m, *[2 * angle_limit_rad] * 2, *[SPEED_LIMIT] * 3], np.float32)
         self.observation_space = spaces.Box(-self._high, self._high, dtype=np.float32)
@@ -196,7 +224,8 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         self.state: PendulumState | None = None
         self.push = 0.0  # last action, clipped
         self._solve = (linear_accelerations if linearised else accelerations)(self.physics)
-        self._x_cost, self._angle_cost = 0.3 / track_m**2, 0.15 / angle_limit_rad**2
+        self._x_cost = 0.3 / track_m**2
+        self._angle_cost = 0.15 / angle_limit_rad**2
         self._screen: Screen | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
@@ -219,10 +248,12 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
             if not math.isfinite(push):
                 raise ValueError(f"CartDoublePendulum: action: expected a finite number from -1 to 1, got {push}")
             push = math.copysign(1.0, push)
-        force, h = self.force_limit_N * push, self.dt_s / self.substeps
+        force = self.force_limit_N * push
+        h = self.dt_s / self.substeps
         for _ in range(self.substeps):
             state = advance(self._solve, state, force, h)
-        self.state, self.push = state, push
+        self.state = state
+        self.push = push
         x, theta, phi, x_dot, theta_dot, phi_dot = state
         up = (
             abs(x) <= self.track_m

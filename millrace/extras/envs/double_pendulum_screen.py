@@ -26,7 +26,8 @@ class Screen:
             raise DependencyNotInstalled(
                 'rendering CartDoublePendulum needs pygame; install it: pip install "gymnasium[classic-control]"'
             ) from error
-        self._track_m, self._link_m = track_m, link_m
+        self._track_m = track_m
+        self._link_m = link_m
         width, height = SCREEN
         self._scale = 2 * min(
             width / (2 * track_m + 0.8), 0.6 * height / (2 * link_m)
@@ -52,9 +53,13 @@ class Screen:
         return None
 
     def _draw(self, x_m: float, theta_rad: float, phi_rad: float, push: float) -> None:
-        draw, canvas, scale = self._pygame.draw, self._canvas, self._scale
+        draw = self._pygame.draw
+        canvas = self._canvas
+        scale = self._scale
         width, height = canvas.get_size()
-        ground, cart_x, top = 0.72 * height, width / 2 + scale * x_m, 0.72 * height - 66
+        ground = 0.72 * height
+        cart_x = width / 2 + scale * x_m
+        top = 0.72 * height - 66
         left, right = (width / 2 + scale * side for side in (-self._track_m, self._track_m))
         canvas.fill("#f6f4ef")
         draw.line(canvas, "#d9d4c7", (width / 2, ground + 8), (width / 2, ground + 34), 3)  # mark of the middle
@@ -66,7 +71,8 @@ class Screen:
             draw.circle(canvas, "#1b2438", (wheel, ground - 15), 15)
             draw.circle(canvas, "#f6f4ef", (wheel, ground - 15), 5)
         if abs(push) > 0.02:
-            side, tip = math.copysign(1, push), cart_x + math.copysign(92, push) + 110 * push
+            side = math.copysign(1, push)
+            tip = cart_x + math.copysign(92, push) + 110 * push
             draw.line(canvas, "#c8553d", (cart_x + 84 * side, top + 24), (tip, top + 24), 8)
             draw.polygon(canvas, "#c8553d", [(tip, top + 10), (tip + 22 * side, top + 24), (tip, top + 38)])
         joint = (cart_x, top)
@@ -83,7 +89,8 @@ class Screen:
         """A thick line whose ends are at right angles to it, which those of pygame's line are not."""
         (x1, y1), (x2, y2) = start, end
         across = 8 / (math.hypot(x2 - x1, y2 - y1) or 1)
-        dx, dy = (y2 - y1) * across, (x1 - x2) * across
+        dx = (y2 - y1) * across
+        dy = (x1 - x2) * across
         points = [(x1 + dx, y1 + dy), (x1 - dx, y1 - dy), (x2 - dx, y2 - dy), (x2 + dx, y2 + dy)]
         self._pygame.draw.polygon(self._canvas, color, points)
 

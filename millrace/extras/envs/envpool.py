@@ -75,7 +75,8 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
             raise UsageError(f"environment {env.id}: envpool has none of this name; {instead_of_vector(env.id)}")
         with _ignore_warnings():
             made = envpool.make_spec(task, **options)
-            observation, action = made.gymnasium_observation_space, made.gymnasium_action_space
+            observation = made.gymnasium_observation_space
+            action = made.gymnasium_action_space
             if isinstance(action, spaces.Box):  # envpool casts actions to float32
                 action = spaces.Box(action.low.astype(np.float32), action.high.astype(np.float32))
     except (TypeError, AssertionError) as error:

@@ -74,7 +74,8 @@ class EnvpoolCopies:
 
     def _step_and_reset(self, actions: Array) -> tuple[StepResult, Array, Array]:
         """Reset the copies that were truncated here and step the others: the result of all, as in `_step`."""
-        reset, rest = np.flatnonzero(self._truncated), np.flatnonzero(~self._truncated)
+        reset = np.flatnonzero(self._truncated)
+        rest = np.flatnonzero(~self._truncated)
         first = self._read(self._env.reset(reset)[0])  # type: ignore[union-attr,arg-type,call-arg]
         result, elapsed, facts = self._step(actions[rest], rest)
 
