@@ -30,7 +30,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from millrace.protocol.wire.codec import decode_to_learner, encode
 from millrace.protocol.wire.compression import Packing
 from millrace.protocol.wire.learner_link import LearnerLink
-from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.workers.collect.collector import Collector

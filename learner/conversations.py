@@ -26,7 +26,7 @@ from millrace.protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec,
 from millrace.protocol.wire.codec import check_can_be_sent
 from millrace.protocol.wire.compression import has_zstd
 from millrace.protocol.wire.learner_link import LearnerLink
-from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 
 
 def describe_spec(config: RolloutConfig, env: EnvSpec, vector: str = "loop", render_mode: str | None = None) -> DescribeSpec:

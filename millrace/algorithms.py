@@ -63,7 +63,6 @@ from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
 from millrace.learner.algorithms.impala import IMPALA
 from millrace.learner.algorithms.minibatches import LossInput, Observations
-from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.algorithms.reinforce import REINFORCE
@@ -72,6 +71,7 @@ from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
 from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from millrace.learner.algorithms.returns import EpisodeEnds, gae, vtrace
+from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.algorithms.td3 import TD3
 from millrace.learner.config.hyperparameters import (

@@ -1,4 +1,5 @@
-"""Bounds of everything that a peer sends, as types for the fields of messages. Pure.
+"""Bounds of the texts, numbers and lists in a message, as types for its fields. How large the message itself may be stands
+in `millrace.protocol.wire.message_sizes`. Pure.
 
 Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it. So a peer can neither fill
 the memory nor a log, nor write control characters to a terminal. A sender makes its own texts fit (`one_line`, `text`).

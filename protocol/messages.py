@@ -12,7 +12,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from millrace.protocol.alive import Alive, Doing, WorkerActivity, WorkerExit
+from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import (
     MAX_SEEDS,
@@ -28,6 +28,7 @@ from millrace.protocol.bounds import (
     Versions,
     Whole,
 )
+from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.message_base import Message
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.space_spec import EnvDescription

@@ -6,8 +6,8 @@ from typing import Literal
 
 import msgspec
 
-from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.bounds import MAX_FACTS, MAX_NAME, one_line
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
 from millrace.protocol.space_spec import Shape
 from millrace.protocol.wire.weight_dtypes import ActingDtype

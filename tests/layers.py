@@ -44,7 +44,7 @@ NO_PROCESS = (
     "tests/learner/algorithms/replay/",
     "tests/learner/algorithms/test_a2c.py",
     "tests/learner/algorithms/test_action_masks.py",
-    "tests/learner/algorithms/test_normalization.py",
+    "tests/learner/algorithms/test_running_statistics.py",
     "tests/learner/algorithms/test_out_of_order.py",
     "tests/learner/algorithms/test_ppo.py",
     "tests/learner/algorithms/test_reinforce.py",

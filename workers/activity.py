@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import NamedTuple, get_args
 
-from millrace.protocol.alive import OF_POLICY, CallTimeouts, Doing
+from millrace.protocol.call_timeouts import OF_POLICY, CallTimeouts, Doing
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000

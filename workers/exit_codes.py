@@ -1,4 +1,7 @@
-"""Exit codes that say why a worker left, besides 0 and 1. Only its supervisor sees the last two: others get 1 and 2."""
+"""Exit codes that say why a worker left, besides 0 and 1. Only its supervisor sees the last two: others get 1 and 2.
+
+Which ends are final, and which workers are started again, the supervisor decides (`supervise/supervisor.py`).
+"""
 
 EXIT_REFUSED = 2
 """The learner refuses it, or bad usage."""

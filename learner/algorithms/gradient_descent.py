@@ -18,8 +18,8 @@ from torch.optim import Optimizer
 
 from millrace.learner.algorithms.algorithm import Algorithm, Start
 from millrace.learner.algorithms.kernels.optimizer_step import load_state, state_of
-from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from millrace.learner.algorithms.prior_data import PriorData
+from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import RunError, UsageError
 from millrace.protocol.rollout import Batch

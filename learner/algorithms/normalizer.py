@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import torch
 
-from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.features import feature_size, features

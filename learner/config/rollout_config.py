@@ -13,8 +13,8 @@ from msgspec import Meta
 
 from millrace.flags.fields import Flag, NotNegative, Positive
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
-from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.bounds import Count, Natural
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import Scalar
 from millrace.protocol.envs.kinds_of_copies import KINDS
 from millrace.protocol.envs.seats import STATE

@@ -31,8 +31,8 @@ from millrace.learner.members.events import (
 )
 from millrace.learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from millrace.protocol.address import key_of_peer, name_for_people, worker_name
-from millrace.protocol.alive import OUR_CODE
 from millrace.protocol.bounds import Stage, Stages, escaped, one_line
+from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,

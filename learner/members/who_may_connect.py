@@ -2,7 +2,7 @@
 
 Rule: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
 first use. On loopback they are needed only if a key folder was named. Between processes that share a file or memory, the
-operating system decides who may connect.
+operating system decides who may connect. Which of them may then join a run, `membership.py` decides.
 """
 
 from __future__ import annotations

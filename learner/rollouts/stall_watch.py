@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from millrace.learner.members.membership import Member
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
-from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.call_timeouts import CallTimeouts
 
 ENDED_WITHIN_S = 5.0  # after its timeout, until the learner hears that a worker was ended
 CHECK_BUDGETS_EVERY_S = 1.0

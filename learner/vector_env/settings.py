@@ -13,7 +13,7 @@ from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
 from millrace.learner.members.who_may_connect import BindSettings
-from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, safe_repr

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_differing_spaces, batch_space
 
 from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
-from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import EnvSpec, PickledCallable
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.spaces import leaves_with_own_dtype

@@ -11,7 +11,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from millrace.launch.local_worker_options import FlagsOfWorker, private_address, temporary_keys
+from millrace.launch.local_worker_options import FlagsOfWorker, temporary_keys
+from millrace.launch.private_address import private_address
 from millrace.learner.members.bound import Bound, bind, listen
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.members.who_may_connect import BindSettings

@@ -1,16 +1,10 @@
-"""Options of local workers: their address, keys, flags and cores.
-
-Rule: a socket file is in its own folder, which only this user can enter (0700). The folder is removed with it.
-"""
+"""Options of local workers: their keys, flags and cores."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
-import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,33 +12,15 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.members.who_may_connect import generate_run_keys
 from millrace.learner.run_folder.regular_files import open_regular, reason, subfolder
-from millrace.protocol.errors import UsageError, safe_repr
+from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import Keyring, chosen_key_folder
 from millrace.protocol.keys.keys import Token
 from millrace.workers.supervise.supervisor import Supervisor, core_flags
 
-LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing
 
 FlagsOfWorker = Callable[[str], tuple[list[str], Path | None]]
 """Takes a worker's name. Returns the flags of its process, and the file for its stderr (None: this process's stderr)."""
-
-
-def private_address(transport: str, stack: ExitStack) -> str:
-    """An address that no other process uses; `stack` removes its files. Raises `UsageError`."""
-    match transport:
-        case "inproc":
-            return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"
-        case "tcp":
-            return "tcp://127.0.0.1:*"
-        case "ipc":
-            room = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
-            # 0700: the operating system decides who may connect
-            folder = tempfile.mkdtemp(prefix="millrace-", dir=None if room else "/tmp")
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            return f"ipc://{folder}/learner"
-        case _:
-            raise UsageError(f"transport: expected ipc, tcp or inproc, got {safe_repr(transport)}")
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from millrace.learner.vector_env.shared_steps import SharedSteps
 from millrace.learner.vector_env.spec import RequestedCopies, observation_spaces, requested_copies
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.address import advertised_address, check_address
-from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import EnvLike, EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.wrappers import WrapperLike

@@ -13,7 +13,7 @@ from millrace.protocol.bounds import LARGEST, one_line
 from millrace.protocol.policy.layout import acting_size
 from millrace.protocol.space_spec import MAX_ELEMENTS, MAX_LEAVES, Dtype
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
-from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 
 MOST_LAYERS = 64
 

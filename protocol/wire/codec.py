@@ -41,14 +41,10 @@ from millrace.protocol.messages import (
 from millrace.protocol.space_spec import check_size
 from millrace.protocol.specs import RunSpec, StepSpec
 from millrace.protocol.wire.compression import Packing, raw_bytes, unpack_array
-from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.wire.message_sizes import MAX_DIMENSIONS, MAX_FRAME_BYTES, MAX_FRAMES, MAX_HEAD_BYTES, MAX_ITEMS
 
 Buffer = bytes | memoryview
 
-MAX_FRAMES = 256  # a description has two for each array of a space
-MAX_HEAD_BYTES = 1 << 20
-MAX_ITEMS = 1 << 16  # in a list or map of a worker's message; of the learner's, its head bounds them
-MAX_DIMENSIONS = 8
 DTYPES = {
     name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
 }

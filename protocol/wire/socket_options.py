@@ -16,12 +16,12 @@ import zmq
 from millrace.protocol.address import needs_ipv6
 from millrace.protocol.keys.handshake_failures import HANDSHAKE_MS
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 
 LINGER_MS = 2000
 UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after a cut it may need as long again as the cut lasted
 QUEUE = 1000  # messages that wait for a peer that does not read
 RECONNECT_MS, RECONNECT_MOST_MS = 100, 2000
-MAX_FRAME_BYTES = 1 << 30
 CURVE_BYTES = 33  # what encryption adds to a frame
 TAG_CHARACTERS = 32
 

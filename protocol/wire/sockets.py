@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import zmq
 
-from millrace.protocol.wire.codec import MAX_FRAMES, Buffer
+from millrace.protocol.wire.codec import Buffer
+from millrace.protocol.wire.message_sizes import MAX_FRAMES
 
 COPY_BELOW_BYTES = 65536  # copying a smaller frame is cheaper than tracking it
 NOT_WAITING, AND_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)

@@ -19,8 +19,9 @@ from millrace.protocol.keys.handshake_failures import WORKER_EVENTS, ConnectionP
 from millrace.protocol.keys.keys import Token
 from millrace.protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from millrace.protocol.messages import ToObserver, ToWorker
-from millrace.protocol.wire.codec import MAX_HEAD_BYTES, Buffer, decode_to_observer, decode_to_worker
+from millrace.protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
 from millrace.protocol.wire.compression import Packing, has_zstd
+from millrace.protocol.wire.message_sizes import MAX_HEAD_BYTES
 from millrace.protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, Limits, routing_id, set_options
 from millrace.protocol.wire.sockets import receive_frames, send_frames
 

@@ -19,7 +19,7 @@ import pytest
 import millrace
 from millrace.arguments import plain
 from millrace.launch import learner_inference, policy_workers, rollouts, training, vector
-from millrace.launch.local_worker_options import private_address
+from millrace.launch.private_address import private_address
 from millrace.learner.members.bound import bind
 from tests.support.users_code import own_policies
 

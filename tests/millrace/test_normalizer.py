@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import millrace
-from millrace.learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
 
 SMALL: dict[str, Any] = {"envs": 4, "lanes": 2, "workers": 1, "rollout_steps": 24, "transport": "inproc"}
 POLICY = millrace.MLP(8, normalize_observations=True)

@@ -23,7 +23,7 @@ import pytest
 from millrace.learner.members import join_limiter, membership
 from millrace.learner.members import member_states as standing
 from millrace.learner.rollouts import ticket_coordinator
-from millrace.protocol import alive, bounds, env_spec, messages, rollout, space_spec, specs
+from millrace.protocol import bounds, call_timeouts, env_spec, messages, rollout, space_spec, specs
 from millrace.protocol.keys import handshake_failures
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
@@ -36,7 +36,7 @@ from millrace.protocol.messages import (
     ToWorker,
     Weights,
 )
-from millrace.protocol.wire import codec, socket_options
+from millrace.protocol.wire import codec, message_sizes, socket_options
 from millrace.protocol.wire import compression as packing
 from millrace.workers.conversation import held, session, worker_states
 
@@ -57,7 +57,7 @@ RECORDS: tuple[type, ...] = (
     specs.DescribeSpec,
     specs.RunSpec,
     specs.StepSpec,
-    alive.CallTimeouts,
+    call_timeouts.CallTimeouts,
     specs.ExtraArray,
     env_spec.EnvSpec,
     specs.PolicySpec,
@@ -149,11 +149,11 @@ PROSE: Mapping[type, tuple[str, ...]] = {
 }
 # What each limit bounds. A new MAX_* constant without a line here fails a test.
 LIMITS: Mapping[tuple[ModuleType, str], str] = {
-    (codec, "MAX_FRAMES"): "frames of a message, the head included",
-    (codec, "MAX_HEAD_BYTES"): "bytes of the head",
-    (socket_options, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
-    (codec, "MAX_ITEMS"): "items of any list or map in the head",
-    (codec, "MAX_DIMENSIONS"): "dimensions of an array",
+    (message_sizes, "MAX_FRAMES"): "frames of a message, the head included",
+    (message_sizes, "MAX_HEAD_BYTES"): "bytes of the head",
+    (message_sizes, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
+    (message_sizes, "MAX_ITEMS"): "items of any list or map in the head",
+    (message_sizes, "MAX_DIMENSIONS"): "dimensions of an array",
     (bounds, "MAX_NAME"): "characters of a `Name`",
     (bounds, "MAX_LINE"): "characters of a `Line`",
     (bounds, "MAX_TEXT"): "characters of a `Text`",
@@ -459,8 +459,8 @@ def test_every_record_that_travels_is_described() -> None:
 
 def test_every_limit_is_in_the_document() -> None:
     for module in (
-        bounds, space_spec, env_spec, codec, socket_options, packing, session, held, ticket_coordinator, messages,
-        rollout, specs,
+        bounds, space_spec, env_spec, codec, message_sizes, socket_options, packing, session, held, ticket_coordinator,
+        messages, rollout, specs,
     ):  # fmt: skip
         for name in re.findall(r"^((?:MAX|MOST)_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from millrace.extras.envs.vector_copies import VectorCopies
-from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.activity import (
     DOING,

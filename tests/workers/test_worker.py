@@ -13,8 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from millrace.protocol.alive import NO_SLOT, OUR_CODE, CallTimeouts
+from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.arrays import Array
+from millrace.protocol.call_timeouts import OUR_CODE, CallTimeouts
 from millrace.protocol.messages import (
     Collect,
     Drain,

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from millrace.protocol.alive import CALLS, OF_POLICY, OUR_CODE, WorkerActivity
+from millrace.protocol.alive import WorkerActivity
 from millrace.protocol.bounds import escaped, one_line
+from millrace.protocol.call_timeouts import CALLS, OF_POLICY, OUR_CODE
 from millrace.protocol.keys.keys import Token
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers.activity import STACK_SIGNAL, ActivityReader

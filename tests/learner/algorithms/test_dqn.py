@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from millrace.learner.algorithms.dqn import DQN, LOSSES, exploration_rate
-from millrace.learner.algorithms.normalization import RewardScaler
 from millrace.learner.algorithms.replay import replay_buffer as replay_module
 from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.running_statistics import RewardScaler
 from millrace.learner.config.hyperparameters import DQNConfig
 from millrace.protocol.arrays import Floats, Ints
 from millrace.protocol.errors import UsageError

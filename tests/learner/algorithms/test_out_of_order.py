@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from millrace.learner.algorithms.normalization import RewardScaler, RunningMoments
 from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer
+from millrace.learner.algorithms.running_statistics import RewardScaler, RunningMoments
 from millrace.learner.rollouts.lanes import TicketedLane
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Batch, Rollout, stack_rollouts

@@ -8,8 +8,8 @@ from millrace.learner.members.events import WorkerProcessFailed
 from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
-from millrace.protocol.alive import CallTimeouts
 from millrace.protocol.bounds import Stages
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Evaluate, Heartbeat, Hello, Weights, WorkerExit
 from tests.learner.rollouts.test_evaluation_dealer import answer, orders, plan

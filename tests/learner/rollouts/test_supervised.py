@@ -14,7 +14,8 @@ from millrace.learner.members.events import Failed, PolicyRaised, WorkerLeft, Wo
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
-from millrace.protocol.alive import OUR_CODE, Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
+from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
+from millrace.protocol.call_timeouts import OUR_CODE, CallTimeouts, Doing
 from millrace.protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits

@@ -8,7 +8,8 @@ from millrace.learner.members.held_up import LONG_S
 from millrace.learner.members.membership import Member
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
-from millrace.protocol.alive import Alive, Doing, WorkerActivity
+from millrace.protocol.alive import Alive, WorkerActivity
+from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.messages import Evaluated, Goodbye, Heartbeat
 from millrace.protocol.random_streams import Purpose
 from millrace.protocol.rollout import Episode

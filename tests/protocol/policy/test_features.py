@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from millrace.learner.algorithms.minibatches import log_probs
-from millrace.learner.algorithms.normalization import ObservationNormalizer
 from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.running_statistics import ObservationNormalizer
 from millrace.learner.algorithms.xqc import XQC
 from millrace.learner.config.hyperparameters import PPOConfig, XQCConfig
 from millrace.learner.run_folder.run_folder import RunFolder

@@ -37,7 +37,8 @@ from millrace.protocol.messages import (
     Welcome,
 )
 from millrace.protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
-from millrace.protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
+from millrace.protocol.wire.codec import DTYPES, decode_to_learner, decode_to_worker, encode
+from millrace.protocol.wire.message_sizes import MAX_FRAMES, MAX_HEAD_BYTES
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.examples import examples
 

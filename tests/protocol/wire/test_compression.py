@@ -25,7 +25,7 @@ from millrace.protocol.rollout import Rollout, rollout_bytes
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from millrace.protocol.wire.compression import Packing, has_zstd, pack_stack, unpack_array, unpack_stack
-from millrace.protocol.wire.socket_options import MAX_FRAME_BYTES
+from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 from tests.support.examples import examples
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around, run_of
 

@@ -31,9 +31,10 @@ from millrace.protocol.messages import (
     ToWorker,
     Weights,
 )
-from millrace.protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
+from millrace.protocol.wire.codec import decode_to_worker, encode
 from millrace.protocol.wire.compression import Packing, has_zstd
 from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.message_sizes import MAX_FRAMES
 from millrace.protocol.wire.sockets import COPY_BELOW_BYTES
 from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 from tests.support.conversation.every_message import to_learner, to_worker

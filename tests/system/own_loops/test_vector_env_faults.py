@@ -25,7 +25,7 @@ import millrace
 from millrace.launch import vector
 from millrace.learner.vector_env import settings
 from millrace.learner.vector_env.env import ZmqVectorEnv
-from millrace.protocol.alive import CallTimeouts
+from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from millrace.protocol.keys.key_folder import KeyFolder

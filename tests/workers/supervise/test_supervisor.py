@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from millrace.protocol.alive import Doing, StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.call_timeouts import Doing
 from millrace.workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
 from millrace.workers.supervise.ending import Ending
 from millrace.workers.supervise.supervisor import (

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from millrace.protocol.alive import CallTimeouts, Doing
+from millrace.protocol.call_timeouts import CallTimeouts, Doing
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers import activity, program
 from millrace.workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader

@@ -13,7 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from millrace.learner.algorithms.normalization import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
+from millrace.learner.algorithms.running_statistics import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.layout import buffer_size
 from millrace.protocol.policy.normalize import normalize

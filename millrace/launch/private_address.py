@@ -1,0 +1,33 @@
+"""The address at which local workers join: of a socket file, of TCP on loopback, or within this process.
+
+Rule: a socket file is in its own folder, which only this user can enter (0700). The folder is removed with it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from contextlib import ExitStack
+
+from millrace.protocol.errors import UsageError, safe_repr
+
+LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
+
+
+def private_address(transport: str, stack: ExitStack) -> str:
+    """An address that no other process uses; `stack` removes its files. Raises `UsageError`."""
+    match transport:
+        case "inproc":
+            return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"
+        case "tcp":
+            return "tcp://127.0.0.1:*"
+        case "ipc":
+            room = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
+            # 0700: the operating system decides who may connect
+            folder = tempfile.mkdtemp(prefix="millrace-", dir=None if room else "/tmp")
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            return f"ipc://{folder}/learner"
+        case _:
+            raise UsageError(f"transport: expected ipc, tcp or inproc, got {safe_repr(transport)}")
