@@ -26,7 +26,8 @@ def main() -> None:
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("seed", type=int)
     arguments = parser.parse_args()
-    supersuit, sb3 = import_module("supersuit"), import_module("stable_baselines3")
+    supersuit = import_module("supersuit")
+    sb3 = import_module("stable_baselines3")
     vec_env = import_module("stable_baselines3.common.vec_env")
     import_module("stable_baselines3.common.utils").set_random_seed(arguments.seed)  # its copies have no `seed`
     module, name, settings, steps = TASKS[arguments.task]

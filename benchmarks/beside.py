@@ -19,7 +19,8 @@ import millrace
 from benchmarks.writing import write
 
 COPIES = 4
-EPISODES, EPISODE_STEPS = 4, 8
+EPISODES = 4
+EPISODE_STEPS = 8
 EVERY = 2 * EPISODES * EPISODE_STEPS * COPIES  # env steps, in twice the time of an evaluation, whose copies share a worker
 WARM_UP_STEPS = 2 * COPIES * 16
 SETTINGS: dict[str, Any] = {

@@ -73,7 +73,8 @@ def step_rate(command: Sequence[str], copies: int, seconds: float) -> float:
         env = stack.enter_context(millrace.make_vec("CartPole-v1", copies, lanes=1, bind=address))
         env.reset(seed=1)
         actions = np.random.default_rng(1).integers(0, 2, (1000, copies))
-        steps, began_s = 0, 0.0
+        steps = 0
+        began_s = 0.0
         while steps == 0 or time.perf_counter() - began_s < seconds:
             for action in actions[:100]:
                 env.step(action)
@@ -121,7 +122,8 @@ def many_clients(folder: Path, steps: int) -> dict[str, float]:
     found = re.search(r"([\d,]+) env steps in ([\d.]+) s", said)
     if found is None:
         raise RuntimeError(f"the learner said: {said}")
-    trained, training_s = float(found[1].replace(",", "")), float(found[2])
+    trained = float(found[1].replace(",", ""))
+    training_s = float(found[2])
     return {"left with code 0": left, "seconds": ended_s, "env steps/s": trained / training_s}
 
 
@@ -138,7 +140,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if shutil.which("cmake") is None or shutil.which("c++") is None:
         sys.exit("benchmarks.clients: expected cmake and c++, got none; apt-get install g++ cmake libzmq3-dev libsodium-dev")
-    console, record = Console(width=110), dict[str, Any]()
+    console = Console(width=110)
+    record = dict[str, Any]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         build(folder)

@@ -51,12 +51,14 @@ from millrace.workers.conversation.held import Assignment
 
 PROCESSES = 2
 STEPS = 128  # T
-CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
+CARTPOLE = EnvSpec("CartPole-v1")
+FRAMES = EnvSpec("benchmarks.frames:Frames-v0")
 PONG = EnvSpec("millrace.extras.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
 NARROW = ("ours, 1 lane, bfloat16", "native, 1 lane, bfloat16")
-NATIVE, POOL = ("bare, native", "native, 1 lane"), ("bare, envpool", "envpool, 1 lane")
+NATIVE = ("bare, native", "native, 1 lane")
+POOL = ("bare, envpool", "envpool, 1 lane")
 
 
 class Case(NamedTuple):
@@ -209,7 +211,8 @@ def _process(name: str, env: EnvSpec, copies: int, number: int, cpu: bool, pipe:
     turn = _make(name, env, copies, number)
     clock = time.process_time if cpu else time.perf_counter
     while (seconds := pipe.recv()) is not None:
-        steps, start = 0, clock()
+        steps = 0
+        start = clock()
         while (now := clock()) - start < seconds:
             steps += turn()
         pipe.send(steps / (now - start))

@@ -15,7 +15,8 @@ from pettingzoo.classic import connect_four_v3
 
 import millrace
 
-ROWS, COLUMNS = 6, 7
+ROWS = 6
+COLUMNS = 7
 GAMES = 200  # with each program; the policy begins in every other one
 
 Array = np.ndarray[Any, Any]
@@ -64,7 +65,9 @@ class LookAhead(AtRandom):
 
 def score(policy: Any, program: AtRandom) -> float:
     """The share of games that the policy wins, acting greedily; a tie is half a win."""
-    env, rng, total = connect_four_v3.env(), np.random.default_rng(1), 0.0
+    env = connect_four_v3.env()
+    rng = np.random.default_rng(1)
+    total = 0.0
     for game in range(GAMES):
         env.reset(seed=game)
         mine = env.agents[game % 2]

@@ -27,7 +27,9 @@ from rich.table import Table
 from benchmarks.programs import Contender, run
 from benchmarks.writing import write
 
-OURS, OVERLAPPED, THEIRS = "millrace", "millrace, --max-lag 1", "SB3"
+OURS = "millrace"
+OVERLAPPED = "millrace, --max-lag 1"
+THEIRS = "SB3"
 CONTENDERS = {
     OURS: Contender("millrace", flags=("--workers", "1", "--lanes", "1")),
     OVERLAPPED: Contender("millrace", flags=("--workers", "1", "--lanes", "1", "--max-lag", "1")),
@@ -37,16 +39,21 @@ COMMON: dict[str, Any] = {
     "env": "Pendulum-v1", "envs": 1, "rollout_steps": 8, "batch_size": 256, "gamma": 0.99, "tau": 0.005,
     "learning_rate": 1e-3, "learning_starts": 100, "replay_size": 50_000, "eval_every": 1000, "eval_episodes": 10,
 }  # fmt: skip
-ROWS, OBSERVATION, ACTION = 256, 3, 1
+ROWS = 256
+OBSERVATION = 3
+ACTION = 1
 WARM_UP_STEPS = 600  # env steps
-SOLVED, LONGEST = -200.0, 20_000
+SOLVED = -200.0
+LONGEST = 20_000
 
 
 def products_s(algo: str, width: int, repeats: int = 200) -> float:
     """Seconds of the matrix products of one gradient step alone, with two hidden layers of this width."""
 
     def seconds(n: int, k: int, m: int) -> float:
-        a, b, out = torch.randn(n, k), torch.randn(k, m), torch.empty(n, m)
+        a = torch.randn(n, k)
+        b = torch.randn(k, m)
+        out = torch.empty(n, m)
         found = []
         for _ in range(repeats):
             began_s = time.perf_counter()

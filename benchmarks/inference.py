@@ -38,7 +38,8 @@ class Frames(gymnasium.Env[Any, Any]):
     def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(0, 255, (84, 84, 4), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(6)
-        self._frame, self._steps = np.zeros((84, 84, 4), np.uint8), 0
+        self._frame = np.zeros((84, 84, 4), np.uint8)
+        self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)

@@ -12,7 +12,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-SIZE, LENGTH = 7, 60
+SIZE = 7
+LENGTH = 60
 MOVES = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])
 COST = 0.02
 
@@ -33,7 +34,8 @@ class Exit(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         if seed is not None or not hasattr(self, "_rng"):
             self._rng = np.random.default_rng(seed)
-        self.agents, self._steps = [*self.possible_agents], 0
+        self.agents = [*self.possible_agents]
+        self._steps = 0
         cells = self._rng.choice(SIZE * SIZE, 1 + len(self.agents), replace=False)
         self._exit, *places = [np.array(divmod(int(cell), SIZE)) for cell in cells]
         self._at = dict(zip(self.agents, places, strict=True))

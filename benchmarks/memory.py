@@ -56,7 +56,8 @@ class Tree:
             rss += resident
             if process is not root:
                 self.child_rss = max(self.child_rss, resident / 1e6)
-        self.own, self.rss = max(self.own, (own + sum(files.values())) / 1e6), max(self.rss, rss / 1e6)
+        self.own = max(self.own, (own + sum(files.values())) / 1e6)
+        self.rss = max(self.rss, rss / 1e6)
         self.processes = max(self.processes, len(tree))
         self._due_s = time.monotonic() + INTERVAL_S
 

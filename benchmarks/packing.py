@@ -63,7 +63,8 @@ def atari(run: RunSpec) -> Rollout:
     if run != STACKS:  # not `is`: it may come from another process
         return rollout
     (noise,) = rollout.obs
-    obs, ends = noise.copy(), len(noise) // 2
+    obs = noise.copy()
+    ends = len(noise) // 2
     for t in range(1, len(obs)):
         obs[t, :, :-1] = obs[t - 1, :, 1:]
         if t == ends:
@@ -106,7 +107,8 @@ def packing(rounds: int) -> list[dict[str, object]]:
     rows += [(f"CartPole, {n} × {t}", cartpole(n, t), "zstd") for n, t in ((8, 32), (64, 128))]
     found: list[dict[str, object]] = []
     for name, rollout, packed_by in rows:
-        way, taken = WAYS[packed_by], np.zeros((4, rounds))
+        way = WAYS[packed_by]
+        taken = np.zeros((4, rounds))
         plain, saved = (sum(map(len, encode(rollout, each))) for each in (None, way))
         for turn in range(rounds):
             for i, each in enumerate((None, way)):
@@ -116,7 +118,8 @@ def packing(rounds: int) -> list[dict[str, object]]:
                 decode_to_learner(frames, MAX_FRAME_BYTES)
                 taken[2 * i : 2 * i + 2, turn] = packed_s - began_s, time.thread_time() - packed_s
         without, unpacked, packed, back = np.median(taken, axis=1).tolist()
-        pack_s, unpack_s = packed - without, back - unpacked
+        pack_s = packed - without
+        unpack_s = back - unpacked
         found.append(
             {
                 "rollout": name,
@@ -134,7 +137,8 @@ def packing(rounds: int) -> list[dict[str, object]]:
 
 def _send(address: str, token: Token, told: Connection) -> None:
     """The sender's process: one rollout of frame stacks, packed as it is told to."""
-    link, rollout = WorkerLink(address, "w", zmq.Context(), token), pong() or atari(STACKS)
+    link = WorkerLink(address, "w", zmq.Context(), token)
+    rollout = pong() or atari(STACKS)
     told.send(None)
     while (way := told.recv()) is not None:
         began_s = time.monotonic()
@@ -145,7 +149,8 @@ def _send(address: str, token: Token, told: Connection) -> None:
 
 def encrypted(rounds: int) -> dict[str, float]:
     """Milliseconds of a rollout of frame stacks from before `encode` until after decoding, over CURVE and loopback TCP."""
-    server, client = Key.new(), Key.new()
+    server = Key.new()
+    client = Key.new()
     keyring = Keyring(server, ClientList().with_client("w", client.public, datetime.now(UTC)))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     link = LearnerLink("tcp://127.0.0.1:*", context, keyring)

@@ -87,7 +87,8 @@ def main(argv: list[str]) -> int:
     name, *flags = argv or [""]
     if name and name not in BENCHMARKS:
         raise UsageError(f"bench {name}: expected one of {', '.join(BENCHMARKS)}, or nothing, which is all of them")
-    failed, all_began_s = [], time.monotonic()
+    failed = []
+    all_began_s = time.monotonic()
     for each in [name] if name else BENCHMARKS:
         if not name and BENCHMARKS[each].peers and importlib.util.find_spec("stable_baselines3") is None:
             print(f"{each}: left out, Stable-Baselines3 is not installed (pip install stable-baselines3)", flush=True)

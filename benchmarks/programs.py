@@ -76,11 +76,17 @@ class Contender(NamedTuple):
         return self.module == "millrace"
 
 
-OURS, OURS_OWN = "millrace, 2 workers", "millrace, own preset"
-OVERLAPPED, NATIVE, ONE_NATIVE = "millrace, --max-lag 1", "millrace, --vector native", "millrace, 1 worker, both"
-DUMMY, SUBPROC = "SB3, one process", "SB3, SubprocVecEnv"
-_SB3, _PEERS = "benchmarks.train_stable_baselines3", "benchmarks.peers"
-AS_PUFFERLIB, AS_SAMPLE_FACTORY = "millrace, as PufferLib's own", "millrace, as Sample Factory's own"
+OURS = "millrace, 2 workers"
+OURS_OWN = "millrace, own preset"
+OVERLAPPED = "millrace, --max-lag 1"
+NATIVE = "millrace, --vector native"
+ONE_NATIVE = "millrace, 1 worker, both"
+DUMMY = "SB3, one process"
+SUBPROC = "SB3, SubprocVecEnv"
+_SB3 = "benchmarks.train_stable_baselines3"
+_PEERS = "benchmarks.peers"
+AS_PUFFERLIB = "millrace, as PufferLib's own"
+AS_SAMPLE_FACTORY = "millrace, as Sample Factory's own"
 
 
 def _flags(sizes: str, more: str) -> tuple[str, ...]:

@@ -28,7 +28,9 @@ from benchmarks.writing import write
 from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
-OURS, OVERLAPPED, THEIRS = "millrace", "millrace, --max-lag 1", "SB3, one process"
+OURS = "millrace"
+OVERLAPPED = "millrace, --max-lag 1"
+THEIRS = "SB3, one process"
 SUBPROC = "SB3, SubprocVecEnv"
 NATIVE = "millrace, --vector native"
 COMMON: dict[str, Any] = {
@@ -51,7 +53,8 @@ def sizes(cores: int) -> dict[str, Size]:
     """Both, on this number of cores."""
     sb3 = "benchmarks.train_stable_baselines3"
     flags = ("--lanes", "2", "--torch-threads")
-    image, features = Leaf("", "box", (4, 84, 84), "uint8", divisor=255), Leaf("", "box", (17,), "float32")
+    image = Leaf("", "box", (4, 84, 84), "uint8", divisor=255)
+    features = Leaf("", "box", (17,), "float32")
     buttons = ActionSpec("discrete", (), "int64", (6,), (0,))
     torques = ActionSpec("box", (6,), "float32", low=(-1.0,) * 6, high=(1.0,) * 6)
     cheetah = {"env": "HalfCheetah-v5", "envs": 8, "rollout_steps": 256, "n_epochs": 10, "net": [64, 64]}
@@ -93,12 +96,15 @@ def rate(name: str, size: Size, seed: int) -> float:
 def network_s(size: Size, threads: int, repeats: int = 8) -> float:
     """Seconds that the network of the updates takes for an env step, forward and backward, by itself."""
     torch.set_num_threads(threads)
-    net, rows = ActorCriticNetwork(size.policy), size.settings["batch_size"]
+    net = ActorCriticNetwork(size.policy)
+    rows = size.settings["batch_size"]
     (leaf,) = size.policy.observation
     if leaf.is_image:
-        x, images = torch.zeros(rows, 0), [torch.randint(0, 256, (rows, *leaf.shape), dtype=torch.uint8)]
+        x = torch.zeros(rows, 0)
+        images = [torch.randint(0, 256, (rows, *leaf.shape), dtype=torch.uint8)]
     else:
-        x, images = torch.randn(rows, *leaf.shape), []
+        x = torch.randn(rows, *leaf.shape)
+        images = []
     found = []
     for _ in range(repeats):
         began_s = time.perf_counter()

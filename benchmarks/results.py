@@ -51,7 +51,8 @@ def read(path: Path, *, only_final: bool) -> Score | None:
     `only_final`: without the best policy; then the settings of evaluations, which change no weights, are not in the command.
     """
     folder = RunFolder.open(path)
-    config, summary = config_of_run(path), folder.summary()
+    config = config_of_run(path)
+    summary = folder.summary()
     if summary is None:
         return None
     best = _played(path, config, summary.best.evaluation if summary.best and not only_final else None, "best")
@@ -87,8 +88,10 @@ def command(config: Config, leave_out: Sequence[str] = ()) -> str:
         words += ["--algo", config.algo]
     preset = resolve(config.env, algo=config.algo)
     if any(getattr(preset, name).keys() - getattr(config, name).keys() for name in TABLES):  # a flag cannot remove an entry
-        preset, words = resolve(config.env, algo=config.algo, preset="none"), [*words, "--preset", "none"]
-    defaults, settings = msgspec.to_builtins(preset), msgspec.to_builtins(config)
+        preset = resolve(config.env, algo=config.algo, preset="none")
+        words = [*words, "--preset", "none"]
+    defaults = msgspec.to_builtins(preset)
+    settings = msgspec.to_builtins(config)
     defaults |= defaults.pop("algorithm")
     settings |= settings.pop("algorithm")
     for name, value in settings.items():
@@ -118,7 +121,8 @@ def main() -> None:
             scores[score.command] = merged(scores.get(score.command), score)
     write_scores(scores.values())
     written = read_scores()
-    returns, commands = returns_table(written, read_published()), commands_table(written)
+    returns = returns_table(written, read_published())
+    commands = commands_table(written)
     for page, old, new in ((PAGE, RETURNS, returns), (PAGE_OF_COMMANDS, COMMANDS, commands)):
         text = page.read_text()
         page.write_text(text.replace("".join(old.findall(text)), new))

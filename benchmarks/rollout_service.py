@@ -77,7 +77,9 @@ class Clock:
     """Env steps/s after a warm-up."""
 
     def __init__(self, seconds: float) -> None:
-        self._seconds, self._began_s, self._since = seconds, time.perf_counter(), (0, 0.0)
+        self._seconds = seconds
+        self._began_s = time.perf_counter()
+        self._since = (0, 0.0)
         self.rate = 0.0
         """0 until the time is over"""
 
@@ -146,10 +148,8 @@ def main() -> None:
     parser.add_argument("--max-lag", type=int, default=0)
     flags = parser.parse_args()
     arrays = {name: array.shape for name, array in _initial().items()}
-    mlp, own = (
-        millrace.MLP(64, 64),
-        millrace.OwnPolicy("benchmarks.rollout_service:Network", arrays, {"log_prob": "float32"}),
-    )
+    mlp = millrace.MLP(64, 64)
+    own = millrace.OwnPolicy("benchmarks.rollout_service:Network", arrays, {"log_prob": "float32"})
     sizes = (flags.max_lag, flags.envs, flags.seconds)
     ceiling = Pair(f"ours, {LANES // PROCESSES} lanes", flags.envs // PROCESSES)
     contenders: dict[str, Callable[[], float]] = {

@@ -92,13 +92,18 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
         stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     warm_mb = _resident_mb(me)
-    first, bytes_before, used_before = len(published_s), link.received.bytes, coordinator.rollouts.ledger.used
-    cpu_s, python_s, began_s = time.process_time(), time.thread_time(), time.monotonic()
+    first = len(published_s)
+    bytes_before = link.received.bytes
+    used_before = coordinator.rollouts.ledger.used
+    cpu_s = time.process_time()
+    python_s = time.thread_time()
+    began_s = time.monotonic()
     while time.monotonic() - began_s < seconds and len(published_s) < VERSIONS:
         stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     took_s = time.monotonic() - began_s
-    cpu_s, python_s = time.process_time() - cpu_s, time.thread_time() - python_s
+    cpu_s = time.process_time() - cpu_s
+    python_s = time.thread_time() - python_s
     used = coordinator.rollouts.ledger.used - used_before
     received_bytes = link.received.bytes - bytes_before
     growth_mb = _resident_mb(me) - warm_mb

@@ -42,8 +42,10 @@ class Team(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     possible_agents = AGENTS
 
     def __init__(self, seconds: float = 0.0) -> None:
-        self._seconds, self._none = seconds, dict.fromkeys(AGENTS, False)
-        self._space, self._actions = spaces.Box(-1, 1, (8,), np.float32), spaces.Discrete(4)
+        self._seconds = seconds
+        self._none = dict.fromkeys(AGENTS, False)
+        self._space = spaces.Box(-1, 1, (8,), np.float32)
+        self._actions = spaces.Discrete(4)
         self._seen = np.zeros((len(AGENTS), 8), np.float32)
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -53,7 +55,8 @@ class Team(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         return self._actions
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        self.agents, self._left = [*AGENTS], LENGTH
+        self.agents = [*AGENTS]
+        self._left = LENGTH
         return dict(zip(AGENTS, self._seen, strict=True)), {agent: {} for agent in AGENTS}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -97,7 +100,8 @@ def step_function(name: str, task: Task) -> tuple[Callable[[Any], object], Calla
         case "plain loop":
             return Loop(task).step, lambda: None
         case "PufferLib":
-            puffer, vector = import_module("pufferlib.emulation"), import_module("pufferlib.vector")
+            puffer = import_module("pufferlib.emulation")
+            vector = import_module("pufferlib.vector")
             made = vector.make(
                 partial(wrapped, puffer.PettingZooPufferEnv, make),
                 backend=vector.Multiprocessing, num_envs=task.copies, num_workers=task.workers, overwork=True,
@@ -131,7 +135,8 @@ TASKS = (
 
 def rate(step: Callable[[Any], object], actions: Any, seconds: float) -> float:
     """Rows/s, measured over this time."""
-    steps, start = 0, time.perf_counter()
+    steps = 0
+    start = time.perf_counter()
     while (now := time.perf_counter()) - start < seconds:
         step(actions[steps % len(actions)])
         steps += 1

@@ -26,7 +26,8 @@ from millrace.protocol.wire.codec import decode_to_worker, encode
 from millrace.workers.conversation.session import Leave, RolloutTask, SendMessage, Session, WorkerEffect, WorkerIdentity
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
-STEPS, COPIES = 32, 8  # T, N: 9 KB
+STEPS = 32  # with these copies, a rollout has 9 KB
+COPIES = 8
 VERSIONS = 100_000  # rows of the table of arrivals: more than a run has
 Arrivals = npt.NDArray[np.float64]
 
@@ -38,7 +39,8 @@ def run_spec(workers: int) -> RunSpec:
 
 def canned(run: RunSpec) -> Rollout:
     """A rollout of the run's shapes in which no episode ends."""
-    rng, shape = np.random.default_rng(0), (run.rollout_steps, run.copies)
+    rng = np.random.default_rng(0)
+    shape = (run.rollout_steps, run.copies)
     nothing = np.zeros(shape, bool)
     return Rollout(
         session=0,
@@ -68,7 +70,8 @@ class Simulated:
     """One worker."""
 
     def __init__(self, number: int, address: str, context: zmq.Context[zmq.Socket[bytes]], arrivals: Arrivals) -> None:
-        self._number, self._arrivals = number, arrivals
+        self._number = number
+        self._arrivals = arrivals
         self.socket = context.socket(zmq.DEALER)
         name = f"w{number}"
         self.socket.routing_id = name.encode()

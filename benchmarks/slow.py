@@ -34,22 +34,26 @@ from benchmarks.writing import write
 
 COPIES = 16
 IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time
-NEVER_WAIT, NEVER_WAIT_S = "copies that never wait", 12.0
+NEVER_WAIT = "copies that never wait"
+NEVER_WAIT_S = 12.0
 WARM_UP = 3  # updates
-WIDTH, ROW = 640, 7  # of the picture, and the height of a copy: letters are large enough on a phone
+WIDTH = 640  # of the picture: letters are large enough on a phone
+ROW = 7  # the height of a copy
 STYLE = (
     "text{fill:#2b3a42}.name{font-weight:600}.rows{fill:#8f9ba3;opacity:.16}.step{fill:#0072b2}.reset{fill:#e69f00}"
     "@media(prefers-color-scheme:dark){text{fill:#dde5ea}.step{fill:#4aa8e0}.reset{fill:#f0b440}}"
 )
 LOOPS_WARM_UP_S = 2.0
-BY_STEP, BY_RECV = "make_vec, step", "make_vec, send and recv"
+BY_STEP = "make_vec, step"
+BY_RECV = "make_vec, send and recv"
 SETTINGS: dict[str, Any] = {
     "env": "benchmarks.slow_env:Lognormal-v0", "algo": "ppo", "envs": COPIES, "rollout_steps": 64, "batch_size": 256,
     "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5,
     "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2, "clip_range_schedule": "constant",
     "eval_every": 0, "eval_episodes": 1, "processes": COPIES, "normalize_observations": False, "normalize_rewards": False,
 }  # fmt: skip
-UPDATES, UPDATES_OF_PEERS = 24, 8
+UPDATES = 24
+UPDATES_OF_PEERS = 8
 SUBPROC = "SB3, SubprocVecEnv"
 OURS = {
     f"millrace, --max-lag {lag}": Contender(
@@ -77,7 +81,8 @@ def rate(name: str, contender: Contender, seed: int) -> float:
 def rate_without_waiting(seed: int) -> float:
     """Env steps/s of copies in processes that only step and reset."""
     context = multiprocessing.get_context("spawn")
-    begin, counts = context.Barrier(COPIES), context.Queue()
+    begin = context.Barrier(COPIES)
+    counts = context.Queue()
     loops = [context.Process(target=_step_only, args=(COPIES * seed + n, begin, counts), daemon=True) for n in range(COPIES)]
     for loop in loops:
         loop.start()
@@ -110,7 +115,8 @@ def rate_of_loop(seed: int, *, by_recv: bool) -> float:
     actions = np.random.default_rng(seed)
     with millrace.make_vec(env_id, COPIES, workers=COPIES, lanes=COPIES, autoreset_mode="SameStep") as env:
         env.reset(seed=COPIES * seed)
-        ids, steps = np.arange(COPIES), 0
+        ids = np.arange(COPIES)
+        steps = 0
         if by_recv:
             env.send(actions.integers(0, 2, COPIES))
         began_s = time.monotonic() + LOOPS_WARM_UP_S
@@ -153,7 +159,8 @@ def draw(found: dict[str, list[np.ndarray[Any, Any]]], seconds: float = 1.2) -> 
 
 def _panel(title: str, copies: list[np.ndarray[Any, Any]], seconds: float) -> str:
     began_s = min(calls[-1, 1] for calls in copies) - seconds - 0.5
-    paths, busy_s = {False: "", True: ""}, 0.0  # by whether it is a reset
+    paths = {False: "", True: ""}  # by whether it is a reset
+    busy_s = 0.0
     for row, calls in enumerate(copies):
         for start_s, end_s, is_reset in calls[(calls[:, 1] > began_s) & (calls[:, 0] < began_s + seconds)]:
             start, end = np.clip(np.array([start_s, end_s]) - began_s, 0.0, seconds)
@@ -198,7 +205,8 @@ def main() -> None:
             except RuntimeError as error:
                 print(f"left out: {error}", file=sys.stderr)
     medians = {name: statistics.median(rates) for name, rates in found.items() if rates}
-    slowest, never_waiting = medians.get(SUBPROC), medians[NEVER_WAIT]
+    slowest = medians.get(SUBPROC)
+    never_waiting = medians[NEVER_WAIT]
     table = Table(title=f"slow environment, {COPIES} copies, medians of {arguments.rounds} (least to most)")
     for column in ("", "env steps/s", "of copies that never wait", f"× {SUBPROC}"):
         table.add_column(column, justify="left" if not column else "right")

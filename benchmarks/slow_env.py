@@ -29,8 +29,11 @@ from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.registration import register
 from gymnasium.spaces import Box, Discrete
 
-MEAN_STEP_S, SIGMA, RESET_S = 0.005, 1.0, 0.2
-SHORTEST, LONGEST = 50, 150  # steps of an episode
+MEAN_STEP_S = 0.005
+SIGMA = 1.0
+RESET_S = 0.2
+SHORTEST = 50  # steps of an episode
+LONGEST = 150
 TIMELINE = "SLOW_ENV_TIMELINE"
 STEPS_PER_S = 1 / (MEAN_STEP_S + RESET_S / ((SHORTEST + LONGEST) / 2))  # of a copy that never waits
 
@@ -72,7 +75,9 @@ class Constant(gymnasium.Env[Any, Any]):
     def __init__(self, seconds: float = 0.01, steps: int = 100) -> None:
         self.observation_space = Box(0.0, 1.0, (1,), np.float32)
         self.action_space = Discrete(2)
-        self._seconds, self._steps, self._left = seconds, steps, steps
+        self._seconds = seconds
+        self._steps = steps
+        self._left = steps
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)

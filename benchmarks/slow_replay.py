@@ -27,9 +27,11 @@ SETTINGS: dict[str, Any] = {
     "algo": "sac", "envs": WORKERS, "rollout_steps": 8, "batch_size": 256, "learning_rate": 1e-3, "learning_starts": 128,
     "replay_size": 50_000, "updates_per_step": 1.0, "eval_every": 0, "eval_episodes": 1,
 }  # fmt: skip
-SLOW, FAST = {"env": "benchmarks.slow_env:TenMilliseconds-v0"}, {"env": "Pendulum-v1"}
+SLOW = {"env": "benchmarks.slow_env:TenMilliseconds-v0"}
+FAST = {"env": "Pendulum-v1"}
 NO_UPDATES = {"learning_starts": 10**9}
-WORKERS_ALONE, LEARNER_ALONE = "the workers alone", "the learner alone"
+WORKERS_ALONE = "the workers alone"
+LEARNER_ALONE = "the learner alone"
 
 
 def rate(settings: dict[str, Any], max_lag: int, steps: int, seed: int) -> float:

@@ -67,8 +67,10 @@ class Measure(NamedTuple):
                 return {self.column: ran.solved_s, f"{self.column}, env steps": steps}
 
 
-SMALL_RATE, LARGE_RATE = "env steps/s, 8 × 32", "env steps/s, 64 × 128"
-SECONDS, MEMORY = "solved, s", "memory, MB"
+SMALL_RATE = "env steps/s, 8 × 32"
+LARGE_RATE = "env steps/s, 64 × 128"
+SECONDS = "solved, s"
+MEMORY = "memory, MB"
 PPO_MEASURES = [
     Measure(SMALL_RATE, ZOO, 30_000, "rate"),
     Measure(LARGE_RATE, LARGE, 150_000, "rate"),

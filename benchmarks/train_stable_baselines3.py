@@ -37,7 +37,8 @@ class PrintUpdates(BaseCallback):
 def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
     """Make the algorithm that the settings describe."""
     linear = s.get("learning_rate_schedule") == "linear"
-    rate, seed = s["learning_rate"], {"seed": s["seed"], "device": "cpu", "gamma": s["gamma"]}
+    rate = s["learning_rate"]
+    seed = {"seed": s["seed"], "device": "cpu", "gamma": s["gamma"]}
     match s["algo"]:
         case "dqn":
             return DQN(

@@ -42,7 +42,8 @@ def rate(env: str, way: str, max_lag: int, seconds: float) -> float:
 
 
 def _rate(stage: Stage, network: Network, env: str, way: str, max_lag: int, seconds: float) -> float:
-    there, here = network.host(1), network.host(2)
+    there = network.host(1)
+    here = network.host(2)
     keys, token = stage.keys()
     port = free_port()
     host, before = ("127.0.0.1", ()) if way == "loopback" else (there.address, there.before)

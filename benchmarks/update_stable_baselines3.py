@@ -47,7 +47,9 @@ OBSERVATION = (Leaf("", "box", (4,), "float32"),)
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
 PENDULUM = (Leaf("", "box", (3,), "float32"),)
 PUSH = ActionSpec("box", (1,), "float32", low=(-2.0,), high=(2.0,))
-COPIES, NEVER, ROWS = 8, 10**9, 256
+COPIES = 8
+NEVER = 10**9
+ROWS = 256
 PLAYED = 500  # transitions that Stable-Baselines3 draws from; it learns nothing while it collects them
 STEPS = 8  # gradient steps, or updates, that are timed together
 
@@ -76,7 +78,8 @@ def some_batch(steps: int, seed: int) -> Batch:
 
 def dqn(width: int, target: float) -> Contest:
     """A gradient step on 64 transitions."""
-    rows, size = 64, 10_000
+    rows = 64
+    size = 10_000
     config = DQNConfig(
         net=(width, width), double=False, batch_size=rows, replay_size=size, target_every=NEVER, max_grad_norm=10
     )
@@ -196,7 +199,8 @@ def a2c(steps: int, target: float) -> Contest:
     theirs = TheirA2C("MlpPolicy", make_vec_env("CartPole-v1", COPIES), n_steps=steps, device="cpu")
     theirs.learn(steps * COPIES)
     buffer: Any = theirs.rollout_buffer
-    nothing, starts = torch.zeros(COPIES), np.zeros(COPIES)
+    nothing = torch.zeros(COPIES)
+    starts = np.zeros(COPIES)
 
     def update() -> None:
         buffer.compute_returns_and_advantage(nothing, starts)

@@ -56,13 +56,16 @@ class Stepping:
     """A contender whose copies are all stepped by `step(actions)`."""
 
     def __init__(self, task: Task, env: Any, step: Callable[[Any], Any] | None = None) -> None:
-        self._env, self._copies, self._step = env, task.copies, step or env.step
+        self._env = env
+        self._copies = task.copies
+        self._step = step or env.step
         space: Any = task.make().action_space
         self._actions = np.random.default_rng(task.copies).integers(space.n, size=(1000, task.copies))
         self.close: Callable[[], None] = env.close
 
     def rate(self, seconds: float) -> float:
-        steps, start = 0, time.perf_counter()
+        steps = 0
+        start = time.perf_counter()
         while (now := time.perf_counter()) - start < seconds:
             self._step(self._actions[steps % len(self._actions)])
             steps += 1
@@ -71,7 +74,8 @@ class Stepping:
 
 def make(name: str, task: Task) -> Contender:
     """Make a contender. Raises `ImportError` if its library is not installed."""
-    copies, makers = task.copies, [task.make] * task.copies
+    copies = task.copies
+    makers = [task.make] * task.copies
     match name:
         case "gymnasium Sync" | "gymnasium Async":
             env: Any = (SyncVectorEnv if name == "gymnasium Sync" else AsyncVectorEnv)(makers)

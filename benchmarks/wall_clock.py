@@ -26,10 +26,8 @@ from benchmarks.wall_clock_tables import page_part
 from benchmarks.writing import processor
 
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "wall_clock.md"
-BEGIN, END = (
-    "<!-- generated: `python -m benchmarks.wall_clock table` writes what follows -->",
-    "<!-- end of what is generated -->",
-)
+BEGIN = "<!-- generated: `python -m benchmarks.wall_clock table` writes what follows -->"
+END = "<!-- end of what is generated -->"
 
 
 def with_part(text: str, part: str) -> str:

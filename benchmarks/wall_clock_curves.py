@@ -23,7 +23,8 @@ from millrace.learner.run_folder.run_format import CONFIG_FILE
 
 CURVES = Path(__file__).with_name("curves.json")
 THEIR_CURVE = "curve.jsonl"
-RETURN_KEY, EVALUATED_KEY = "eval/mean_reward", "eval/env_steps"
+RETURN_KEY = "eval/mean_reward"
+EVALUATED_KEY = "eval/env_steps"
 
 
 class Curve(msgspec.Struct, kw_only=True):
@@ -70,7 +71,8 @@ def found_in(folder: Path, made_on: str | None) -> Iterator[Curve]:
 
 def of_run(path: Path, made_on: str) -> Curve:
     """The curve of a run folder of millrace."""
-    config, table = config_of_run(path), path / METRICS_FILE
+    config = config_of_run(path)
+    table = path / METRICS_FILE
     rows = read_rows(table) if table.exists() else []
     points = [(int(row.get(EVALUATED_KEY) or row[ENV_STEPS_KEY]), row[RETURN_KEY]) for row in rows if RETURN_KEY in row]
     summary = RunFolder.open(path).summary()

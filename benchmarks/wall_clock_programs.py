@@ -14,10 +14,12 @@ from millrace.learner.config.layers import resolve
 
 COPIES = 16
 ENVS = ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
-OURS, THEIRS = "millrace", "Stable-Baselines3"
+OURS = "millrace"
+THEIRS = "Stable-Baselines3"
 ALGORITHMS = {OURS: ("ppo", "sac", "tqc", "crossq", "xqc"), THEIRS: ("ppo", "sac", "tqc", "crossq")}
 NAMES = {"ppo": "PPO", "sac": "SAC", "tqc": "TQC", "crossq": "CrossQ", "xqc": "XQC"}
-EVAL_EVERY, EVAL_EPISODES = 10_000, 20
+EVAL_EVERY = 10_000
+EVAL_EPISODES = 20
 STEPS = {"ppo": 1_000_000}
 MOST_STEPS = 300_000
 """env steps of a curve, if `STEPS` has no others"""

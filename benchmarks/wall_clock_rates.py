@@ -25,7 +25,8 @@ from benchmarks.wall_clock_programs import COPIES, OURS, Program, rate_command
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 
 RATES = Path(__file__).with_name("rates.json")
-LOOK_S, LONGEST_S = 0.5, 600.0
+LOOK_S = 0.5
+LONGEST_S = 600.0
 LEAST_UPDATES = 2
 """of those that are measured"""
 
@@ -112,7 +113,8 @@ def measure(
     """Env steps/s over at least so many seconds after the warm-up. Raises `RuntimeError`."""
     command = rate_command(program, env, step_s, seed, threads, device)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
-        folder, began_s = Path(name), time.monotonic()
+        folder = Path(name)
+        began_s = time.monotonic()
         with started(command, folder) as process:
             try:
                 while True:

@@ -36,7 +36,9 @@ from benchmarks.wall_clock_programs import COPIES, EVAL_EPISODES, EVAL_EVERY, MO
 from benchmarks.writing import processor
 
 KINDS: dict[str, Any] = {"ppo": PPO, "sac": SAC, "tqc": TQC, "crossq": CrossQ}
-CURVE, MODEL, REPLAY = "curve.jsonl", "model.zip", "replay.pkl"
+CURVE = "curve.jsonl"
+MODEL = "model.zip"
+REPLAY = "replay.pkl"
 OTHER_EPISODES = 1_000_000
 """the seed of the evaluations"""
 EVALUATIONS_OF_A_CHECKPOINT = 5
@@ -47,8 +49,12 @@ class WriteCurve(BaseCallback):
 
     def __init__(self, folder: Path, env: VecEnv, every: int, episodes: int) -> None:
         super().__init__()
-        self._folder, self._env, self._every, self._episodes = folder, env, every, episodes
-        self._evaluated, self._saved = 0, 0  # times `every`
+        self._folder = folder
+        self._env = env
+        self._every = every
+        self._episodes = episodes
+        self._evaluated = 0  # times `every`
+        self._saved = 0  # times `every`
 
     def _on_training_start(self) -> None:
         self._evaluated = self._saved = self.num_timesteps // self._every

@@ -38,7 +38,11 @@ from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.worker_link import WorkerLink
 
 TRANSPORTS = ("ipc", "tcp")
-SHARE, PYTHON_US, OVERHEAD, FRAME = 0.8, 40, 1.02, 1.05  # targets
+# Targets.
+SHARE = 0.8
+PYTHON_US = 40
+OVERHEAD = 1.02
+FRAME = 1.05
 CARTPOLE = run_spec(4)
 PACKING = {
     "bytes": "bytes",
@@ -82,7 +86,9 @@ def large(run: RunSpec, rounds: int) -> list[dict[str, object]]:
     zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     times: dict[str, list[float]] = {f"{kind} {transport}": [] for kind in ("raw", "ours") for transport in TRANSPORTS}
     with tempfile.TemporaryDirectory() as folder:
-        links, sockets, addresses = {}, {}, {}
+        links = {}
+        sockets = {}
+        addresses = {}
         for way in times:
             address = f"ipc://{folder}/{way.replace(' ', '-')}" if way.endswith("ipc") else "tcp://127.0.0.1:*"
             if way.startswith("ours"):

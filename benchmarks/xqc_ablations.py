@@ -35,7 +35,8 @@ class WithoutJointPass(XQC):
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
         """As XQC's, in two passes."""
-        joint, size = self.joint(rows), len(rows.x)
+        joint = self.joint(rows)
+        size = len(rows.x)
         with torch.no_grad():
             next_logits = self.target.minibatch_outputs(joint.x[size:], joint.action[size:])
             target = self.target_distribution(rows, next_logits, joint.next_log_prob)
@@ -71,7 +72,8 @@ class OneValue(XQC):
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
         """½ Σ E[w (Q(s, a) − y)²] over both critics."""
-        joint, size = self.joint(rows), len(rows.x)
+        joint = self.joint(rows)
+        size = len(rows.x)
         with torch.no_grad():
             next_values = self.target.minibatch_outputs(joint.x, joint.action)[:, size:, 0].amin(0)
             y = rows.reward + rows.discount * (next_values - self.temperature * joint.next_log_prob)

@@ -38,7 +38,8 @@ class EnvSpaces(NamedTuple):
 
         `critic_keys`: of a Dict observation, which only the critic sees.
         """
-        observation, action = env.observation_space, action_spec(env.action_space)
+        observation = env.observation_space
+        action = action_spec(env.action_space)
         if action_masks == "info" and action.kind not in ("discrete", "multidiscrete"):
             raise UsageError(
                 f"action_masks info: expected an action space Discrete or MultiDiscrete, got {env.action_space}"

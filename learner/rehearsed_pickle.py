@@ -34,7 +34,9 @@ class _Function(NamedTuple):
 
 def rehearse(content: bytes) -> None:
     """Follow a pickle to its end. Raises `Unfit`, or what `pickletools` and an empty stack raise for damaged bytes."""
-    stack, marks, notes = list[object](), list[int](), dict[int, object]()
+    stack = list[object]()
+    marks = list[int]()
+    notes = dict[int, object]()
     bytes_left = len(content)
     for opcode, argument, _ in pickletools.genops(content):
         match opcode.name, argument:
@@ -63,7 +65,8 @@ def rehearse(content: bytes) -> None:
             case "GLOBAL", str(name) if name in CALLED or name.startswith(TYPES):
                 stack.append(_Function(name))
             case "REDUCE", _:
-                arguments, called = stack.pop(), stack.pop()
+                arguments = stack.pop()
+                called = stack.pop()
                 bytes_left -= _cost(called, arguments)
                 if bytes_left < 0:
                     raise Unfit("it has more bytes objects than fit into the file")

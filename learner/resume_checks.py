@@ -82,7 +82,8 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
 
 def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple[str, str] | None:
     """The first two that differ, as text in one line; or their numbers; None if all are equal."""
-    expected, got = [*expected], [*got]
+    expected = [*expected]
+    got = [*got]
     for one, other in zip(expected, got, strict=False):
         if one != other:
             return one_line(str(one)), one_line(str(other))

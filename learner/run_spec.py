@@ -31,7 +31,8 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
         if given and config.inference == "learner":
             raise UsageError(f"inference learner: {why}, and workers must act; use --inference workers")
     teams = _teams(config, spaces.seats)
-    steps, programs = config.algorithm.rollout_steps, config.opponents
+    steps = config.algorithm.rollout_steps
+    programs = config.opponents
     return rollout_spec(config, env, policy, steps, spaces=spaces, teams=teams, scripted=programs)
 
 

@@ -121,7 +121,9 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
     `policy` is the one to train. Raises `UserFacingError` if the other one is different, or cannot be read.
     """
     card, parameters, buffers = policy_to_start_from(config)
-    parts, run, where = config.from_parts, Path(config.start_from), f"start_from {config.start_from}"
+    parts = config.from_parts
+    run = Path(config.start_from)
+    where = f"start_from {config.start_from}"
     for name in dict.fromkeys(("observation", "action", "head", *PolicySpec.__struct_fields__)):
         both = getattr(policy, name), getattr(card.policy, name)
         if found := first_difference(*(both if name == "observation" else ((one,) for one in both))):
@@ -132,12 +134,11 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
         parts = "critic" if whole and policy.stores_scaled_actions else "policy"
     if whole:
         saved = _newest(run)
-        state, taken = (
-            saved.state.get("algorithm", {}),
-            f"policy, statistics{BESIDES[parts]}, after {saved.env_steps:,} env steps",
-        )
+        state = saved.state.get("algorithm", {})
+        taken = f"policy, statistics{BESIDES[parts]}, after {saved.env_steps:,} env steps"
     elif parts in ("policy", "best"):
-        state, taken = _of_policy_alone(config, policy, parameters, buffers), f"{'best ' * (parts == 'best')}policy"
+        state = _of_policy_alone(config, policy, parameters, buffers)
+        taken = f"{'best ' * (parts == 'best')}policy"
     else:
         raise UsageError(f"{where}: from_parts {parts}: expected a run with a checkpoint, got a policy alone")
     try:

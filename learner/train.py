@@ -57,7 +57,9 @@ def train(
         check_time()
 
     def publish(weights: tuple[Floats, Floats]) -> None:
-        deal, state, attributes = tally.training_goes_on(), tally.state, audience.env_attributes()
+        deal = tally.training_goes_on()
+        state = tally.state
+        attributes = audience.env_attributes()
         hub.publish(state.version, *weights, deal=deal, env_attributes=attributes, env_steps=state.env_steps)
 
     def tell(metrics: Row | None) -> None:

@@ -39,7 +39,8 @@ _Result = TypeVar("_Result")
 
 def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """The same function, which raises `UsageError` for arguments that its annotations do not allow."""
-    signature, who = inspect.signature(function), function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
+    signature = inspect.signature(function)
+    who = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @functools.cache
     def hints() -> dict[str, Any]:
@@ -130,7 +131,8 @@ def unusable(value: Any) -> str:
 
 def fits(value: Any, hint: Any) -> bool:
     """Whether an annotation allows this value."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, UnionType):
         return any(fits(value, part) for part in parts)
     if origin is Literal:
@@ -147,7 +149,8 @@ def fits(value: Any, hint: Any) -> bool:
 
 def words(hint: Any) -> str:
     """An annotation in words."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(map(words, parts)))
     if origin is Literal:

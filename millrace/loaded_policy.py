@@ -123,9 +123,11 @@ class LoadedPolicy:
         allowed = None if mask is None else self._checked_mask(mask, n)
         state = self._state_for(n, first)
         with np.errstate(all="ignore"):
-            params, chance = self._policy(leaves, state), self._distribution
+            params = self._policy(leaves, state)
+            chance = self._distribution
             if allowed is not None:
-                params, chance = forbid(params, allowed), self._masked_distribution
+                params = forbid(params, allowed)
+                chance = self._masked_distribution
             if self._generator is None:
                 chosen = chance.mode(params)[0]
             else:
@@ -154,7 +156,8 @@ class LoadedPolicy:
 
     def _checked_mask(self, mask: npt.ArrayLike, n: int) -> Bools:
         """A mask as an array [1, n, choices]. Raises `UsageError`."""
-        action, size = self.spec.action, choices(self.spec.action)
+        action = self.spec.action
+        size = choices(self.spec.action)
         try:
             given = np.asarray(mask)
         except (ValueError, TypeError):  # rows of different lengths

@@ -199,7 +199,8 @@ class PolicyParameters:
         flat = np.zeros(self.size, np.float32)
         for piece in self.layout:
             if piece.gain:
-                rows, columns = piece.shape[0], math.prod(piece.shape[1:])
+                rows = piece.shape[0]
+                columns = math.prod(piece.shape[1:])
                 normal = drawn.standard_normal((max(rows, columns), min(rows, columns)))
                 q, r = np.linalg.qr(normal)
                 q = q * np.sign(np.diag(r))
@@ -244,7 +245,8 @@ class PolicyParameters:
 
 
 def _pieces(fields: tuple[Field, ...]) -> tuple[Piece, ...]:
-    pieces, offset = [], 0
+    pieces = []
+    offset = 0
     for field in fields:
         pieces.append(Piece(field.name, field.shape, offset, field.gain))
         offset += math.prod(field.shape)

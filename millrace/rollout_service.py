@@ -164,7 +164,8 @@ class RolloutService:
         if restore is not None:
             state, self.restored = read(Path(restore))
             past = state.ledger, state.incarnations
-            self._version, self.env_steps = max(state.version - 1, -1), state.env_steps
+            self._version = max(state.version - 1, -1)
+            self.env_steps = state.env_steps
         self.config: RolloutConfig = config
         """All settings of collecting rollouts."""
         self._interrupts = Interrupts()
@@ -172,7 +173,9 @@ class RolloutService:
         self._over = threading.Event()
         self._owner = threading.get_ident()
         self._published = False
-        self._window, self._steps_before, self._began_s = EpisodeWindow(), self.env_steps, time.monotonic()
+        self._window = EpisodeWindow()
+        self._steps_before = self.env_steps
+        self._began_s = time.monotonic()
         self._normalizer: Normalizer | None = None
         self._resources = ExitStack()
         spec = EnvSpec.of(env, config.env_kwargs, config.all_wrappers(wrappers), config.eval_env_kwargs)
@@ -238,7 +241,8 @@ class RolloutService:
         self._check_open()
         if buffers is None and self._normalizer is not None and self.run.policy.normalize_observations:
             buffers = self._normalizer.buffers()
-        flat, flat_buffers = self.policy.flat(parameters), self.policy.flat_buffers(buffers)
+        flat = self.policy.flat(parameters)
+        flat_buffers = self.policy.flat_buffers(buffers)
         with self._lock:
             self._hub.publish(self._version + 1, flat, flat_buffers, deal=False)
         self._version += 1
@@ -424,7 +428,8 @@ class RolloutService:
         stacked = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
         leaves = self.run.policy.observation
         named = {leaf.path: array for leaf, array in zip(leaves, stacked.obs, strict=True)}
-        own, extras = self.run.policy.own, zip(self.run.extras, stacked.extras, strict=True)
+        own = self.run.policy.own
+        extras = zip(self.run.extras, stacked.extras, strict=True)
         fields = {name: getattr(stacked, name) for name in Batch.__struct_fields__}
         return RolloutBatch(
             **fields

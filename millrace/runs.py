@@ -68,7 +68,8 @@ class Metrics(dict[str, Array]):
     def __init__(self, rows: list[dict[str, Any]], unreadable: int = 0) -> None:
         names = dict.fromkeys(name for row in rows for name in row)
         super().__init__({name: _column([row.get(name) for row in rows]) for name in names})
-        self.unreadable, self._updates = unreadable, len(rows)
+        self.unreadable = unreadable
+        self._updates = len(rows)
 
     def __repr__(self) -> str:
         lost = f", {self.unreadable} more cannot be read" if self.unreadable else ""
@@ -114,7 +115,8 @@ class Run(os.PathLike[str]):
     def _trained(cls, path: Path, given: Mapping[str, Any]) -> Run:
         """A run that was just trained. `given`: environment and algorithm, if they are objects of the caller's program."""
         run = cls.__new__(cls)
-        run.path, run._given = path, dict(given)
+        run.path = path
+        run._given = dict(given)
         return run
 
     @property
@@ -232,7 +234,8 @@ class Run(os.PathLike[str]):
     def _facts(self) -> dict[str, str]:
         """What is most important about the run, by name. Never raises."""
         try:
-            config, summary = read_config(self.path), self.summary  # not `self.config`, which imports the algorithm
+            config = read_config(self.path)  # not `self.config`, which imports the algorithm
+            summary = self.summary
             facts = {"environment": config["env"], "algorithm": config["algo"], "seed": f"seed {config['seed']}"}
             if summary is None:
                 return facts | _newest_figures(self.metrics)
@@ -288,7 +291,8 @@ def train(
     """
     from millrace.launch import training
 
-    name, given = remembered_name(env), dict[str, Any](settings)
+    name = remembered_name(env)
+    given = dict[str, Any](settings)
     if named := [each for each in callbacks if isinstance(each, str)]:
         given["callbacks"] = named
     if wrappers is not None:

@@ -89,7 +89,9 @@ class Sb3VecEnv(VecEnv):
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
         env.merge_infos = False  # merged infos have one dtype and shape for all copies
-        self.env, self._monitored, self._rows_of_copy = env, monitored, max(1, len(env.seats))
+        self.env = env
+        self._monitored = monitored
+        self._rows_of_copy = max(1, len(env.seats))
         space = env.single_action_space
         self._nested_actions = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._flatten, self._unflatten = make_flatten(space), make_unflatten(space)
@@ -130,7 +132,8 @@ class Sb3VecEnv(VecEnv):
         info_list = self._info_list()
         for n, info in enumerate(info_list):
             if done[n]:
-                final_info, reset_info = info.pop("final_info", {}), dict(info)
+                final_info = info.pop("final_info", {})
+                reset_info = dict(info)
                 terminal_observation = reset_info.pop("final_obs")
                 self.reset_infos[n] = reset_info
                 info.clear()
@@ -172,7 +175,8 @@ class Sb3VecEnv(VecEnv):
         copies = self._copies(indices)
         if self._monitored and issubclass(Monitor, wrapper_class):
             return [True for _ in copies]
-        ascending, name = sorted(set(copies)), class_name(wrapper_class)
+        ascending = sorted(set(copies))
+        name = class_name(wrapper_class)
         found = dict(zip(ascending, self.env.calls.describe(ascending), strict=True))
         return [(copy := found[n]) is not None and name in copy.wrappers for n in copies]
 
@@ -202,7 +206,9 @@ class _Wrapping:
     def __init__(
         self, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
     ) -> None:
-        self._wrapper_class, self._keywords, self._monitor = wrapper_class, keywords, monitor
+        self._wrapper_class = wrapper_class
+        self._keywords = keywords
+        self._monitor = monitor
         self._made: dict[object, Callable[..., gymnasium.Env[Any, Any]]] = {}
 
     def __call__(self, env: EnvLike) -> Callable[..., gymnasium.Env[Any, Any]]:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 
-BLOCKS, ASCII = "▁▂▃▅▇", ".:=*#"
+BLOCKS = "▁▂▃▅▇"
+ASCII = ".:=*#"
 COLUMNS = 16
 MOST_POINTS = 1_000
 
@@ -31,11 +32,13 @@ class Sparkline:
         if len(self._points) < 2:
             return ""
         values = [y for _, y in self._last_of_parts(COLUMNS)]
-        low, high = min(values), max(values)
+        low = min(values)
+        high = max(values)
         step = (high - low) / (len(self._blocks) - 1) or 1.0
         return "".join(self._blocks[round((y - low) / step)] for y in values)
 
     def _last_of_parts(self, parts: int) -> list[tuple[float, float]]:
         """The last point of each of equal parts of the run; the newest one is a part of its own."""
-        first, last = self._points[0][0], self._points[-1][0]
+        first = self._points[0][0]
+        last = self._points[-1][0]
         return list({int((parts - 1) * (x - first) / (last - first)): (x, y) for x, y in self._points}.values())

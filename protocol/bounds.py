@@ -19,7 +19,9 @@ INVALID = (msgspec.MsgspecError, ValueError, RecursionError)
 Whoever decodes what another program wrote catches all of them.
 """
 
-MAX_NAME, MAX_LINE, MAX_TEXT = 200, 1_000, 64_000  # characters
+MAX_NAME = 200  # characters
+MAX_LINE = 1_000  # characters
+MAX_TEXT = 64_000  # characters
 LARGEST = 2**53  # every whole number up to here is exact as a float64 too
 MAX_TICKETS = 1 << 16  # in one message
 MAX_WORKERS = 1_024  # that one supervisor speaks for

@@ -251,7 +251,8 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
         """Make `copies` copies in the environment's own vectorized form, whatever its autoreset mode."""
-        own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, self.kwargs_of_copy()
+        own = VectorizeMode.VECTOR_ENTRY_POINT
+        kwargs = self.kwargs_of_copy()
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 
     def registered(self) -> gymnasium.envs.registration.EnvSpec:
@@ -314,7 +315,10 @@ class _Factory:
 
         `specs`: of ids that a process may not know that has just started, and for which the code may ask gymnasium.
         """
-        self._name, self._env, self._wrappers, self._specs = name, env, wrappers, specs
+        self._name = name
+        self._env = env
+        self._wrappers = wrappers
+        self._specs = specs
 
     def __call__(self, render_mode: str | None = None, **kwargs: Scalar) -> Any:
         for spec in self._specs:

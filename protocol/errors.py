@@ -269,7 +269,8 @@ def worker_exception(traceback: str) -> Exception | None:
     if not traceback:
         return None
     traceback = escaped(traceback).rstrip()
-    text, lines = WorkerTraceback(traceback), traceback.split("\n")
+    text = WorkerTraceback(traceback)
+    lines = traceback.split("\n")
     last_frame = max((n for n, line in enumerate(lines) if line.startswith('  File "')), default=len(lines))
     raised = dropwhile(lambda line: line.startswith(" "), lines[last_frame:])
     name, colon, message = "\n".join(raised).partition(": ")

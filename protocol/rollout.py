@@ -98,7 +98,8 @@ def _env_steps(valid: Array, resets: Array | None) -> int:
 
 def rollout_bytes(run: RunSpec) -> int:
     """Number of bytes of all arrays of a rollout of this run."""
-    T, N = run.rollout_steps, run.sent_columns
+    T = run.rollout_steps
+    N = run.sent_columns
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
     if run.masked:

@@ -10,7 +10,8 @@ class TokenBucket:
     """A bucket that is full at first and fills again at a steady rate."""
 
     def __init__(self, most: float, per_s: float) -> None:
-        self._most, self._per_s = most, per_s
+        self._most = most
+        self._per_s = per_s
         self._tokens = most
         self._filled_s: float | None = None
 

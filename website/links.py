@@ -102,7 +102,8 @@ def anchors(text: str) -> set[str]:
     """All anchors of a page: of its headings (a title that comes again gets a number), and those that it names itself."""
     found: set[str] = set()
     for title in headings(text):
-        name, number = slug(title), 0
+        name = slug(title)
+        number = 0
         while (anchor := f"{name}_{number}" if number else name) in found:
             number += 1
         found.add(anchor)

@@ -70,7 +70,8 @@ def shown_names() -> list[str]:
 
 
 def _table(record: type[msgspec.Struct], names: Sequence[str], prefix: str = "") -> str:
-    hints, texts = get_type_hints(record, include_extras=True), field_texts(record)
+    hints = get_type_hints(record, include_extras=True)
+    texts = field_texts(record)
     resumed = {} if record is RunFlags else declared(record)
     defaults = record()
     return table(

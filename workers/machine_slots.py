@@ -32,15 +32,18 @@ from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.worker")
 
-FILE_VARIABLE, LIMIT_VARIABLE = "MILLRACE_SLOTS", "MILLRACE_COPIES_PER_MACHINE"
+FILE_VARIABLE = "MILLRACE_SLOTS"
+LIMIT_VARIABLE = "MILLRACE_COPIES_PER_MACHINE"
 FILE = "/tmp/millrace-slots-{user}"  # not of $TMPDIR, which may differ between the processes of a user
 FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is not followed, a FIFO does not block
-OWN, SHARED = 0o600, 0o666  # modes
+OWN = 0o600  # a mode
+SHARED = 0o666  # a mode
 MOST = 1 << 16  # slots of a file; there are as many ports
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
 TOUCH_EVERY_S = 3600.0
-WAIT_S, POLL_S = 30.0, 0.2  # for a slot; the copies of another worker may take long to close
+WAIT_S = 30.0  # for a slot; the copies of another worker may take long to close
+POLL_S = 0.2
 
 
 class NoSlot(UsageError):
@@ -66,7 +69,8 @@ class Slots:
 
         Raises `NoSlot` if none becomes free within `WAIT_S`, and `UsageError` if there is no limit and all are locked.
         """
-        until_s, said = time.monotonic() + WAIT_S, False
+        until_s = time.monotonic() + WAIT_S
+        said = False
         file = f"{slots_path()}, a file of {_owner(self.fd)}"
         line = f"{NO_SLOT} on {socket.gethostname()}: other env copies hold all {self.most} of {LIMIT_VARIABLE} ({file})"
         while (slot := self._take_now()) is None:
@@ -144,7 +148,8 @@ def slots_path() -> Path:
 def open_slots() -> int:
     """A descriptor whose locks belong to it and its copies. Raises `UsageError` if the file or the limit cannot be used."""
     copies_per_machine()  # before any worker starts
-    path, shared = slots_path(), bool(os.environ.get(FILE_VARIABLE))
+    path = slots_path()
+    shared = bool(os.environ.get(FILE_VARIABLE))
     mode = SHARED if shared else OWN
     try:
         with suppress(FileExistsError):

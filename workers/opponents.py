@@ -84,7 +84,8 @@ class OtherTeams:
     """The other teams in some env copies."""
 
     def __init__(self, run: RunSpec, matches: Sequence[Match], generator: np.random.Generator) -> None:
-        self._run, self._generator = run, generator
+        self._run = run
+        self._generator = generator
         self._matches = list(matches)
         seats = np.zeros((len(matches), run.seats_of_copy), bool)
         for n, match in enumerate(matches):
@@ -113,7 +114,8 @@ class OtherTeams:
     def result(self, n: int, returns: Sequence[float]) -> tuple[float, float, int]:
         """Of an episode of copy n, by the returns of its seats: the return of the policy's team, the score, the opponent."""
         of_teams = [sum(returns[seat] for seat in team) for team in self._run.teams]
-        own, best = of_teams[self._matches[n].team], max(of_teams)
+        own = of_teams[self._matches[n].team]
+        best = max(of_teams)
         score = 1 / of_teams.count(best) if own == best else 0.0  # of all teams the scores add up to 1
         return own, score, self._matches[n].opponent.number
 

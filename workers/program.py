@@ -36,7 +36,8 @@ from millrace.workers.watchdog import Watchdog
 from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
-LOOK_FOR_PARENT_S, LEAVE_WITHIN_S = 0.5, 2.0  # after the supervisor's death
+LOOK_FOR_PARENT_S = 0.5
+LEAVE_WITHIN_S = 2.0  # after the supervisor's death
 CLOSED_WITHIN_S = 1.0  # the sockets of a killed process
 AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
 

@@ -47,8 +47,10 @@ class SharedWeights:
     def write(self, first_session: int, version: int, frames: Sequence[bytes | memoryview]) -> None:
         """Share this message. Raises `OSError` without memory, and `struct.error` for what is no message of weights."""
         lengths = [*map(len, frames), *[0] * (FRAMES - len(frames))]
-        entry, place = ENTRY.pack(first_session, version, len(frames), *lengths), self._next
-        at, self._next = _begin(place), (place + 1) % SHARED_VERSIONS
+        entry = ENTRY.pack(first_session, version, len(frames), *lengths)
+        place = self._next
+        at = _begin(place)
+        self._next = (place + 1) % SHARED_VERSIONS
         os.pwrite(self._fd, bytes(ENTRY.size), place * ENTRY.size)
         for frame in frames:
             if os.pwrite(self._fd, frame, at) < len(frame):
@@ -69,7 +71,8 @@ class SharedWeightsReader:
     """A worker's side."""
 
     def __init__(self, fd: int, wake_fd: int) -> None:
-        self._fd, self._wake = fd, WakePipe(read_fd=wake_fd)
+        self._fd = fd
+        self._wake = WakePipe(read_fd=wake_fd)
         self.wake_fd = wake_fd
         """can be read when weights have come"""
 
@@ -82,7 +85,8 @@ class SharedWeightsReader:
             first_session, version, frames, *lengths = entry
             if not frames or version not in versions or not is_of_learner(session, first_session):
                 continue
-            found, at = [], _begin(place)
+            found = []
+            at = _begin(place)
             for length in lengths[:frames]:
                 found.append(os.pread(self._fd, length, at))
                 at += length

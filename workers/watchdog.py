@@ -37,7 +37,8 @@ class Watchdog:
         if now < self._due_s and timeout_s == self._set_to_s:
             return
         interval_s = min(1.0, timeout_s / 4)
-        self._set_to_s, self._due_s = timeout_s, now + interval_s
+        self._set_to_s = timeout_s
+        self._due_s = now + interval_s
         if timeout_s == math.inf:
             self.stop()
         else:

@@ -70,7 +70,8 @@ def installed() -> list[str]:
 
 def install(name: str) -> None:
     """Make its environment from the beginning. Raises `CalledProcessError`."""
-    peer, folder = PEERS[name], ENVS / name
+    peer = PEERS[name]
+    folder = ENVS / name
     share_torch()
     shutil.rmtree(folder, ignore_errors=True)
     venv.create(folder, with_pip=True)

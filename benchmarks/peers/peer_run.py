@@ -52,7 +52,8 @@ def mean_return(env_id: str, episodes: int, greedy: Greedy) -> float:
     """The mean return of this many greedy episodes, which are played side by side."""
     copies: list[gymnasium.Env[Any, Any]] = [gymnasium.make(env_id) for _ in range(episodes)]
     obs = [copy.reset(seed=FIRST_SEED + lane)[0] for lane, copy in enumerate(copies)]
-    total, playing = 0.0, list(range(episodes))
+    total = 0.0
+    playing = list(range(episodes))
     while playing:
         actions = greedy(np.stack([obs[lane] for lane in playing]).astype(np.float32))
         for lane, action in zip(list(playing), actions, strict=True):

@@ -56,7 +56,8 @@ def config(s: dict[str, Any], own: bool) -> dict[str, Any]:
     """Its default.ini. Unless its own settings are requested, the common settings replace those in it."""
     from pufferlib.pufferl import load_config
 
-    argv, sys.argv = sys.argv, sys.argv[:1]
+    argv = sys.argv
+    sys.argv = sys.argv[:1]
     found: dict[str, Any] = load_config("default")["train"]
     sys.argv = argv
     found |= {
@@ -83,7 +84,8 @@ def main() -> None:
 
     torch.set_num_threads(1)
     run = PeerRun()
-    s, own = run.settings, run.how == "own"
+    s = run.settings
+    own = run.how == "own"
     if own:
         s["steps"] = max(s["steps"], OWN_STEPS) if run.until_solved else s["steps"]
     torch.manual_seed(s["seed"])

@@ -26,7 +26,8 @@ def main() -> None:
     logging.getLogger("ray").setLevel(logging.ERROR)
     runners = s.get("processes", RUNNERS)
     init(num_cpus=runners + 1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    rate, rows = s["learning_rate"], s["envs"] * s["rollout_steps"]
+    rate = s["learning_rate"]
+    rows = s["envs"] * s["rollout_steps"]
     config = (
         PPOConfig()
         .environment(s["env"])

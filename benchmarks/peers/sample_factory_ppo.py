@@ -77,7 +77,8 @@ def arguments(s: dict[str, Any], how: str) -> list[str]:
         named = common | own | {"reward_scale": 0.1}
     else:
         serial = how == "serial"
-        rows, splits = s["envs"] * s["rollout_steps"], 1 if serial or s["envs"] == workers else 2
+        rows = s["envs"] * s["rollout_steps"]
+        splits = 1 if serial or s["envs"] == workers else 2
         named = common | {
             "serial_mode": serial, "async_rl": not serial, "num_workers": 1 if serial else workers,
             "num_envs_per_worker": s["envs"] if serial else s["envs"] // workers, "worker_num_splits": splits,

@@ -71,7 +71,8 @@ def main() -> None:
         with torch.no_grad():
             return actor(obs)[0].argmax(-1).numpy()
 
-    env_steps, ended = 0, False
+    env_steps = 0
+    ended = False
     while not ended:
         for group in algorithm.optim._optim.param_groups:
             group["lr"] = scheduled(s, "learning_rate", env_steps)

@@ -26,7 +26,8 @@ class Make:
     """Makes the copies of one process. It is a class, because it is sent to that process."""
 
     def __init__(self, env: str, copies: int) -> None:
-        self.env, self.copies = env, copies
+        self.env = env
+        self.copies = copies
 
     def one(self) -> Any:
         import gymnasium
@@ -54,10 +55,12 @@ def main() -> None:
     s = run.settings
     torch.manual_seed(s["seed"])
     processes = s.get("processes", PROCESSES)
-    copies, rows = s["envs"] // processes, s["envs"] * s["rollout_steps"]
+    copies = s["envs"] // processes
+    rows = s["envs"] * s["rollout_steps"]
     make = Make(s["env"], copies)
     one = make.one()
-    inputs, outputs = one.observation_spec["observation"].shape[-1], one.action_spec.space.n
+    inputs = one.observation_spec["observation"].shape[-1]
+    outputs = one.action_spec.space.n
     pi = network(inputs, outputs, 0.01)
     actor = ProbabilisticActor(
         TensorDictModule(pi, in_keys=["observation"], out_keys=["logits"]),

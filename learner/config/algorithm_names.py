@@ -78,7 +78,8 @@ def name_of(algorithm: type) -> str:
 
     Raises `UsageError` if the class lacks something.
     """
-    module, qualname = algorithm.__module__, algorithm.__qualname__
+    module = algorithm.__module__
+    qualname = algorithm.__qualname__
     for short, name in ALGORITHMS.items():
         if name == f"{module}:{qualname}":
             return short

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from millrace.learner.config.config import Config
 
-MOST_EPISODES, FEWEST_EPISODES = 100, 10  # of an evaluation whose number of episodes is not set
+MOST_EPISODES = 100  # of an evaluation whose number of episodes is not set
+FEWEST_EPISODES = 10
 LONGEST_EPISODE = 10  # its episodes are cut after so many times the mean length of training, if there is no time limit
 
 
@@ -34,7 +35,8 @@ def final_evaluation_size(
     """
     if config.eval_episodes is not None or config.eval_every:
         return evaluation_size(config)
-    budget, most = 3 * env_steps // 4, config.eval_max_steps
+    budget = 3 * env_steps // 4
+    most = config.eval_max_steps
     length = time_limit or episode_length
     if length is None:  # episodes may have no end
         return EvaluationSize(FEWEST_EPISODES, max(min(most, budget), 1))

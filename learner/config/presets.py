@@ -63,7 +63,8 @@ def origin(config: Config) -> str:
     that differ from the defaults are named: they were given, or come from a file or the preset of another environment.
     """
     preset = environment_presets(config.algo).get(config.env)
-    mine, defaults = _settings(config), _settings(type(config)(algorithm=type(config.algorithm)()))
+    mine = _settings(config)
+    defaults = _settings(type(config)(algorithm=type(config.algorithm)()))
     if preset is None:
         given = [name for name in config.algorithm.__struct_fields__ if mine[name] != defaults[name]]
         found = f"settings: defaults, except {', '.join(given)}" if given else "settings: defaults"

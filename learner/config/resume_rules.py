@@ -57,7 +57,8 @@ def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str
 def changes(run: msgspec.Struct, given: msgspec.Struct) -> Iterator[Change]:
     """The settings that differ, in the order of the fields. Both records are of one type."""
     for name, on_resume in declared(type(run), by_type=True).items():
-        before, now = getattr(run, name), getattr(given, name)
+        before = getattr(run, name)
+        now = getattr(given, name)
         if not isinstance(before, msgspec.Struct) and before != now:
             yield Change(name, on_resume, before, now)
 

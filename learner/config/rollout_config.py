@@ -22,7 +22,8 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 HEARTBEAT_S = 1.0
-SEAT_ID, WITH_STATE = "millrace.protocol.envs.seats:seat_id", "millrace.protocol.envs.seats:with_state"
+SEAT_ID = "millrace.protocol.envs.seats:seat_id"
+WITH_STATE = "millrace.protocol.envs.seats:with_state"
 STALL_TIMEOUT_S = 600.0
 
 

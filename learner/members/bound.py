@@ -22,7 +22,8 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
-LINGER_S, LINGER_ELSEWHERE_S = 0.5, 2.0  # for what is queued, when the socket is closed
+LINGER_S = 0.5  # for what is queued, when the socket is closed
+LINGER_ELSEWHERE_S = 2.0  # the same, if the learner is on another machine
 
 
 @dataclass(frozen=True)

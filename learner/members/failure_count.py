@@ -32,7 +32,9 @@ class FailureCount:
 
     def __init__(self, allowed: int, copies: int = 1, began_s: float = 0.0) -> None:
         """`allowed`: `max_env_failures`. `copies`: the env copies of the run. `began_s`: when the learner began."""
-        self._allowed, self._copies, self._began_s = allowed, copies, began_s
+        self._allowed = allowed
+        self._copies = copies
+        self._began_s = began_s
         self._in_a_row: dict[int | str, float] = {}
         self._error: EnvironmentFailed | PolicyFailed | None = None
         self._within_hour: list[tuple[float, float]] = []  # of failures after env steps: when, and the seconds worked before
@@ -49,13 +51,15 @@ class FailureCount:
         if worked_s is not None:
             recent = [(at_s, before_s) for at_s, before_s in self._within_hour if now - at_s < HOUR_S]
             self._within_hour = [*recent, (now, min(worked_s, HOUR_S))]
-            failures, allowed = len(self._within_hour), self._allowed_within_hour(now)
+            failures = len(self._within_hour)
+            allowed = self._allowed_within_hour(now)
             if failures > allowed:
                 more = f"as many for each {WORK_S:g} s that the workers which failed had worked"
                 copies = f"as many an hour for each of {self._copies} env copies"
                 why = f"{self._allowed}, {more}, and {copies}; set it higher if need be"
                 return f"failure {failures} within an hour; max_env_failures allows {allowed} ({why})"
-        in_a_row, allowed = max(map(self._in_a_row.__getitem__, lanes)), min(self._allowed, MOST_IN_A_ROW)
+        in_a_row = max(map(self._in_a_row.__getitem__, lanes))
+        allowed = min(self._allowed, MOST_IN_A_ROW)
         if in_a_row <= allowed:
             return ""
         hint = "; shorter rollouts may help" if stepped else ""

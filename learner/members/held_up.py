@@ -37,14 +37,18 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
 
     The largest is that of the member that is held up longest, or else of the slowest.
     """
-    row, seconds, silent_s = member.status(now), 0.0, now - member.alive_s
+    row = member.status(now)
+    seconds = 0.0
+    silent_s = now - member.alive_s
     # Its speed is measured between two heartbeats with more steps, so a worker that has made none has no speed.
     unmeasured = "has begun to step" if row.steps else "no env step yet"
     what = f"{row.steps_per_s:,.1f} steps/s" if row.steps_per_s else unmeasured
     if silent_s >= LONG_S:
-        seconds, what = silent_s, f"silent for {silent_s:.0f} s"
+        seconds = silent_s
+        what = f"silent for {silent_s:.0f} s"
     elif row.doing_s >= LONG_S and row.doing in DOING:
-        seconds, what = row.doing_s, in_words(row.doing, row.doing_s)
+        seconds = row.doing_s
+        what = in_words(row.doing, row.doing_s)
     return seconds, -row.steps_per_s, f"worker {row.worker} on {row.host}: {what}"
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from millrace.protocol.token_bucket import TokenBucket
 
-AT_ONCE, PER_S = 10_000, 100.0  # Hellos of one key
+AT_ONCE = 10_000  # Hellos of one key
+PER_S = 100.0  # Hellos of one key
 
 
 class JoinLimiter:

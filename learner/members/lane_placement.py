@@ -35,7 +35,8 @@ class PlacedLane:
 
     def restart(self) -> None:
         """The lane left its worker: its next owner starts it on new env copies."""
-        self.owner, self.moving = None, False
+        self.owner = None
+        self.moving = False
 
 
 L = TypeVar("L", bound=PlacedLane)
@@ -51,7 +52,8 @@ class LanePlacement(Generic[L]):
 
     def __init__(self, lanes: Sequence[L], tie_break: Callable[[Member], Any]) -> None:
         """`tie_break`: among workers with equally few lanes, the one with the smallest value gets the next lane."""
-        self._lanes, self._tie_break = lanes, tie_break
+        self._lanes = lanes
+        self._tie_break = tie_break
         self._unplaced = {lane.number for lane in lanes}
         self._settled = False
         self._waiting_for: Member | None = None  # a lane of this worker is to move, once its tickets have ended
@@ -105,7 +107,8 @@ class LanePlacement(Generic[L]):
                 break
             lane = min((self._lanes[n] for n in fullest.lanes), key=lambda lane: (lane.busy, -lane.number))
             if lane.busy:
-                lane.moving, self._waiting_for = True, fullest
+                lane.moving = True
+                self._waiting_for = fullest
                 break
             fullest.lanes.remove(lane.number)
             out.append((fullest.peer, Release(fullest.session, (LaneIncarnation(lane.number, lane.incarnation),))))

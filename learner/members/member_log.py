@@ -26,7 +26,8 @@ class MemberLog:
     """Log lines that workers cause: few for each worker and for each key, however much it sends."""
 
     def __init__(self, link: LearnerLink, clock: Callable[[], float]) -> None:
-        self._link, self._clock = link, clock
+        self._link = link
+        self._clock = clock
         self._limit = LogRateLimiter()
         self._of_key: dict[str, LogBudget] = {}  # as many as there are keys, and one more
         self._traceback = ""  # the newest that was logged
@@ -67,7 +68,8 @@ class MemberLog:
         note += f" ({suppressed} more lines about it, or about workers of the same key, were left out)" if suppressed else ""
         first, _, more = lines.partition("\n")
         if more and more == self._traceback:
-            first, more = f"{first}; its traceback is the same as the one before", ""
+            first = f"{first}; its traceback is the same as the one before"
+            more = ""
         self._traceback = more or self._traceback
         log.log(level, "%s%s%s", first, note, f"\n{more}" if more else "", extra={"event": event} if event else None)
 

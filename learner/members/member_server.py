@@ -101,9 +101,13 @@ class MemberServer:
         """`processes` are the worker processes that this program started."""
         self.listened_s = clock()
         """Time at which the server last listened."""
-        self._link, self._coordinator, self._callbacks, self._processes = link, coordinator, callbacks, processes
+        self._link = link
+        self._coordinator = coordinator
+        self._callbacks = callbacks
+        self._processes = processes
         self._membership = coordinator.membership
-        self._settings, self._clock = settings or ServerSettings(), clock
+        self._settings = settings or ServerSettings()
+        self._clock = clock
         self._keys = KeyRevocation(link)
         self.member_log = MemberLog(link, clock)
         """lines about members, few for each peer"""
@@ -165,7 +169,8 @@ class MemberServer:
         Raises `NoWorkers` after `timeout_s`, or at once if so many cannot join any more. Workers that only evaluate do not
         count.
         """
-        deadline_s, wait = self._clock() + timeout_s, LongWait(self._clock())
+        deadline_s = self._clock() + timeout_s
+        wait = LongWait(self._clock())
         while (joined := len(self._membership.collectors())) < workers:
             now = self._clock()
             self.check_left(workers, collecting=True)
@@ -227,7 +232,8 @@ class MemberServer:
 
     def what_workers_do(self) -> str:
         """What the workers do, those that are held up longest first, and what is awaited if there are none."""
-        members, processes = self._membership.members.values(), self._processes
+        members = self._membership.members.values()
+        processes = self._processes
         doing, wrote = what_they_do(members, processes.running(), processes.said(), self._clock())
         return "; ".join([doing or f"waiting for {self.awaited()}", *wrote])
 
@@ -310,7 +316,8 @@ class MemberServer:
     def _log_events(self, cause: bytes | None) -> None:
         told = ""  # the worker of whose failure the log has just told
         for event in self._membership.take_events():
-            line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested | NamelessHello)
+            line = describe(event)
+            expected = isinstance(event, WorkerJoined | RejoinRequested | NamelessHello)
             match event:
                 case WorkerRefused(_, why) | NamelessHello(_, why):
                     self._last_turned_away = f"was refused: {one_line(why)}"
@@ -321,7 +328,8 @@ class MemberServer:
                     self._last_turned_away = self._last_turned_away if expected else why
                     expected = expected or worker == told
                 case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
-                    line, expected = line.partition("\n")[0], True
+                    line = line.partition("\n")[0]
+                    expected = True
                 case Failed(worker):
                     told = worker
                 case _:

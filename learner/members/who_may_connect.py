@@ -73,7 +73,8 @@ def keyring_for(config: Listening, now: datetime) -> Keyring | None:
 
 def generate_run_keys(worker: str, now: datetime) -> tuple[Keyring, Token]:
     """Keys for one run on this machine. They are in no file."""
-    server, client = Key.new(), Key.new()
+    server = Key.new()
+    client = Key.new()
     return Keyring(server, ClientList().with_client(worker, client.public, now)), Token(server.public, client)
 
 

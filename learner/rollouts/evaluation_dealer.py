@@ -68,7 +68,8 @@ class EvaluationPlan:
 
         `max_steps`: env steps that the whole evaluation may take. Each episode gets an equal share, at least one step.
         """
-        most_steps, of_best = min(max(1, max_steps // episodes), LARGEST), purpose is Purpose.CONFIRMATION
+        most_steps = min(max(1, max_steps // episodes), LARGEST)
+        of_best = purpose is Purpose.CONFIRMATION
         return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, most_steps, of_best=of_best)
 
     def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
@@ -161,21 +162,29 @@ class EvaluationDealer:
         """Begin to evaluate this version, `beside` training if so. `deal` then gives out the tickets."""
         assert not self.pending, "an evaluation is pending"
         self._first += len(self._seeds)
-        self._plan, self.version, self._on_rows, self.beside, self._most_workers = plan, version, on_rows, beside, 0
+        self._plan = plan
+        self.version = version
+        self._on_rows = on_rows
+        self.beside = beside
+        self._most_workers = 0
         self._seeds = [plan.seeds[i : i + plan.copies] for i in range(0, len(plan.seeds), plan.copies)]
         self._undealt = list(range(len(self._seeds)))
-        self._played, self._rows = {}, {}
+        self._played = {}
+        self._rows = {}
 
     def all_play(self) -> None:
         """The pending evaluation is beside training no more. With a limit of copies, one other worker plays."""
-        self.beside, self._most_workers = False, 1
+        self.beside = False
+        self._most_workers = 1
 
     def end(self) -> list[PlayedEpisode]:
         """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
         for number, member in [*self.held.items(), *self.second.items()]:
             del member.tickets[number]
         self._plan = None
-        self.held, self.second, self._rows = {}, {}, {}
+        self.held = {}
+        self.second = {}
+        self._rows = {}
         answers = [answer for _, answer in sorted(self._played.items())]
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
@@ -185,7 +194,8 @@ class EvaluationDealer:
         They are in the order of joining, those that only evaluate first. With a limit of copies, the first of them play,
         because a worker keeps its copies.
         """
-        plan, out = self._plan, list[Outgoing]()
+        plan = self._plan
+        out = list[Outgoing]()
         assert plan is not None
         members = self._who_may_play([member for member in active if member.hello.evaluates or not self.beside], plan)
         holds = self._held_by()
@@ -322,7 +332,8 @@ class EvaluationDealer:
 
     def _matches(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The opponent of each episode of a ticket, and the team that is evaluated: each opponent meets all teams."""
-        plan, count = self._plan, len(self._run.teams)
+        plan = self._plan
+        count = len(self._run.teams)
         if plan is None or not count:
             return (), ()
         index = number - self._first

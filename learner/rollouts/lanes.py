@@ -39,7 +39,9 @@ class TicketedLane(PlacedLane):
         super().restart()
         if self.dealt:
             self.incarnation += 1
-            self.dealt, self.next_sequence, self.out_of_order = 0, 0, set()
+            self.dealt = 0
+            self.next_sequence = 0
+            self.out_of_order = set()
 
     def deal(self, number: int, round_number: int, version: int, opponent: int | None) -> Ticket:
         """A ticket for the next rollout, for the lane's owner."""

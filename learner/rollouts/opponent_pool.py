@@ -86,7 +86,8 @@ class OpponentPool:
     """The opponents of one run."""
 
     def __init__(self, settings: PoolSettings, state: PoolState | None = None) -> None:
-        self._settings, self.state = settings, state or PoolState()
+        self._settings = settings
+        self.state = state or PoolState()
         missing = settings.scripted - len(self.state.scripted)
         self.state.scripted.extend([FIRST_RATING] * missing)
 
@@ -103,7 +104,8 @@ class OpponentPool:
 
     def made(self, version: int, env_steps: int) -> bool:
         """New weights were made. Returns whether they are a snapshot."""
-        snapshots, settings = self.state.snapshots, self._settings
+        snapshots = self.state.snapshots
+        settings = self._settings
         if not settings.window:
             return False
         if snapshots and (version <= snapshots[-1].version or env_steps < snapshots[-1].env_steps + settings.save_steps):

@@ -42,10 +42,12 @@ class SentWeights:
 
     def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember], named: Named) -> list[Outgoing]:
         """These messages; after all of them, the weights of the versions that they name and their workers do not hold."""
-        out, weights = list[Outgoing](), list[Outgoing]()
+        out = list[Outgoing]()
+        weights = list[Outgoing]()
         for peer, message in orders:
             if isinstance(message, Collect | Evaluate):
-                member, keep = members[peer], named(members[peer].tickets)
+                member = members[peer]
+                keep = named(members[peer].tickets)
                 for version in sorted(message.versions - member.versions.keys()):
                     weights += self._sent(member, version, acts=version == message.version)
                 member.versions = {version: sent_at for version, sent_at in member.versions.items() if version in keep}

@@ -41,7 +41,9 @@ class StallWatch:
     """Watches one run."""
 
     def __init__(self, coordinator: TicketCoordinator, stall_timeout_s: float, timeouts: CallTimeouts) -> None:
-        self._coordinator, self._stall_timeout_s, self._timeouts = coordinator, stall_timeout_s, timeouts
+        self._coordinator = coordinator
+        self._stall_timeout_s = stall_timeout_s
+        self._timeouts = timeouts
         self._mark: object = None
         self._progress_s = self._answered_s = 0.0
         self._answered = 0  # episodes of the pending evaluation
@@ -60,7 +62,8 @@ class StallWatch:
         of_collectors, of_evaluators = self._coordinator.membership.progress.values()
         mark = (of_collectors, evaluating and of_evaluators, progress)
         if mark != self._mark:
-            self._mark, self._progress_s = mark, now
+            self._mark = mark
+            self._progress_s = now
         if now >= self._budgets_due_s:
             self._budgets_due_s = now + CHECK_BUDGETS_EVERY_S
             if over := self._over_budget(now):
@@ -83,7 +86,8 @@ class StallWatch:
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:
-            self._answered, self._answered_s = answered, now
+            self._answered = answered
+            self._answered_s = now
         return overdue
 
     def _in_call(self, member: Member, now: float) -> bool:
@@ -96,7 +100,8 @@ class StallWatch:
     def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
         """The members whose oldest ticket is older than all their tickets may take together."""
         coordinator = self._coordinator
-        run, plan = coordinator.run, coordinator.evaluation.plan
+        run = coordinator.run
+        plan = coordinator.evaluation.plan
         rollout_s = self._longest_s(run.copies, run.rollout_steps)
         episodes_s = 0.0 if plan is None else self._longest_s(plan.copies, plan.most_steps)
         held = {

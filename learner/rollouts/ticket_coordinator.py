@@ -142,7 +142,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def collected(self) -> int:
         """Env steps of the next update's rollouts: of those that have come, and of those under way, as workers report."""
-        rollouts, of_one = self.rollouts, self.run.rollout_steps * self.run.copies
+        rollouts = self.rollouts
+        of_one = self.run.rollout_steps * self.run.copies
         awaited = Counter(ticket.peer for ticket in rollouts.awaited())
         under_way = (min(self.members[peer].steps_under_way, count * of_one) for peer, count in awaited.items())
         return rollouts.collected() + sum(under_way)

@@ -31,10 +31,13 @@ class LearnerTime:
     ) -> None:
         """`no_worker` returns what is awaited if there is no member; `stepping`, who steps if the members do not."""
         self.phase: Phase = "starting"
-        self.since_s, self._last = now, ""  # who waited last; empty if the last wait for rollouts was short
+        self.since_s = now
+        self._last = ""  # who waited last; empty if the last wait for rollouts was short
         self.spent_s: dict[Phase, float] = dict.fromkeys(get_args(Phase), 0.0)
         """seconds of the phases that have ended"""
-        self._coordinator, self._no_worker, self._stepping = coordinator, no_worker, stepping
+        self._coordinator = coordinator
+        self._no_worker = no_worker
+        self._stepping = stepping
 
     @property
     def evaluating(self) -> bool:
@@ -46,7 +49,9 @@ class LearnerTime:
         if self.phase == "gathering":
             waited_s = now - self.since_s
             self._last = f"waited {waited_s:.0f} s for rollouts" if waited_s >= LONG_S else ""
-        self.spent_s, self.phase, self.since_s = self.until(now), phase, now
+        self.spent_s = self.until(now)
+        self.phase = phase
+        self.since_s = now
 
     def learned(self, now: float) -> None:
         """New weights are about to be sent to the workers that wait for them."""
@@ -61,7 +66,10 @@ class LearnerTime:
 
     def line(self, now: float) -> str:
         """Who waits for whom; empty if nobody waits long."""
-        lasts_s, members, spent_s, text = now - self.since_s, self._coordinator.members, self.until(now), ""
+        lasts_s = now - self.since_s
+        members = self._coordinator.members
+        spent_s = self.until(now)
+        text = ""
         if members and self.evaluating and (plan := self._coordinator.evaluation.plan) is not None:
             return one_line(f"evaluating{' the best policy' * plan.of_best} for {lasts_s:.0f} s: {self._played(plan, now)}")
         if lasts_s < LONG_S:
@@ -73,7 +81,8 @@ class LearnerTime:
         elif self.phase == "gathering" and self._coordinator.rollouts.awaited():
             text = f"waiting {lasts_s:.0f} s for {self._awaited(now)}{self._collected(now)}"
         if text and (total_s := spent_s["gathering"] + spent_s["learning"]) >= SHARES_AFTER_S:
-            gather, learn = spent_s["gathering"] / total_s, spent_s["learning"] / total_s
+            gather = spent_s["gathering"] / total_s
+            learn = spent_s["learning"] / total_s
             text += f"; so far {gather:.0%} waiting for rollouts, {learn:.0%} learning"
         return one_line(text)
 
@@ -86,11 +95,13 @@ class LearnerTime:
 
     def _awaited(self, now: float) -> str:
         """The lanes of the worker that is held up longest, that worker, and how many other lanes are awaited."""
-        lanes, members = dict[bytes, set[int]](), self._coordinator.members
+        lanes = dict[bytes, set[int]]()
+        members = self._coordinator.members
         for ticket in self._coordinator.rollouts.awaited():
             lanes.setdefault(ticket.peer, set()).add(ticket.lane)
         peer = max(lanes, key=lambda peer: held_up(members[peer], now))
-        mine, more = sorted(lanes.pop(peer)), sum(map(len, lanes.values()))
+        mine = sorted(lanes.pop(peer))
+        more = sum(map(len, lanes.values()))
         named = ", ".join(map(str, mine[:MOST_LANES])) + ", …" * (len(mine) > MOST_LANES)
         who = self._held_up_longest([members[peer]], now)
         return f"lane{'s' * (len(mine) > 1)} {named} ({who})" + (f" and {more} more" if more else "")
@@ -98,7 +109,8 @@ class LearnerTime:
     def _collected(self, now: float) -> str:
         """How much of the next update's rollouts is made, and how long the rest takes; empty before their first env step."""
         coordinator = self._coordinator
-        made, of = coordinator.collected(), coordinator.steps_of_update()
+        made = coordinator.collected()
+        of = coordinator.steps_of_update()
         if not made:
             return ""
         which = "next" if coordinator.rollouts.rounds.next else "first"

@@ -22,5 +22,6 @@ def _train(argv: list[str], command: Literal["train", "learner"]) -> int:
     config, resume = read_config(command, argv)
     from millrace.launch import training  # takes 0.2 s to import: not before the flags are known to be right
 
-    elsewhere, new = command == "learner", None if resume else config
+    elsewhere = command == "learner"
+    new = None if resume else config
     return show_run(argv, lambda watch: training.train(config, resume, watch, elsewhere=elsewhere), new, command)

@@ -50,7 +50,8 @@ def help_text(command: str, about: str, groups: Mapping[str, Group]) -> str:
 
 def _entries(record: type[msgspec.Struct] | msgspec.Struct, names: Sequence[str]) -> Iterator[Entry]:
     kind = record if isinstance(record, type) else type(record)
-    fields, texts = fields_of(kind), field_texts(kind)
+    fields = fields_of(kind)
+    texts = field_texts(kind)
     defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
     for name in names:
         if not fields[name].flag.hidden:
@@ -71,7 +72,8 @@ def _heading(entry: Entry) -> str:
 
 def _lines(entry: Entry, width: int) -> list[str]:
     """The heading and, beside or below it, the text and the default."""
-    heading, text = f"  {_heading(entry)}", f"{entry.text}{_default(entry)}"
+    heading = f"  {_heading(entry)}"
+    text = f"{entry.text}{_default(entry)}"
     lines = textwrap.wrap(text, width - TEXT_COLUMN, break_long_words=False, break_on_hyphens=False)
     wrapped = [line.replace(NO_BREAK, " ") for line in lines]
     indented = [" " * TEXT_COLUMN + line for line in wrapped]

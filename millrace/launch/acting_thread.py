@@ -98,7 +98,9 @@ class _BeforeWaits:
     """
 
     def __init__(self, env: ZmqVectorEnv, workers: int, timeout_s: float) -> None:
-        self._env, self._workers, self._timeout_s = env, workers, timeout_s
+        self._env = env
+        self._workers = workers
+        self._timeout_s = timeout_s
         self._there_s = 0.0  # when a worker was there, or the wait began
 
     def __call__(self, pulse: Pulse) -> None:

@@ -101,7 +101,8 @@ def open_endpoint(where: BindSettings, transport: str, resources: ExitStack, cod
     `code`: as of `millrace.learner.members.bound.bind`. Raises `UsageError`.
     """
     if where.bind:
-        token, bound = None, listen(where, resources, code)
+        token = None
+        bound = listen(where, resources, code)
     else:
         keyring, token = temporary_keys(transport, where.keys, insecure=where.insecure)
         bound = bind(private_address(transport, resources), keyring, resources, code)

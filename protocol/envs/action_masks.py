@@ -23,7 +23,8 @@ def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) ->
     if not (isinstance(observation, spaces.Dict) and MASK in observation.spaces and len(observation.spaces) > 1):
         return False
     try:
-        leaves, wanted = observation_leaves(observation.spaces[MASK]), choices(action_spec(action))
+        leaves = observation_leaves(observation.spaces[MASK])
+        wanted = choices(action_spec(action))
     except UsageError:
         return False
     return 0 < wanted == sum(math.prod(leaf.shape) for leaf in leaves) and all(map(_has_bits, leaves))

@@ -13,7 +13,8 @@ import numpy as np
 
 from millrace.protocol.bounds import one_line
 
-RESET, STEP = "observation, info", "observation, reward, terminated, truncated, info"
+RESET = "observation, info"
+STEP = "observation, reward, terminated, truncated, info"
 """What each method returns."""
 OF_RESET = f"expected ({RESET})"
 OF_STEP = f"expected ({STEP})"

@@ -87,7 +87,8 @@ def read_description(description: EnvDescription) -> DescribedEnv:
     metadata = plain_values.unpack(description.metadata.tobytes())
     if type(metadata) is not dict or not all(type(name) is str for name in metadata):
         raise BadMessage(f"metadata: expected a dict with names as keys, got {type(metadata).__name__}")
-    seats, takes_turns = description.seats, description.takes_turns
+    seats = description.seats
+    takes_turns = description.takes_turns
     if len(set(seats)) < len(seats) or (takes_turns and not seats):
         raise BadMessage(f"seats: expected agents of different names, or none, got {agents_in_words(seats, takes_turns)}")
     observation_space = _made_space(description.observation, "observation space")

@@ -18,11 +18,13 @@ def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
 
     Actions in [-1, 1] are scaled to the bounds of the Box, in float64, and then converted as all others.
     """
-    convert, spec = make_action_converter(policy.action), policy.action
+    convert = make_action_converter(policy.action)
+    spec = policy.action
     if not policy.stores_scaled_actions:
         return convert
     low, high = (np.reshape(bound, spec.shape) for bound in (spec.low, spec.high))
-    middle, half = (low + high) / 2, (high - low) / 2
+    middle = (low + high) / 2
+    half = (high - low) / 2
     return lambda action: convert(middle + half * action.astype(np.float64))
 
 
@@ -54,6 +56,7 @@ def stored_actions_of(policy: PolicySpec) -> Callable[[Array], Array]:
     if not policy.stores_scaled_actions:
         return lambda action: action.astype(spec.stored_dtype)
     low, high = (np.reshape(bound, spec.shape) for bound in (spec.low, spec.high))
-    middle, half = (low + high) / 2, (high - low) / 2
+    middle = (low + high) / 2
+    half = (high - low) / 2
     half = np.where(half > 0, half, 1)  # an element with one value alone is stored as 0
     return lambda action: np.clip((action - middle) / half, -1, 1).astype(spec.stored_dtype)

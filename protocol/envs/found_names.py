@@ -15,7 +15,8 @@ MAIN = "__main__"
 
 def name_of(made: object) -> str:
     """The name under which `made` is found again, or one that says that it is not."""
-    module, qualname = attribute(made, "__module__"), attribute(made, "__qualname__")
+    module = attribute(made, "__module__")
+    qualname = attribute(made, "__qualname__")
     if not isinstance(module, str) or not isinstance(qualname, str):
         return f"<{type(made).__name__}>"
     if attribute(sys.modules.get(module), qualname) is not made:

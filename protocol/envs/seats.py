@@ -25,7 +25,8 @@ from millrace.protocol.envs.answers import OF_STEP, WrongAnswer, in_words, reset
 from millrace.protocol.envs.found_names import attribute
 from millrace.protocol.errors import UsageError, safe_repr
 
-SEAT, STATE = "seat", "state"
+SEAT = "seat"
+STATE = "state"
 """Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""
 MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters, so that the name of an agent's return is not cut
 _NO_INFO: Mapping[str, Any] = {}
@@ -78,7 +79,8 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
 
         Raises `UsageError` unless all agents have the same spaces.
         """
-        self.env, self.metadata = env, getattr(env, "metadata", {})
+        self.env = env
+        self.metadata = getattr(env, "metadata", {})
         self.render_mode = getattr(env, "render_mode", None)
         self.agents = list(env.possible_agents)
         self.seats = _names(self.agents)

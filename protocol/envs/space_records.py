@@ -146,7 +146,10 @@ def _check_multi_discrete(nvec: Array, start: Array, dtype: Dtype) -> None:
         )
     if not nvec.size:
         return
-    fewest, most, first, last = int(nvec.min()), int(nvec.max()), int(start.min()), int(start.max())
+    fewest = int(nvec.min())
+    most = int(nvec.max())
+    first = int(start.min())
+    last = int(start.max())
     if fewest < 1 or most > LARGEST or max(-first, last) > LARGEST:
         raise BadMessage(f"MultiDiscrete space: expected entries of 1 to {LARGEST} values, got {fewest} to {most}")
     _check_whole("MultiDiscrete space", dtype, first, int((start + nvec - 1).max()))

@@ -91,7 +91,8 @@ class PendingHandshakes:
     """
 
     def __init__(self, keys: bool, host_of: Callable[[int], str] | None = None) -> None:
-        self._keys, self._host_of = keys, host_of or peer_host
+        self._keys = keys
+        self._host_of = host_of or peer_host
         self._pending: dict[int, str] = {}
         self._failed: tuple[int, int] | None = None
         self._approved: deque[str] = deque(maxlen=100)
@@ -115,7 +116,8 @@ class PendingHandshakes:
                         next((one for one, at in self._pending.items() if at == host), next(iter(self._pending)))
                     ]
             case zmq.EVENT_DISCONNECTED:
-                host, failed = self._pending.pop(value, None), self._failed
+                host = self._pending.pop(value, None)
+                failed = self._failed
                 self._failed = None
                 if failed is not None and failed[0] != zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                     return host or "", handshake_failure(*failed, self._keys)

@@ -86,7 +86,8 @@ class KeyFolder:
 
     def new(self, name: str, now: datetime) -> Path:
         """Create a key for a client and allow it. Returns the path of its token."""
-        server, client = self.server(), Key.new()
+        server = self.server()
+        client = Key.new()
         with self._locked():
             after = self.allowed().with_client(name, client.public, now)
             _replace(self.token_path(name), Token(server.public, client).to_text() + "\n")
@@ -156,7 +157,9 @@ class Keyring:
 
     def __init__(self, key: Key, allowed: ClientList, folder: KeyFolder | None = None) -> None:
         """`folder`: where the list is read again; None: the list never changes."""
-        self.key, self.allowed, self.folder = key, allowed, folder
+        self.key = key
+        self.allowed = allowed
+        self.folder = folder
         self.read_error = ""
         """Why the list cannot be read now; empty if it can. If not, no client can join; connected clients stay."""
         self._read_state: tuple[int, ...] = ()  # of the file that was read: `allowed` may be older than the file is now
@@ -168,7 +171,8 @@ class Keyring:
             return
         self._read_state = state
         try:
-            self.allowed, error_text = self.folder._read_list(), ""
+            self.allowed = self.folder._read_list()
+            error_text = ""
         except Exception as error:
             error_text = str(error)
         if error_text != self.read_error:

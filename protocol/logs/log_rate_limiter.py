@@ -15,7 +15,8 @@ class LogRateLimiter:
 
     def __init__(self, every_s: float = 60.0, most: int = 20) -> None:
         """Allow one line for each key in `every_s` seconds, for at most `most` keys in that time."""
-        self.every_s, self.most = every_s, most
+        self.every_s = every_s
+        self.most = most
         self._last_lines: dict[str, tuple[float, int]] = {}  # time of the last line, and how many were suppressed since
 
     def due(self, key: str, now: float) -> int | None:
@@ -59,7 +60,8 @@ class LogBudget:
         """A line of this size is logged. Returns the number of lines that were suppressed since the last one."""
         self._lines.spend(1)
         self._bytes.spend(size)
-        suppressed, self._suppressed = self._suppressed, 0
+        suppressed = self._suppressed
+        self._suppressed = 0
         return suppressed
 
     def suppress(self) -> None:

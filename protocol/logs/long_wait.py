@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-FIRST_S, AGAIN_S = 30.0, 60.0
+FIRST_S = 30.0
+AGAIN_S = 60.0
 
 
 class LongWait:
     """One wait."""
 
     def __init__(self, began_s: float) -> None:
-        self._began_s, self._due_s = began_s, began_s + FIRST_S
+        self._began_s = began_s
+        self._due_s = began_s + FIRST_S
 
     def due(self, now: float) -> bool:
         """Whether the log is to tell of it now."""

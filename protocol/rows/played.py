@@ -17,7 +17,8 @@ def reason_to_reject(
     rows: EpisodeRows, before: Sequence[EpisodeRows], run: RunSpec, most_steps: int, with_frames: bool
 ) -> str:
     """What is wrong with these rows; empty if they can be used. `before`: the earlier rows of their episode."""
-    policy, seats = run.policy, (len(run.seats),) if run.seats else ()
+    policy = run.policy
+    seats = (len(run.seats),) if run.seats else ()
     if before and (before[-1].terminated[-1] or before[-1].truncated[-1]):
         return "expected none after the end of their episode"
     L = len(rows.reward) if rows.reward.ndim == 1 else 0

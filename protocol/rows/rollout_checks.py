@@ -24,8 +24,10 @@ LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
-    T, N = run.rollout_steps, run.sent_columns
-    action, axes = run.policy.action, run.sent_axes
+    T = run.rollout_steps
+    N = run.sent_columns
+    action = run.policy.action
+    axes = run.sent_axes
     expected = [
         Expected("action", rollout.action, (T, N, *action.shape), action.stored_dtype, action),
         Expected("log_prob", rollout.log_prob, (T, N), "float32"),
@@ -75,7 +77,8 @@ def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> Non
     reset = np.repeat(resets, run.sent_seats, axis=1)  # [T+1, N·A]
     steps = np.arange(len(valid))[:, None]
     row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last
-    gone, plays = np.zeros_like(reset), np.zeros_like(reset)  # the seat has left this episode; it has a row in it
+    gone = np.zeros_like(reset)  # the seat has left this episode
+    plays = np.zeros_like(reset)  # it has a row in this episode
     gone[1:], plays[1:] = end > begin, row > end
     idle = plays[:-1] & ~valid if not run.takes_turns else np.zeros_like(valid)
     for wrong, expected in (

@@ -49,9 +49,11 @@ class Packing:
         frame: Frame = raw_bytes(array)
         packings: list[str] = []
         if self.stack and (payload := pack_stack(array)) is not None:
-            frame, packings = payload.data, ["stack"]
+            frame = payload.data
+            packings = ["stack"]
         if self.zstd and (compressed := _compressed(frame)) is not None:
-            frame, packings = compressed, [*packings, "zstd"]
+            frame = compressed
+            packings = [*packings, "zstd"]
         return frame, packings
 
 
@@ -134,7 +136,8 @@ def unpack_stack(payload: Frame, dtype: np.dtype[Any], shape: Sequence[int]) -> 
         expected = f"uint8 [T+1, N, 2 to {MAX_STACK}, H, W, …] with frames of {MIN_FRAME_BYTES} bytes or more"
         raise BadMessage(f"stack: expected {expected}, got {dtype.str}{list(shape)}")
     steps, copies, k = shape[:3]
-    frame_bytes, bit_count = math.prod(shape[3:]), copies * (steps - 1)
+    frame_bytes = math.prod(shape[3:])
+    bit_count = copies * (steps - 1)
     bit_bytes = (bit_count + 7) // 8
     fewest = bit_bytes + copies * (steps - 1 + k) * frame_bytes
     if len(payload) < fewest:

@@ -44,7 +44,8 @@ class LearnerLink:
         check_address(address)
         self.context = context or zmq.Context.instance()
         self.keyring = keyring
-        self.received, self.sent = Traffic(), Traffic()
+        self.received = Traffic()
+        self.sent = Traffic()
         self.refused_messages = 0
         """messages under keys that are not allowed any more"""
         self.packed_bytes_limit = 0

@@ -77,20 +77,24 @@ class SharedMemory:
         memory = mmap.mmap(self.fd, size)
         self._words = memoryview(memory)[: 2 * CACHE_LINE_BYTES * len(lanes)].cast("q")
         numbers = np.frombuffer(memory, np.int64, 2 * WORDS * len(lanes)).reshape(len(lanes), 2, WORDS)[:, :, 0]
-        self._ordered, self._answered = numbers[:, 0], numbers[:, 1]
+        self._ordered = numbers[:, 0]
+        self._answered = numbers[:, 1]
         self._fence = threading.Lock()
         arrays = [
             np.frombuffer(memory, dtype, N * int(np.prod(shape)), at).reshape(N, *shape)
             for at, shape, dtype in (*places, *flags)
         ]
-        self.actions, self.obs = tuple(arrays[: len(spec.action)]), tuple(arrays[len(spec.action) : -3])
+        self.actions = tuple(arrays[: len(spec.action)])
+        self.obs = tuple(arrays[len(spec.action) : -3])
         """[N, *leaf] each, all lanes together"""
         self.reward, self.terminated, self.truncated = arrays[-3:]
         self.lanes = []
         for lane, rows in enumerate(lanes):
             actions, obs = (tuple(array[rows] for array in leaves) for leaves in (self.actions, self.obs))
             view = memoryview(memory)[infos : infos + self.info_bytes[lane]]
-            reward, terminated, truncated = self.reward[rows], self.terminated[rows], self.truncated[rows]
+            reward = self.reward[rows]
+            terminated = self.terminated[rows]
+            truncated = self.truncated[rows]
             self.lanes.append(LaneArrays(actions, obs, reward, terminated, truncated, view))
             infos += self.info_bytes[lane]
 
@@ -109,7 +113,8 @@ class SharedMemory:
 
         `wake`: the worker wakes the learner when a lane is done, even if others are not.
         """
-        words, numbers = self._words, dict[int, int]()
+        words = self._words
+        numbers = dict[int, int]()
         for lane in lanes:
             at = 2 * WORDS * lane
             words[at + 1] = wake

@@ -21,7 +21,8 @@ from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 LINGER_MS = 2000
 UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after a cut it may need as long again as the cut lasted
 QUEUE = 1000  # messages that wait for a peer that does not read
-RECONNECT_MS, RECONNECT_MOST_MS = 100, 2000
+RECONNECT_MS = 100
+RECONNECT_MOST_MS = 2000
 CURVE_BYTES = 33  # what encryption adds to a frame
 TAG_CHARACTERS = 32
 
@@ -43,7 +44,10 @@ def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Li
     socket.connect_timeout = 2000
     socket.tcp_maxrt = UNACKNOWLEDGED_MS
     # Without keepalive, the connection to a host that vanished while idle would stay forever.
-    socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
+    socket.tcp_keepalive = 1
+    socket.tcp_keepalive_idle = 15
+    socket.tcp_keepalive_intvl = 5
+    socket.tcp_keepalive_cnt = 3
     socket.ipv6 = needs_ipv6(address)
     # A worker never reaches its limit: at most one Weights message, a few tickets and their rollouts are on their way.
     socket.sndhwm = socket.rcvhwm = limits.messages

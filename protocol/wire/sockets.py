@@ -11,7 +11,8 @@ from millrace.protocol.wire.codec import Buffer
 from millrace.protocol.wire.message_sizes import MAX_FRAMES
 
 COPY_BELOW_BYTES = 65536  # copying a smaller frame is cheaper than tracking it
-NOT_WAITING, AND_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
+NOT_WAITING = int(zmq.NOBLOCK)
+AND_MORE = int(zmq.NOBLOCK | zmq.SNDMORE)
 
 
 def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = None) -> list[Buffer] | None:

@@ -96,7 +96,8 @@ class SpinWait:
         until = now + seconds
         while now < until:
             os.sched_yield()
-            before, now = now, perf_counter()
+            before = now
+            now = perf_counter()
             if seen():
                 self._skipped = 0
                 return True

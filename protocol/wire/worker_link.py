@@ -47,7 +47,8 @@ class WorkerLink:
         """With a token (only over tcp) the link connects only to the learner of that token. `limits`: if not a worker's."""
         check_address(address)
         check_worker_name(name)
-        self.address, self.token = address, token
+        self.address = address
+        self.token = token
         self.problem: ConnectionProblem | None = None
         """why there is no connection, if known"""
         self.connected = False
@@ -117,7 +118,8 @@ class WorkerLink:
                         )
                     self.connected = False
                 elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                    self.connected, self.problem = True, None
+                    self.connected = True
+                    self.problem = None
                 else:
                     self._report(connection_problem(event, value, self.address, self.token))
 

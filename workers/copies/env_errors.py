@@ -21,7 +21,9 @@ class CopyFailed(Exception):
 
     def __init__(self, copy: int | None, doing: str = "reset", line: str = "") -> None:
         super().__init__(copy, doing, line)
-        self.copy, self.doing, self.line = copy, doing, line
+        self.copy = copy
+        self.doing = doing
+        self.line = line
 
 
 def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = "") -> EnvironmentFailed:
@@ -29,7 +31,8 @@ def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = ""
 
     `doing`: what the copy did, where that is known better than by the copy.
     """
-    whose, detail = "while the policy was evaluated: " if lane is None else f"lane {lane}, ", ""
+    whose = "while the policy was evaluated: " if lane is None else f"lane {lane}, "
+    detail = ""
     if isinstance(what, str):
         return EnvironmentFailed(whose + what, detail, lane)
     copy = "" if what.copy is None else f"copy {what.copy}, "

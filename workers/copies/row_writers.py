@@ -30,7 +30,8 @@ class LeafWriter:
     """Writes one array of the observations of N copies."""
 
     def __init__(self, leaf: Leaf, copies: int) -> None:
-        self._leaf, self._dtype = leaf, np.dtype(leaf.dtype)
+        self._leaf = leaf
+        self._dtype = np.dtype(leaf.dtype)
         self._is_whole = self._dtype.kind in "iu"
         self._shape = (copies, *leaf.shape)
         # Observations of one dimension or more are joined along their first one, which is the fastest way.

@@ -38,7 +38,8 @@ class SeatedCopies(LoopedCopies):
     ) -> None:
         """`seats`: the names of the A agents. `facts`: without the returns of seats. For the rest, see `LoopedCopies`."""
         super().__init__(makes, pulse, facts, masked=masked, critic_keys=critic_keys, first=first)
-        self._names, self._seats = seats, len(seats)
+        self._names = seats
+        self._seats = len(seats)
         self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: every action
         self.columns: SeatColumns
 

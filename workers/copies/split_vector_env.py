@@ -48,12 +48,16 @@ class SplitVectorEnv:
         `step_lanes` steps some lanes of the vector environment: then it may have more lanes than these, for evaluation.
         `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
         """
-        self.env, self.facts = env, facts
-        observation, action = env.single_observation_space, env.single_action_space
+        self.env = env
+        self.facts = facts
+        observation = env.single_observation_space
+        action = env.single_action_space
         self._masks = MaskReader(observation, action) if masked else None
         self.observation_space = without_mask(observation, action) if masked else observation
         """of one copy"""
-        self._lanes, self._before_wait, self._step_lanes = lanes, before_wait, step_lanes
+        self._lanes = lanes
+        self._before_wait = before_wait
+        self._step_lanes = step_lanes
         self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(self.observation_space)
         self._result: StepResult | None = None
@@ -96,7 +100,8 @@ class SplitVectorEnv:
         else:
             if self._actions is None:
                 self._actions = np.zeros((self.env.num_envs, *actions.shape[1:]), actions.dtype)
-            padded, step_lanes = self._actions, self._step_lanes
+            padded = self._actions
+            step_lanes = self._step_lanes
             padded[copies] = actions
             result = self._wait(lambda: step_lanes(lanes, padded), pulse)
         observation, reward, terminated, truncated, infos = result
@@ -189,7 +194,9 @@ class SplitLane:
     """The env copies of one lane, or those for evaluation: a lost copy costs the episodes that are being played."""
 
     def __init__(self, split: SplitVectorEnv, first: int, count: int) -> None:
-        self._split, self._first, self.count = split, first, count
+        self._split = split
+        self._first = first
+        self.count = count
         self._copies = slice(first, first + count)
         self.note = ""
         self.observation_space = split.observation_space

@@ -34,7 +34,8 @@ log = logging.getLogger("millrace.worker")
 EVERY_S = 1.0
 EVERY_S_WHILE_SLOW = 0.4
 SLOW_S = 0.3  # a call of an environment that takes longer: its worker does not send heartbeats meanwhile
-ENDED_AFTER_S, ENDED_FOR_S = 0.2, 5.0
+ENDED_AFTER_S = 0.2
+ENDED_FOR_S = 5.0
 
 
 class AliveSender:
@@ -42,7 +43,9 @@ class AliveSender:
 
     def __init__(self, address: str, token: Token | None, weights: SharedWeights | None = None) -> None:
         """Connects at the first `send` that has something to say. `weights`: shares those that come among the workers."""
-        self._address, self._token, self._weights = address, token, weights
+        self._address = address
+        self._token = token
+        self._weights = weights
         self._first_session = self._replies = 0  # of the learner's last answer
         self._socket: zmq.Socket[bytes] | None = None
         self._due_s = 0.0
@@ -73,7 +76,8 @@ class AliveSender:
         if self._socket is None:
             time.sleep(for_s)
             return False
-        until_s, over = time.monotonic() + for_s, False
+        until_s = time.monotonic() + for_s
+        over = False
         while self._socket.poll(max(0, int(1000 * (until_s - time.monotonic())))):
             over |= self._take(self._socket.recv_multipart(copy=False))
             if time.monotonic() >= until_s:
@@ -92,7 +96,8 @@ class AliveSender:
                 case ["Drain", *_]:
                     return True
                 case ["HeartbeatReply", int(first_session), int(number), _]:
-                    self._first_session, self._replies = first_session, number
+                    self._first_session = first_session
+                    self._replies = number
                 case ["Weights", int(version), *_] if self._weights is not None:
                     self._share(version, [frame.buffer for frame in frames])
         return False
@@ -118,7 +123,8 @@ class AliveSender:
         found.sndhwm = 10  # only the newest word counts
         name = f"supervisor-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"[-MAX_NAME:]
         found.routing_id = routing_id(name, self._token)
-        found.reconnect_ivl, found.reconnect_ivl_max = RECONNECT_MS, RECONNECT_MOST_MS
+        found.reconnect_ivl = RECONNECT_MS
+        found.reconnect_ivl_max = RECONNECT_MOST_MS
         if self._token is not None:
             connect_with(found, self._token)
         found.connect(self._address)

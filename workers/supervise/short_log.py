@@ -10,7 +10,8 @@ import os
 from pathlib import Path
 
 MOST = 16 << 20  # bytes
-BEGINNING, END = 1 << 20, 4 << 20  # what stays
+BEGINNING = 1 << 20  # bytes that stay
+END = 4 << 20  # bytes that stay
 GONE = b"[millrace: the log became too long, and what stood here was removed]\n"
 
 

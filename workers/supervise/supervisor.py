@@ -29,7 +29,9 @@ from millrace.workers.supervise.ending import Ending
 
 log = logging.getLogger("millrace.worker")
 
-BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
+BACKOFF_FIRST_S = 0.5
+BACKOFF_MOST_S = 30.0
+HEALTHY_S = 30.0
 MOST_FAILED_STARTS = 4
 GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
@@ -127,7 +129,9 @@ class Supervisor:
 
         `stay`: they serve one run after another.
         """
-        self._start, self._clock, self._stay = start, clock, stay
+        self._start = start
+        self._clock = clock
+        self._stay = stay
         self._stopping = False
         self._low_priority = False
         self._enforce_due_s = 0.0
@@ -147,7 +151,8 @@ class Supervisor:
         ]
 
     def _ended(self) -> list[tuple[WorkerExit, Ending]]:
-        ended, now = list[tuple[WorkerExit, Ending]](), self._clock()
+        ended = list[tuple[WorkerExit, Ending]]()
+        now = self._clock()
         enforce = now >= self._enforce_due_s
         if enforce:
             self._enforce_due_s = now + ENFORCE_EVERY_S
@@ -155,7 +160,8 @@ class Supervisor:
             if worker.running is not None and enforce:
                 worker.running.end_if_hung(now)
             if worker.running is not None and (end := worker.running.ended()) is not None:
-                name, nonce = worker.running.name, worker.running.process_nonce  # the learner knows it by this name
+                name = worker.running.name  # the learner knows it by this name
+                nonce = worker.running.process_nonce
                 self._record_end(worker, end, now)
                 reason = end.reason + (GIVEN_UP if worker.failed_starts == MOST_FAILED_STARTS else "")
                 ended.append((WorkerExit(name, nonce, one_line(reason), end.failed, end.of_policy), end))
@@ -178,7 +184,8 @@ class Supervisor:
     def _record_end(self, worker: _NamedWorker, end: Ending, now: float) -> None:
         left = end.on_purpose and end.code in (0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE)
         told_early = self._stopping and end.code == -signal.SIGTERM  # to leave, before it could listen to signals
-        worker.running, worker.exit_code = None, end.code if left else 0 if told_early else 1
+        worker.running = None
+        worker.exit_code = end.code if left else 0 if told_early else 1
         healthy = end.worked or now - worker.started_s > HEALTHY_S or (left and end.code == 0)
         if healthy:
             worker.backoff_s = BACKOFF_FIRST_S
@@ -257,7 +264,10 @@ class Supervisor:
         After such a request, or once the run is over, no worker is restarted, and one whose environment hangs is killed.
         With `stay`, one that hangs after the end of a run is killed too.
         """
-        handled, leave_by_s, kill_hanging_from_s, over = 0, float("inf"), float("inf"), False
+        handled = 0
+        leave_by_s = float("inf")
+        kill_hanging_from_s = float("inf")
+        over = False
         while True:
             ended = self._ended()
             for each, end in ended:

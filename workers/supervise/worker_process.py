@@ -42,7 +42,8 @@ CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments a
 KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # bytes of a log that are read for what it ends with
-MOST_LAST_LINES, MAX_LAST_TEXT = 12, 2_000  # lines and characters of it that are shown if a worker cannot start
+MOST_LAST_LINES = 12  # of it that are shown if a worker cannot start
+MAX_LAST_TEXT = 2_000  # characters of it that are shown then
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -66,7 +67,8 @@ class WorkerProcess:
     """A worker in a process of its own."""
 
     def __init__(self, start: WorkerCommand) -> None:
-        self.name, self._log = start.name, start.log
+        self.name = start.name
+        self._log = start.log
         self.process_nonce = int.from_bytes(os.urandom(6), "little")
         self._slots = open_slots()
         self._page = ActivityReader()
@@ -154,7 +156,8 @@ class WorkerProcess:
                 if page.leaves_for_s > CLOSE_WITHIN_S:
                     self.kill()
             elif page.for_s > page.timeouts.limit_s(page.doing):
-                self._because, self._kill_at_s = page.timeouts.reason(page.doing), now + WRITE_STACKS_S
+                self._because = page.timeouts.reason(page.doing)
+                self._kill_at_s = now + WRITE_STACKS_S
                 if STACK_SIGNAL is not None:
                     self._process.send_signal(STACK_SIGNAL)
 
@@ -224,7 +227,8 @@ class WorkerProcess:
 
     def _ending(self, code: int) -> Ending:
         """How it ended. `code` is negative if a signal ended it."""
-        page, output = self._page.read(time.monotonic()), self._output()
+        page = self._page.read(time.monotonic())
+        output = self._output()
         last = "".join(f" ({line})" for line in output.strip().splitlines()[-1:])
         meanwhile = f" in {CALLS[page.doing]}" if page.doing in CALLS else ""
         if page.doing == "starting":

@@ -89,5 +89,6 @@ class ActorWithCritics:
 
 def layer_sizes(policy: PolicySpec, critic_net: tuple[int, ...], outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The sizes of the layers of the policy's actor, and of each critic with these hidden layers and outputs."""
-    features, size = feature_size(policy), math.prod(policy.action.shape)
+    features = feature_size(policy)
+    size = math.prod(policy.action.shape)
     return (features, *policy.net, 2 * size), (features + size, *critic_net, outputs)

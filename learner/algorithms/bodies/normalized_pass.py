@@ -66,7 +66,8 @@ class NormalizedPass(torch.autograd.Function):
         ctx: Any, x: Tensor, flat: Tensor, plan: Plan, running: Sequence[RunningStatistics] | None, renormalizes: bool
     ) -> Tensor:
         """`running` moves towards the statistics of the minibatch; None: nothing does. `renormalizes`: see `_normalized`."""
-        h, kept = x.t().contiguous().unsqueeze(0), []
+        h = x.t().contiguous().unsqueeze(0)
+        kept = []
         for i, layer in enumerate(plan.layers_of(flat)):
             statistics = None if running is None else running[i]
             if i and not plan.before:
@@ -77,7 +78,8 @@ class NormalizedPass(torch.autograd.Function):
                 h = activated = _activation(h, plan.relu)
             kept.append((normalization, activated, h))
             h = torch.bmm(layer.weight, h) if layer.bias is None else torch.baddbmm(layer.bias, layer.weight, h)
-        ctx.kept, ctx.plan = kept, plan
+        ctx.kept = kept
+        ctx.plan = plan
         ctx.save_for_backward(flat)  # so that torch raises if a step changes them before the backward pass
         return h.mT
 
@@ -87,10 +89,12 @@ class NormalizedPass(torch.autograd.Function):
         refuse_second_derivatives()
         (flat,), plan = ctx.saved_tensors, ctx.plan
         by_flat = torch.zeros_like(flat)
-        layers, by_layers = plan.layers_of(flat), plan.layers_of(by_flat)
+        layers = plan.layers_of(flat)
+        by_layers = plan.layers_of(by_flat)
         g = outputs[0].mT
         for i in reversed(range(len(layers))):
-            layer, by_layer = layers[i], by_layers[i]
+            layer = layers[i]
+            by_layer = by_layers[i]
             normalization, activated, h = ctx.kept[i]
             by_layer.weight.copy_(torch.bmm(g, h.mT))
             if by_layer.bias is not None:
@@ -118,7 +122,8 @@ class _Normalization(NamedTuple):
 
     def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
         """The gradient [K, n, B] by what was normalized, from `g` by the result, which is overwritten."""
-        total, product = g.sum(-1, keepdim=True), _row_products(g, self.x_hat.expand_as(g))
+        total = g.sum(-1, keepdim=True)
+        product = _row_products(g, self.x_hat.expand_as(g))
         by_layer.shift.copy_(total)
         by_layer.gain.copy_(product if self.r is None or self.d is None else self.r * product + self.d * total)
         gain = layer.gain if self.r is None else layer.gain * self.r
@@ -139,7 +144,10 @@ def _normalized(
     variance = _row_products(x_hat, x_hat) / h.shape[-1]
     inverse = (variance + EPS).rsqrt()
     x_hat.mul_(inverse)
-    gain, shift, r, d = layer.gain, layer.shift, None, None
+    gain = layer.gain
+    shift = layer.shift
+    r = None
+    d = None
     if running is not None:
         if renormalizes:
             r, d = renormalization(mean, inverse, running)
@@ -149,7 +157,8 @@ def _normalized(
     return torch.addcmul(shift, x_hat, gain), _Normalization(x_hat, inverse, r, d)
 
 
-R_MAX, D_MAX = 3.0, 5.0
+R_MAX = 3.0
+D_MAX = 5.0
 """bounds of batch renormalization: of σ / σ(running) and its inverse, and of (μ − μ(running)) / σ(running)"""
 
 

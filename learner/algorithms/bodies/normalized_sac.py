@@ -104,6 +104,7 @@ class NormalizedSAC(SAC):
                 "start_from: expected a run of the same algorithm with a checkpoint, got a policy without the statistics of "
                 "batch normalization"
             )
-        actor, statistics = len(self.net.actor), total_size(self.net.actor_body.shape.statistics())
+        actor = len(self.net.actor)
+        statistics = total_size(self.net.actor_body.shape.statistics())
         super().start_from(start._replace(acting=actor))
         self.net.statistics[:statistics].copy_(start.state["statistics"][:statistics])

@@ -49,7 +49,8 @@ class MLPShape(NamedTuple):
 
     def fields(self) -> list[Field]:
         """The parameters, [K, …] each."""
-        K, last = self.networks, len(self.sizes) - 2
+        K = self.networks
+        last = len(self.sizes) - 2
         fields: list[Field] = []
         for i in range(last + 1):
             inputs, outputs = self.sizes[i : i + 2]
@@ -135,7 +136,8 @@ class StackedMLPs:
         into = named_views(flat, self._folded_fields)
         scales, shifts = zip(*map(_linear, self._now, self._running), strict=True)
         for i, layer in enumerate(self._now):
-            weight, bias = into[f"{i}.weight"], into[f"{i}.bias"]
+            weight = into[f"{i}.weight"]
+            bias = into[f"{i}.bias"]
             weight.copy_(layer.weight)
             if layer.bias is not None:
                 bias.copy_(layer.bias)
