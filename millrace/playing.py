@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
 from millrace.arguments import checked
 from millrace.flags.fields import fields_of
-from millrace.flags.values import read_value
+from millrace.flags.values import convert, with_whole_numbers
 from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.rollout_config import RolloutConfig
@@ -142,10 +142,8 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     for keyword in keywords:
         if keyword not in fields or keyword in NOT_KEYWORDS:
             raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, fields)}")
-    try:
-        return kind(**{keyword: read_value(fields[keyword], value) for keyword, value in keywords.items()})
-    except UsageError as error:
-        raise UsageError(f"{name}: {error}") from None
+    values = {keyword: with_whole_numbers(fields[keyword], value) for keyword, value in keywords.items()}
+    return convert(values, kind, {keyword: f"{name}: {keyword}" for keyword in keywords})
 
 
 def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) -> tuple[Evaluation, list[Path]]:

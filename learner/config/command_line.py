@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 from millrace.flags.fields import Flag, fields_of
-from millrace.flags.parse import asks_for_help, given_values, show_help, words_of
+from millrace.flags.parse import Typed, asks_for_help, first_words, given_values, show_help, typed_flags
+from millrace.learner.config.algorithm_names import settings_record
 from millrace.learner.config.config import Config
-from millrace.learner.config.layers import lower_layers, override
+from millrace.learner.config.layers import LowerLayers, SettingsLayer, merged, read_lower_layers, settings_of_run
 from millrace.learner.config.other_names import in_place_of
-from millrace.learner.config.validation import validate
 from millrace.learner.run_folder.newest_run import AUTO, newest_run
 
 
@@ -68,37 +68,36 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
 
     Raises `UsageError`, with a one-line message, if a setting or a file is not valid.
     """
-    words = words_of(argv, "algo", "config", "preset", "resume")
+    typed = typed_flags(argv)
+    words = first_words(typed, "algo", "config", "preset", "resume")
+    algo = words.get("algo")
+    file = _path(words, "config")
     resume = _path(words, "resume")
-    if resume != AUTO:
-        return _read_layers(command, argv, words, resume), resume
-    config = _read_layers(command, argv, words, None)
-    found = newest_run(config)
-    if found is None:
-        return config, None
-    # A run that `--resume auto` found already contains the settings of its --config and --preset.
-    return _read_layers(command, argv, {**words, "config": "none", "preset": "none"}, found), found
+    preset = words.get("preset", "auto")
+    if resume == AUTO:
+        config = _read_flags(command, argv, typed, read_lower_layers(algo, file=file, resume=None, preset=preset))
+        resume = newest_run(config)
+        if resume is None:
+            return config, None
+        file, preset = None, "none"  # the settings of the run that was found already contain them
+    lower = read_lower_layers(algo, file=file, resume=resume, preset=preset)
+    return _read_flags(command, argv, typed, lower), resume
 
 
-def _read_layers(command: str, argv: list[str], words: dict[str, str], resume: Path | None) -> Config:
-    """The settings. Those of a resumed run lie below the flags.
-
-    `words`: the flags that say what lies below the others, and which algorithm has which flags.
-    """
-    file, preset = _path(words, "config"), words.get("preset", "auto")
-    below = partial(lower_layers, algo=words.get("algo"), file=file, resume=resume, preset=preset)
-    algorithm = type(below("").algorithm)
-    own = fields_of(algorithm)
+def _read_flags(command: str, argv: list[str], typed: list[Typed], lower: LowerLayers) -> Config:
+    """The settings: the flags above the other layers, which say by their algorithm which flags there are."""
+    own = fields_of(settings_record(lower.algo))
     fields = fields_of(RunFlags) | own
-    given = given_values(fields, argv, command, partial(in_place_of, known=fields, flag=True))
-    base = below(given.get("env", ""))
+    given = given_values(fields, typed, command, partial(in_place_of, known=fields, flag=True))
+    flags = SettingsLayer("", {name: value for name, value in given.items() if name not in LAYERS})
     if asks_for_help(argv):
+        env = SettingsLayer("", {name: given[name] for name in given if name == "env"})
+        base = merged(lower.algo, [*lower.below(flags), env])
         shown = RunFlags(**{name: getattr(base, name) for name in Config.__struct_fields__})
         of_algorithm = {base.algo.rpartition(":")[2]: (base.algorithm, list(own))}
         groups = {title: (shown, names) for title, names in GROUPS.items()}
         show_help(command, DESCRIPTIONS[command], {"basics": (shown, BASIC), **of_algorithm, **groups})
-    settings = {name: value for name, value in given.items() if name not in LAYERS}
-    return validate(override(base, settings, "flags"))
+    return settings_of_run(lower, flags)
 
 
 def _path(words: dict[str, str], flag: str) -> Path | None:

@@ -1,31 +1,81 @@
-"""The layers that a run's settings come from, and how one overrides another. Pure but for reading TOML files.
+"""The layers that a run's settings come from, merged and made one record. Pure but for reading TOML files.
 
-From the weakest to the strongest: the defaults of `Config`, the preset of (algorithm, environment), a TOML file, flags or
-keyword arguments. A setting has one name everywhere: the field `learning_rate` is the TOML key `learning_rate` and the flag
-`--learning-rate`. The settings of the algorithm stand in a TOML table named after it, as [ppo].
+From the weakest to the strongest: the defaults of the records, the preset of (algorithm, environment), a named preset, a
+TOML file, flags or keyword arguments. A setting has one name everywhere: the field `learning_rate` is the TOML key
+`learning_rate` and the flag `--learning-rate`. The settings of the algorithm stand in a TOML table named after it, as [ppo].
+
+Rule: a layer is a dictionary, and says where it is from. Layers are merged as they are, and become a record once, so that
+each value is checked once, and what is wrong is said of the layer that has it.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
-from millrace.flags.fields import fields_of
-from millrace.flags.values import with_whole_numbers
+from millrace.flags.fields import FlagField, fields_of
+from millrace.flags.values import convert, with_whole_numbers
 from millrace.learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.other_names import in_place_of
 from millrace.learner.config.presets import PRESETS, environment_presets, named_presets
-from millrace.learner.config.validation import convert, validate
+from millrace.learner.config.validation import check_numbers, check_table, check_text, validate
 from millrace.learner.run_folder.regular_files import MOST_TEXT_BYTES
 from millrace.learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
 from millrace.protocol.envs.found_names import moved
 from millrace.protocol.errors import UsageError, did_you_mean
+
+ALL_BUT_TABLES = {*Config.__struct_fields__} - {"algorithm", *TABLES}
+
+
+class SettingsLayer(NamedTuple):
+    """Settings that stand in one place: those of the run and of its algorithm side by side."""
+
+    where: str
+    """as an error begins: a file, `preset NAME`, `train`; empty for flags, whose names tell"""
+    settings: Mapping[str, Any]
+
+    def origin(self, field: FlagField) -> str:
+        """What an error calls a setting of this layer."""
+        return f"{self.where}: {field.name}" if self.where else field.written
+
+
+class LowerLayers(NamedTuple):
+    """What lies below flags and keyword arguments, as it was read, and the algorithm that all layers together name."""
+
+    algo: str
+    preset: str
+    named: SettingsLayer
+    file: SettingsLayer
+    resume: Path | None
+
+    def below(self, given: SettingsLayer) -> list[SettingsLayer]:
+        """The layers below those that were given, which may name the environment. Raises `UsageError`."""
+        env = str(given.settings.get("env", ""))
+        if self.resume is not None and env and not moved(str(self.file.settings.get("env")), env):
+            found = self.file.settings.get("env")
+            raise UsageError(f"run {self.resume} is of {found}, not of {env}; resume it without naming an environment")
+        env = env or str(self.file.settings.get("env", self.named.settings.get("env", "")))
+        layers = [self._of_environment(env), self.named]
+        if self.file.settings.keys() >= ALL_BUT_TABLES:  # those of a whole run: its tables are whole, too
+            layers = [SettingsLayer(where, _without_tables(settings)) for where, settings in layers]
+        return [*layers, self.file]
+
+    def _of_environment(self, env: str) -> SettingsLayer:
+        """The preset of this algorithm and environment, or of the environment that --preset names."""
+        if self.preset == "none":
+            return SettingsLayer(str(PRESETS), {})
+        presets, named = environment_presets(self.algo), named_presets()
+        name = env if self.preset == "auto" or self.preset in named else self.preset
+        if name not in presets and name == self.preset:
+            hint = did_you_mean(name, [*presets, *named]) or "; millrace presets lists them"
+            raise UsageError(f"preset {name}: {self.algo} has none of this name{hint}")
+        return SettingsLayer(str(PRESETS), presets.get(name, {}))
 
 
 def resolve(
@@ -45,8 +95,8 @@ def resolve(
         raise UsageError(
             f"train: algo: expected one of {', '.join(HYPERPARAMETERS)}, module:Class or a class, got {algo!r:.60}"
         )
-    below = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
-    return validate(override(below, keywords, "train"))
+    lower = read_lower_layers(keywords.get("algo"), file=file, resume=resume, preset=preset)
+    return settings_of_run(lower, SettingsLayer("train", keywords | ({"env": env} if env else {})))
 
 
 def config_from_toml(text: str, where: str = "config.toml") -> Config:
@@ -54,7 +104,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 
     `where`: the file's name for error messages.
     """
-    return validate(_override_from_toml(Config(), parse_toml(text, where), where), where)
+    return _settings_of_file(parse_toml(text, where), where)
 
 
 def config_of_run(run: Path, algo: str | None = None) -> Config:
@@ -62,20 +112,11 @@ def config_of_run(run: Path, algo: str | None = None) -> Config:
 
     `algo`: the name that its algorithm has now, if it may be another one (`algorithm_names.moved`).
     """
-    where = run / "config.toml"
-    table = with_algorithm(read_config(run), algo)
-    return validate(_override_from_toml(Config(), table, str(where)), str(where))
+    return _settings_of_file(with_algorithm(read_config(run), algo), str(run / CONFIG_FILE))
 
 
-def lower_layers(
-    env: str,
-    *,
-    algo: str | None = None,
-    file: Path | None = None,
-    resume: Path | None = None,
-    preset: str = "auto",
-) -> Config:
-    """The layers below flags and keyword arguments: defaults, preset and file. Only the types are checked yet."""
+def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | None, preset: str) -> LowerLayers:
+    """Read the named preset and the file. `algo`: the algorithm that was given, if any. Raises `UsageError`."""
     if resume is not None:
         if file is not None:
             raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
@@ -88,73 +129,115 @@ def lower_layers(
         table = with_algorithm(read_config(resume), algo)
     else:
         table = {} if file is None else _read_toml(file)
+    presets = named_presets()
+    named = presets[preset].settings if preset in presets else {}
     where = str(file)
-    if resume is not None and env and not moved(str(table.get("env")), env):
-        raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
-    named = named_presets()
-    whole_run = named[preset].settings if preset in named else {}
-    env = env or str(table.get("env", whole_run.get("env", "")))
-    if algo is None and "algo" in table:
-        config = _defaults_of(str(table["algo"]), f"{where}: ")
-    else:
-        config = _defaults_of(algo or str(whole_run.get("algo", "ppo")))
-    if preset != "none":
-        by_env = environment_presets(config.algo)
-        name = env if preset == "auto" or preset in named else preset
-        if name not in by_env and name == preset:
-            hint = did_you_mean(name, [*by_env, *named]) or "; millrace presets lists them"
-            raise UsageError(f"preset {name}: {config.algo} has none of this name{hint}")
-        config = override(config, by_env.get(name, {}), str(PRESETS))
-        config = override(config, {**whole_run, "algo": config.algo}, f"preset {preset}")
-    if table.keys() >= {*Config.__struct_fields__} - {
-        "algorithm",
-        *TABLES,
-    }:  # all settings of a run: its tables are whole, too
-        config = msgspec.structs.replace(config, **{name: {} for name in TABLES})
-    config = _override_from_toml(config, {**table, "algo": config.algo}, where)
-    if resume is not None:
-        validate(config, where)  # so that an error names the file, and not what is given beside it
-    return override(config, {"env": env}, "ENV")
+    if algo is None:
+        algo = _known_algorithm(table, where) if "algo" in table else str(named.get("algo", "ppo"))
+    return LowerLayers(algo, preset, SettingsLayer(f"preset {preset}", named), _layer_of_file(table, algo, where), resume)
 
 
-def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
-    """The configuration with these values instead of its own. Types are checked.
-
-    `values` has settings of the run and of the algorithm side by side. `env_kwargs` and `eval_env_kwargs` are merged with
-    those that are there.
-    """
-    config = _defaults_of(values["algo"], f"{where}: ") if values.get("algo", config.algo) != config.algo else config
-    settings: dict[str, Any] = msgspec.to_builtins(config)
-    algorithm: dict[str, Any] = settings["algorithm"]
-    for name, value in values.items():
-        if name in algorithm:
-            algorithm[name] = _coerce(config.algorithm, name, value)
-        elif name in TABLES and isinstance(value, Mapping):
-            settings[name] |= value
-        elif name in settings and name != "algorithm":
-            settings[name] = _coerce(config, name, value)
-        else:
-            known = [setting for setting in (*settings, *algorithm) if setting != "algorithm"]
-            hint = in_place_of(name, known) or did_you_mean(name, known)
-            raise UsageError(f"{where}: unknown setting {name}{hint}")
-    return convert(settings, where)
-
-
-def _defaults_of(algo: str, where: str = "") -> Config:
+def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
+    """The settings of a run. Raises `UsageError`."""
+    below = lower.below(given)
+    config = merged(lower.algo, [*below, given])
     try:
-        return Config(algo=algo, algorithm=settings_record(algo)())
+        validate(config)
     except UsageError as error:
-        raise UsageError(f"{where}{error}", error.detail) from error
+        if lower.file.settings and _is_wrong_alone(lower.algo, [*below, SettingsLayer("", {"env": config.env})], error):
+            raise UsageError(f"{lower.file.where}: {error}") from error
+        raise
+    return config
 
 
-def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
-    """1e5 and "1_000" become integers where the field is one, and "none" becomes None where the default is None."""
-    default = getattr(type(record)(), name)
+def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
+    """The record of these layers, from the weakest to the strongest. Each setting is checked by itself. Raises `UsageError`.
+
+    `env_kwargs` and `eval_env_kwargs` are merged entry by entry.
+    """
+    record = settings_record(algo)
+    fields = fields_of(Config) | fields_of(record)
+    values: dict[str, Any] = {}
+    origins: dict[str, str] = {}
+    for layer in layers:
+        for name, value in layer.settings.items():
+            if name not in fields:
+                hint = in_place_of(name, fields) or did_you_mean(name, fields)
+                raise UsageError(f"{layer.where}: unknown setting {name}{hint}")
+            origins[name] = layer.origin(fields[name])
+            check_text(name, value, origins[name])
+            if name in TABLES:
+                check_table(value, origins[name])
+                value = {**values.get(name, {}), **value}
+            values[name] = _plain(fields[name], value)
+    values["algo"] = algo
+    of_algorithm = {name: values.pop(name) for name in record.__struct_fields__ if name in values}
+    algorithm = convert(of_algorithm, record, origins)
+    config = convert(values, Config, origins)
+    check_numbers(algorithm, origins)
+    check_numbers(config, origins)
+    return msgspec.structs.replace(config, algorithm=algorithm)
+
+
+def _plain(field: FlagField, value: Any) -> Any:
+    """1e5 and "1_000" become integers where the field is one, "none" becomes None where it may be, and a path text."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    if isinstance(value, str) and value == "none" and default is None:
+    if field.optional and value == "none":
         return None
-    return with_whole_numbers(fields_of(type(record))[name], value)
+    return with_whole_numbers(field, value)
+
+
+def _known_algorithm(table: Mapping[str, Any], where: str) -> str:
+    """The algorithm that a file names. Raises `UsageError`."""
+    algo = str(table.get("algo", "ppo"))
+    try:
+        settings_record(algo)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}", error.detail) from error
+    return algo
+
+
+def _settings_of_file(table: dict[str, Any], where: str) -> Config:
+    """The settings of a file alone, over the defaults."""
+    algo = _known_algorithm(table, where)
+    config = merged(algo, [_layer_of_file(table, algo, where)])
+    try:
+        validate(config)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from error
+    return config
+
+
+def _is_wrong_alone(algo: str, layers: Sequence[SettingsLayer], why: UsageError) -> bool:
+    """Whether settings are wrong for this reason without those that were given."""
+    try:
+        validate(merged(algo, layers))
+    except UsageError as error:
+        return str(error) == str(why)
+    return False
+
+
+def _layer_of_file(table: dict[str, Any], algo: str, where: str) -> SettingsLayer:
+    """The settings of a TOML file for this algorithm. Tables of others are left out: one file can hold those of several."""
+    of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS and not is_own(name)}
+    of_algorithm = table.get(algo, {})
+    if not isinstance(of_algorithm, dict):
+        raise UsageError(f"{where}: {algo}: expected a table, {_header(algo)}, got {of_algorithm}")
+    if misplaced := of_run.keys() & {*settings_record(algo).__struct_fields__}:
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table {_header(algo)}")
+    if misplaced := of_algorithm.keys() & {*Config.__struct_fields__}:
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table {_header(algo)}")
+    return SettingsLayer(where, of_run | of_algorithm)
+
+
+def _header(algo: str) -> str:
+    """The header of an algorithm's table in TOML."""
+    return f'["{algo}"]' if is_own(algo) else f"[{algo}]"
+
+
+def _without_tables(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in TABLES}
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
@@ -168,22 +251,3 @@ def _read_toml(file: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise UsageError(f"config file {file} cannot be read: {why}") from error
-
-
-def _override_from_toml(config: Config, table: dict[str, Any], where: str) -> Config:
-    """Tables of other algorithms are ignored, so that one file can hold the settings of several."""
-    algo = str(table.get("algo", config.algo))
-    of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS and not is_own(name)}
-    of_algorithm = table.get(algo, {})
-    if not isinstance(of_algorithm, dict):
-        raise UsageError(f"{where}: {algo}: expected a table, {_header(algo)}, got {of_algorithm}")
-    if misplaced := of_run.keys() & set(msgspec.structs.asdict(config.algorithm)):
-        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table {_header(algo)}")
-    if misplaced := of_algorithm.keys() & set(msgspec.structs.asdict(config)):
-        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table {_header(algo)}")
-    return override(config, of_run | of_algorithm, where)
-
-
-def _header(algo: str) -> str:
-    """The header of an algorithm's table in TOML."""
-    return f'["{algo}"]' if is_own(algo) else f"[{algo}]"

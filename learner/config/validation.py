@@ -1,17 +1,14 @@
-"""Checks of a configuration. Each error is one line that names the setting, what was expected and what was given. Pure."""
+"""Checks of settings that types can't make. Each error is one line: setting, what was expected, what was given. Pure."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
-from millrace.flags.fields import fields_of
-from millrace.flags.values import what_was_expected
-from millrace.learner.config.algorithm_names import settings_record
+from millrace.flags.values import convert
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.evaluation_size import evaluation_size
 from millrace.learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
@@ -27,64 +24,56 @@ from millrace.protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
 LARGEST_SEED = 2**64 - 1  # that PyTorch takes
-RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
-def convert(settings: dict[str, Any], where: str) -> Config:
-    """The record of these settings (plain data), each checked by itself.
-
-    Raises `UsageError` that names the setting, what was expected and what was given. `where` says in which file it stands.
-    """
-    kind: type[msgspec.Struct] = settings_record(settings["algo"])
-    algorithm = _converted(settings["algorithm"], kind, settings, where)
-    return msgspec.structs.replace(_converted({**settings, "algorithm": {}}, Config, settings, where), algorithm=algorithm)
-
-
-def _converted(values: Any, kind: type[RecordT], settings: dict[str, Any], where: str = "") -> RecordT:
-    """These values, which are among the settings, as a record. Raises `UsageError`."""
-    for table in TABLES:
-        if not isinstance(settings.get(table, {}), Mapping):
-            raise UsageError(f"{where}: {table}: expected table, got {settings[table]!r:.60}".removeprefix(": "))
-        check_arguments(settings.get(table, {}), f"{where}: {table}".removeprefix(": "))
-    try:
-        return msgspec.convert(values, kind)
-    except (msgspec.ValidationError, UnicodeEncodeError) as error:  # the latter for a path that is no text
-        raise UsageError(f"{where}: {_reworded(str(error), settings)}".removeprefix(": ")) from error
-
-
-def validate(config: Config, where: str = "") -> Config:
-    """The same configuration, if a run can be made of it. Raises `UsageError` that says what is wrong."""
-    at = f"{where}: " if where else ""
-    config = convert(msgspec.to_builtins(config), where)
+def validate(config: Config) -> None:
+    """Raise `UsageError`, which says what is wrong, if no run can be made of these settings, each of which is right."""
     if not config.env:
-        raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
-    _check_texts(config, at)
-    check_rollout_settings(config, at)
-    _check_numbers(config.algorithm, at)
-    _check_env_arguments(config, at)
+        raise UsageError("which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
+    check_rollout_settings(config)
+    _check_env_arguments(config)
     match config.algorithm:
         case OffPolicyConfig(replay_size=size, rollout_steps=steps) if size < (
             most := (steps + 1) * config.envs // config.lanes
         ):
-            raise UsageError(f"{at}replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
+            raise UsageError(f"replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
     if config.inference == "learner":
-        _check_learner_inference(config, at)
-    _check_prior(config, at)
+        _check_learner_inference(config)
+    _check_prior(config)
     check_copies(config, "max_env_copies", config.max_env_copies)
     encoder = getattr(config.algorithm, "encoder", None)
     if encoder is not None and not is_name(encoder):
-        raise UsageError(f"{at}encoder {encoder}: expected module:factory, as in my_package.networks:encoder")
-    return config
+        raise UsageError(f"encoder {encoder}: expected module:factory, as in my_package.networks:encoder")
 
 
-def _check_texts(config: Config, at: str) -> None:
+def check_table(value: object, origin: str) -> None:
+    """Raise `UsageError` if this is no table of arguments that a message can carry. `origin`: what an error calls it."""
+    if not isinstance(value, Mapping):
+        raise UsageError(f"{origin}: expected table, got {value!r:.60}")
+    check_arguments(value, origin)
+
+
+def check_text(name: str, value: object, origin: str) -> None:
     """Raise `UsageError` for a text that no file and no message can hold: words of a command line may be any bytes."""
-    settings = msgspec.structs.asdict(config) | msgspec.structs.asdict(config.algorithm)
-    del settings["run_dir"]  # of which the folder's own check says what to do
-    for name, value in settings.items():
-        for text in value if isinstance(value, tuple) else (value,):
-            if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
-                raise UsageError(f"{at}{name}: expected text in UTF-8, got {text!r:.60}")
+    if name == "run_dir":  # of which the folder's own check says what to do
+        return
+    for text in value if isinstance(value, tuple | list) else (value,):
+        if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
+            raise UsageError(f"{origin}: expected text in UTF-8, got {text!r:.60}")
+
+
+def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
+    """Raise `UsageError` for NaN, and for a whole number that is too large for a message.
+
+    `origins`: what an error calls a setting that was given.
+    """
+    for name, value in msgspec.structs.asdict(record).items():
+        most = LARGEST_SEED if name == "seed" else LARGEST
+        for each in value if isinstance(value, tuple) else (value,):
+            if isinstance(each, int) and each > most:
+                raise UsageError(f"{origins.get(name, name)}: expected int <= {most}, got {one_line(str(each))}")
+        if isinstance(value, float) and math.isnan(value):
+            raise UsageError(f"{origins.get(name, name)}: expected a number, got {value}")
 
 
 def check_copies(config: Config, limit: str, most: int) -> None:
@@ -138,77 +127,67 @@ def unused_setting(config: Config) -> str:
 
 def convert_rollout_settings(settings: dict[str, Any], where: str) -> RolloutConfig:
     """The record of these settings, checked. Raises `UsageError`. `where` begins the message."""
-    config = _converted(settings, RolloutConfig, settings, where)
-    check_rollout_settings(config, f"{where}: ")
+    origins = {name: f"{where}: {name}" for name in settings}
+    for table in settings.keys() & {*TABLES}:
+        check_table(settings[table], origins[table])
+    config = convert(settings, RolloutConfig, origins)
+    check_numbers(config, origins)
+    try:
+        check_rollout_settings(config)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from error
     return config
 
 
-def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
-    """Raise `UsageError` if rollouts cannot be collected with these settings. `at` begins the message."""
-    _check_numbers(config, at)
+def check_rollout_settings(config: RolloutConfig) -> None:
+    """Raise `UsageError` if rollouts cannot be collected with these settings."""
     if config.envs % config.lanes:
         fewer = config.envs - config.envs % config.lanes
         near = f"{fewer} or {fewer + config.lanes}" if fewer else f"{config.lanes}"
         divisor = max(n for n in range(1, min(config.lanes, config.envs) + 1) if config.envs % n == 0)
         raise UsageError(
-            f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
+            f"{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
     if (tickets := config.lanes * (1 + config.max_lag)) > MOST_TICKETS:
         expected = f"expected lanes * (1 + max_lag) of at most {MOST_TICKETS}"
-        raise UsageError(f"{at}{config.lanes} lanes with max_lag {config.max_lag}: {expected}, got {tickets}")
+        raise UsageError(f"{config.lanes} lanes with max_lag {config.max_lag}: {expected}, got {tickets}")
     names = config.info_keys
     if len(names) > MAX_FACTS or len(set(names)) < len(names):
-        raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
+        raise UsageError(f"info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
-        raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
+        raise UsageError(f"info_keys: expected names in one line, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
     if taken := METRICS_BESIDE_FACTS.union(f"{name}_missing" for name in names).intersection(names):
-        raise UsageError(f"{at}info_keys: expected another name than {min(taken)}, under which something else is logged")
+        raise UsageError(f"info_keys: expected another name than {min(taken)}, under which something else is logged")
     if config.wrappers and config.vector != "loop":
         raise UsageError(
-            f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
+            f"vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
         )
-    try:
-        check_kind(config.vector)
-        for wrapper in config.wrappers:
-            wrapper_name(wrapper)
-        check_address(config.bind)
-    except UsageError as error:
-        raise UsageError(f"{at}{error}") from None
+    check_kind(config.vector)
+    for wrapper in config.wrappers:
+        wrapper_name(wrapper)
+    check_address(config.bind)
     if config.metrics_bind:
         try:
             check_address(f"tcp://{config.metrics_bind}")
         except UsageError:
             expected = "expected HOST:PORT, as in 127.0.0.1:9464"
-            raise UsageError(f"{at}metrics_bind {config.metrics_bind}: {expected}") from None
+            raise UsageError(f"metrics_bind {config.metrics_bind}: {expected}") from None
     try:
         check_address(advertised_address("tcp://*:1", config.advertise, "machine"))
     except UsageError:
-        raise UsageError(
-            f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
-        ) from None
+        raise UsageError(f"advertise {config.advertise}: expected a host name or an IP address, without a port") from None
 
 
-def _check_numbers(record: msgspec.Struct, at: str) -> None:
-    """Raise `UsageError` for NaN, and for a whole number that is too large for a message."""
-    for name, value in msgspec.structs.asdict(record).items():
-        most = LARGEST_SEED if name == "seed" else LARGEST
-        for each in value if isinstance(value, tuple) else (value,):
-            if isinstance(each, int) and each > most:
-                raise UsageError(f"{at}{name}: expected int <= {most}, got {one_line(str(each))}")
-        if isinstance(value, float) and math.isnan(value):
-            raise UsageError(f"{at}{name}: expected a number, got {value}")
-
-
-def _check_env_arguments(config: Config, at: str) -> None:
+def _check_env_arguments(config: Config) -> None:
     """Raise `UsageError` for a number that policy.json, which names the environment with its arguments, cannot hold."""
     for table in TABLES:
         for name, value in getattr(config, table).items():
             if isinstance(value, float) and not math.isfinite(value):
                 expected = "expected a finite number"
-                raise UsageError(f"{at}{table} {name}: {expected}, got {value}; leave it out, or take a large one")
+                raise UsageError(f"{table} {name}: {expected}, got {value}; leave it out, or take a large one")
 
 
-def _check_learner_inference(config: Config, at: str) -> None:
+def _check_learner_inference(config: Config) -> None:
     if config.max_lag:
         wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
     elif config.vector != "loop":
@@ -217,27 +196,16 @@ def _check_learner_inference(config: Config, at: str) -> None:
         wrong = f"eval_workers: expected 0, got {config.eval_workers}; its workers step copies, and cannot evaluate alone"
     else:
         return
-    raise UsageError(f"{at}inference learner: {wrong}")
+    raise UsageError(f"inference learner: {wrong}")
 
 
-def _check_prior(config: Config, at: str) -> None:
+def _check_prior(config: Config) -> None:
     match config.algorithm:
         case PolicyGradientConfig(clone_epochs=0) if config.prior:
-            raise UsageError(f"{at}prior {config.prior}: {config.algo} can only clone it; add --clone-epochs 50")
+            raise UsageError(f"prior {config.prior}: {config.algo} can only clone it; add --clone-epochs 50")
         case RecurrentConfig(core=str(), clone_epochs=epochs) if epochs:
-            raise UsageError(f"{at}clone_epochs: expected 0 with a recurrent core, got {epochs}; take --core none")
+            raise UsageError(f"clone_epochs: expected 0 with a recurrent core, got {epochs}; take --core none")
     for name in ("prior_steps", "clone_epochs"):
         number: int = getattr(config.algorithm, name, 0)
         if number and not config.prior:
-            raise UsageError(f"{at}{name}: expected 0 without prior data, got {number}; name it by --prior")
-
-
-def _reworded(message: str, settings: dict[str, Any]) -> str:
-    """Msgspec's message in our words: the setting, what was expected and what was given."""
-    algorithm = settings.get("algorithm", {})
-    name = re.split(r"[.\[`]", message.partition(" - at `$.")[2])[0]
-    record = settings_record(settings["algo"]) if name in algorithm else Config
-    given = algorithm.get(name, settings.get(name))
-    given = list(given) if isinstance(given, tuple) else given
-    field = fields_of(record).get(name)
-    return f"{name}: {what_was_expected(message, field and field.hint)}, got {safe_repr(given)}"
+            raise UsageError(f"{name}: expected 0 without prior data, got {number}; name it by --prior")

@@ -8,10 +8,8 @@ the last one counts. What the user does wrong is one line.
 from __future__ import annotations
 
 import sys
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import msgspec
 
@@ -26,12 +24,31 @@ EVERYWHERE = (*HELP_FLAGS, "--debug")  # flags that every command takes
 FlagsT = TypeVar("FlagsT", bound=msgspec.Struct)
 
 
+class Typed(NamedTuple):
+    """A flag as it was typed, and the words behind it up to the next flag."""
+
+    flag: str
+    """`--net`, or `--net=64`; empty for the words before the first flag"""
+    words: list[str]
+
+    @property
+    def name(self) -> str:
+        """As a field is named."""
+        return self.flag.partition("=")[0].lstrip("-").replace("-", "_")
+
+    @property
+    def value(self) -> str | None:
+        """Behind the sign; None without a sign."""
+        _, sign, value = self.flag.partition("=")
+        return value if sign else None
+
+
 def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
     """The record that these words describe. Raises `UsageError`, or SystemExit(0) after `--help`."""
     fields = fields_of(record)
     if asks_for_help(argv):
         show_help(command, " ".join((record.__doc__ or "").split()), {"flags": (record, list(fields))})
-    given = given_values(fields, argv, command)
+    given = given_values(fields, typed_flags(argv), command)
     required = {field.name for field in msgspec.structs.fields(record) if field.required}
     if missing := [fields[name].written for name in fields if name in required - given.keys()]:
         raise UsageError(f"{command}: missing: {', '.join(missing)}{_more(command)}")
@@ -55,41 +72,58 @@ def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return list(argv[:at]), list(argv[at + 1 :])
 
 
-def words_of(argv: Sequence[str], *names: str) -> dict[str, str]:
-    """The words behind these flags, whatever the other flags may be."""
+def typed_flags(argv: Sequence[str]) -> list[Typed]:
+    """The flags that were typed, in order, whatever flags there are. First come the words before the first flag."""
+    found = [Typed("", [])]
+    for word in argv:
+        if word in EVERYWHERE:
+            continue
+        if is_flag(word):
+            found.append(Typed(word, []))
+        else:
+            found[-1].words.append(word)
+    return found
+
+
+def first_words(flags: Sequence[Typed], *names: str) -> dict[str, str]:
+    """The value, or the first word, of each of these flags that has one."""
     found = {}
-    for word, following in pairwise([*argv, "--"]):
-        name, sign, value = _parts(word)
-        if is_flag(word) and name in names and (sign or not is_flag(following)):
-            found[name] = value if sign else following
+    for typed in flags:
+        if typed.name in names and (typed.value is not None or typed.words):
+            found[typed.name] = typed.words[0] if typed.value is None else typed.value
     return found
 
 
 def given_values(
     fields: Mapping[str, FlagField],
-    argv: Sequence[str],
+    flags: Sequence[Typed],
     command: str,
     hint: Callable[[str], str] = lambda name: "",
 ) -> dict[str, Any]:
     """The values of the fields that are given. `hint` gets the name of an unknown flag, and ends the error's line."""
     given: dict[str, Any] = {}
     arguments: list[str] = []
-    words = deque(word for word in argv if word not in EVERYWHERE)
-    while words:
-        word = words.popleft()
-        if not is_flag(word):
-            arguments.append(word)
+    for typed in flags:
+        if not typed.flag:
+            arguments += typed.words
             continue
-        name, sign, value = _parts(word)
-        field = _field(fields, name)
+        field = _field(fields, typed.name)
         if field is None or field.flag.positional:
-            raise UsageError(f"{command}: {_unknown(fields, word.partition('=')[0], command, hint(name))}")
+            raise UsageError(f"{command}: {_unknown(fields, typed, command, hint(typed.name))}")
         if field.kind is bool and not field.optional:
-            if sign:
-                raise UsageError(f"{command}: {word}: expected {field.written} or --no-{field.written[2:]}")
-            given[field.name] = name == field.name
+            if typed.value is not None:
+                raise UsageError(f"{command}: {typed.flag}: expected {field.written} or --no-{field.written[2:]}")
+            given[field.name] = typed.name == field.name
+            arguments += typed.words
             continue
-        values = [value] if sign else _taken(words, len(words) if field.many else 1)
+        if typed.value is not None:
+            values = [typed.value]
+            arguments += typed.words
+        elif field.many:
+            values = typed.words
+        else:
+            values = typed.words[:1]
+            arguments += typed.words[1:]
         if not values and not field.many:
             raise UsageError(f"{command}: expected {field.written} {field.metavar}, got no value{_more(command)}")
         given[field.name] = read_words(field, values)
@@ -105,26 +139,12 @@ def is_flag(word: str) -> bool:
     return False
 
 
-def _parts(word: str) -> tuple[str, str, str]:
-    """The name of a flag as a field has it, and the value behind a sign, if there is one."""
-    name, sign, value = word.partition("=")
-    return name.lstrip("-").replace("-", "_"), sign, value
-
-
 def _field(fields: Mapping[str, FlagField], name: str) -> FlagField | None:
     """The field of this flag. A field that is true or false also has a flag that begins with `no`."""
     for field in fields.values():
         if name in (field.name, field.flag.alias) or (field.kind is bool and name == f"no_{field.name}"):
             return field
     return None
-
-
-def _taken(words: deque[str], most: int) -> list[str]:
-    """The values that come next, which are taken away."""
-    taken: list[str] = []
-    while words and len(taken) < most and not is_flag(words[0]):
-        taken.append(words.popleft())
-    return taken
 
 
 def _arguments(fields: Sequence[FlagField], words: list[str], command: str) -> dict[str, Any]:
@@ -141,14 +161,14 @@ def _arguments(fields: Sequence[FlagField], words: list[str], command: str) -> d
     return given
 
 
-def _unknown(fields: Mapping[str, FlagField], flag: str, command: str, hint: str) -> str:
-    name = flag.lstrip("-").replace("-", "_")
-    if name in fields:
-        argument = fields[name].metavar
+def _unknown(fields: Mapping[str, FlagField], typed: Typed, command: str, hint: str) -> str:
+    if typed.name in fields:
+        argument = fields[typed.name].metavar
         return f"{argument} has no flag; expected it as in: millrace {command} {argument}"
     known = [field for field in fields.values() if not field.flag.positional]
     names = [field.written[2:] for field in known]
     names += [f"no-{field.written[2:]}" for field in known if field.kind is bool]
+    flag = typed.flag.partition("=")[0]
     return f"unknown flag {flag}{hint or did_you_mean(flag.lstrip('-'), names, '--')}"
 
 

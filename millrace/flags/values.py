@@ -1,7 +1,8 @@
-"""Turns words of a command line, or a keyword argument, into the value of a field, or says why that is impossible.
+"""Turns words of a command line, or a keyword argument, into the value of a field, and values into a record.
 
 Rules: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64. The values of a table are written as
-in TOML (toml_words.py); those of any other field are read as its type.
+in TOML (toml_words.py); those of any other field are read as its type. Values of Python and TOML are not read: the text
+"2.5" is no number.
 """
 
 from __future__ import annotations
@@ -9,16 +10,18 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import msgspec
 
-from millrace.flags.fields import FlagField, choices, is_choice
+from millrace.flags.fields import FlagField, choices, fields_of, is_choice
 from millrace.flags.toml_words import as_text, read_word
-from millrace.protocol.bounds import one_line
-from millrace.protocol.errors import UsageError
+from millrace.protocol.bounds import MAX_NAME, one_line
+from millrace.protocol.errors import UsageError, safe_repr
+
+RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:
@@ -31,17 +34,25 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
                 name, _, right = wrong[0].partition("=")
                 looks_like_a_flag = right.startswith("-") and not right[1:2].isdigit()
                 apart = f"{name} {as_text(right) if looks_like_a_flag else right}"
-                raise UsageError(f"{field.name}: expected NAME VALUE, got {wrong[0]}; write them apart: {one_line(apart)}")
+                raise UsageError(
+                    f"{field.written}: expected NAME VALUE, got {wrong[0]}; write them apart: {one_line(apart)}"
+                )
             if len(words) % 2:
                 hint = f"; a text that begins with a dash is written in quotes: {shlex.quote(words[-1])} '\"-x\"'"
-                raise UsageError(f"{field.name}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}{hint}")
+                raise UsageError(f"{field.written}: expected NAME VALUE NAME VALUE ..., got {shlex.join(words)}{hint}")
             return {name: _entry(field, name, word) for name, word in zip(words[::2], words[1::2], strict=True)}
         case origin if origin in (tuple, list):
             value: object = list(words)
         case _:
             (value,) = words
     value = with_whole_numbers(field, value)
-    return _converted(field, value, shlex.join(words), strict=False)
+    try:
+        return msgspec.convert(value, field.hint, strict=False, dec_hook=_path)
+    except msgspec.ValidationError as error:
+        expected = what_was_expected(str(error), field.hint)
+    except UnicodeEncodeError:  # a word, or a name of a file, may be any bytes
+        expected = "expected text in UTF-8"
+    raise UsageError(f"{field.written}: {expected}, got {shlex.join(words)}")
 
 
 def with_whole_numbers(field: FlagField, value: Any) -> Any:
@@ -69,18 +80,18 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def read_value(field: FlagField, value: Any) -> Any:
-    """The same value of Python's, as the field has it. Raises `UsageError`."""
-    return _converted(field, with_whole_numbers(field, value), f"{value!r:.60}", strict=True)
+def convert(values: Mapping[str, Any], record: type[RecordT], origins: Mapping[str, str]) -> RecordT:
+    """The record of these values of Python's or TOML's. Raises `UsageError`.
 
-
-def _converted(field: FlagField, value: Any, given: str, *, strict: bool) -> Any:
+    `origins`: what an error calls each value, by its name: `--max-lag`, or `my.toml: max_lag`.
+    """
     try:
-        return msgspec.convert(value, field.hint, strict=strict, dec_hook=_path)
+        return msgspec.convert(values, record, dec_hook=_path)
     except msgspec.ValidationError as error:
-        raise UsageError(f"{field.name}: {what_was_expected(str(error), field.hint)}, got {given}") from None
-    except UnicodeEncodeError:  # a word of the command line, or a name of a file, may be any bytes
-        raise UsageError(f"{field.name}: expected text in UTF-8, got {given}") from None
+        name = re.split(r"[.\[`]", str(error).partition(" - at `$.")[2])[0]
+        given = list(values[name]) if isinstance(values[name], tuple) else values[name]
+        expected = what_was_expected(str(error), fields_of(record)[name].hint)
+        raise UsageError(f"{origins[name]}: {expected}, got {one_line(safe_repr(given), MAX_NAME)}") from error
 
 
 def _path(kind: Any, value: object) -> Path:
@@ -106,9 +117,9 @@ def _entry(field: FlagField, name: str, word: str) -> Any:
         value = read_word(word)
         return msgspec.convert(value, get_args(field.kind)[1])
     except UsageError as error:
-        raise UsageError(f"{field.name}: {name}: {error}") from None
+        raise UsageError(f"{field.written}: {name}: {error}") from None
     except msgspec.ValidationError as error:
         expected = what_was_expected(str(error), None)
         raise UsageError(
-            f"{field.name}: {name}: {expected}, got {one_line(word, 60)}; write {as_text(word)} for this text"
+            f"{field.written}: {name}: {expected}, got {one_line(word, 60)}; write {as_text(word)} for this text"
         ) from None

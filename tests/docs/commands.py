@@ -20,7 +20,7 @@ from millrace.extras.launchers.command import LAUNCHERS
 from millrace.extras.monitoring.dashboard.command import DashboardFlags
 from millrace.extras.monitoring.report.command import PlotFlags, ReportFlags
 from millrace.flags.fields import fields_of
-from millrace.flags.parse import cut_at_dashes, given_values, parse_flags, words_of
+from millrace.flags.parse import cut_at_dashes, first_words, given_values, parse_flags, typed_flags
 from millrace.learner.config.command_line import RunFlags
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import UsageError
@@ -139,9 +139,10 @@ def _parse(name: str, argv: list[str]) -> None:
 
 def _parse_run(command: str, argv: list[str]) -> None:
     """Flags of a run. An algorithm of the user's own has flags that nobody knows here."""
-    algo = words_of(argv, "algo").get("algo", "ppo")
+    typed = typed_flags(argv)
+    algo = first_words(typed, "algo").get("algo", "ppo")
     if algo in HYPERPARAMETERS:
-        given_values(fields_of(RunFlags) | fields_of(HYPERPARAMETERS[algo]), argv, command)
+        given_values(fields_of(RunFlags) | fields_of(HYPERPARAMETERS[algo]), typed, command)
     elif ":" not in algo and not PLACEHOLDER.match(algo):
         raise UsageError(f"{command}: no such algorithm: {algo}")
 

@@ -1,6 +1,7 @@
 """The configuration: its layers in order, its one-line refusals, its file."""
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ import msgspec
 import pytest
 
 from millrace.learner.algorithms import ALGORITHMS, algorithm_class
+from millrace.learner.config.command_line import read_config
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
-from millrace.learner.config.layers import config_from_toml, lower_layers, resolve
+from millrace.learner.config.layers import config_from_toml, resolve
 from millrace.learner.config.presets import PRESETS, named_presets
 from millrace.learner.config.validation import check_copies, idle_workers, unused_setting, workers_to_wait_for
 from millrace.learner.run_folder.run_format import write_format
@@ -211,6 +213,36 @@ def test_a_bad_file_is_named(tmp_path: Path, text: str, says: str) -> None:
     assert str(file) in line
 
 
+def test_the_file_may_be_a_pipe_which_can_be_read_once() -> None:
+    """As in `--config <(generate)`."""
+    reading, writing = os.pipe()
+    os.write(writing, b"env = 'CartPole-v1'\nalgo = 'dqn'\nmax_lag = 2\n[dqn]\nn_step = 3\n")
+    os.close(writing)
+    config, _ = read_config("train", ["--config", f"/dev/fd/{reading}", "--tau", "0.5"])
+    os.close(reading)
+    assert config == resolve("CartPole-v1", algo="dqn", max_lag=2, n_step=3, tau=0.5)
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--max-lag", "-1"], "--max-lag: expected int >= 0, got -1"),
+        (["--seed", str(2**64)], "--seed: expected int <= 18446744073709551615, got 18446744073709551616"),
+        (["--config", "FILE"], "FILE: gamma: expected float <= 1.0, got 2"),
+        (["--config", "FILE", "--gamma", "0.5"], ""),
+    ],
+)
+def test_what_is_wrong_is_said_of_the_layer_that_counts(tmp_path: Path, flags: list[str], says: str) -> None:
+    file = str(written(tmp_path, "[ppo]\ngamma = 2\n"))
+    argv = ["CartPole-v1", *(flag.replace("FILE", file) for flag in flags)]
+    if not says:
+        assert read_config("train", argv)[0].algorithm.gamma == 0.5
+        return
+    with pytest.raises(UsageError) as caught:
+        read_config("train", argv)
+    assert str(caught.value) == says.replace("FILE", file)
+
+
 def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
     """Editors of Windows write it."""
     file = tmp_path / "my.toml"
@@ -224,12 +256,17 @@ def test_a_file_of_bytes_is_not_text(tmp_path: Path) -> None:
     assert f"config file {file} cannot be read: it is not text" in refusal(file=file)
 
 
-def test_lower_layers_are_not_yet_judged_as_a_whole(tmp_path: Path) -> None:
-    """A flag may still repair what a file alone would break."""
+def test_a_layer_may_repair_what_the_one_below_it_would_break(tmp_path: Path) -> None:
+    file = written(tmp_path, "lanes = 3\nsteps = 0\n")
+    assert resolve("CartPole-v1", file=file, envs=9, steps=5).lanes == 3
+
+
+def test_what_is_wrong_together_is_said_of_the_file_if_the_file_is_wrong_alone(tmp_path: Path) -> None:
     file = written(tmp_path, "lanes = 3\n")
-    assert lower_layers("CartPole-v1", file=file).lanes == 3
-    assert resolve("CartPole-v1", file=file, envs=9).envs == 9
-    assert "8 envs" in refusal(file=file)
+    says = "8 envs cannot be shared evenly among 3 lanes; take 6 or 9, or 2 lanes"
+    assert refusal(file=file) == refusal(file=file, seed=5) == f"{file}: {says}"
+    assert refusal(file=file, lanes=5).startswith("8 envs cannot be shared evenly among 5 lanes")
+    assert refusal(lanes=3) == says
 
 
 def test_a_resumed_run_keeps_its_settings_but_for_those_given(tmp_path: Path) -> None:

@@ -94,15 +94,15 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["record", "runs/a", "runs/b", "--out", "x"], "record: expected one run, got 2; name one of them"),
         (["status", "runs/a", "runs/b", "runs/c", "--json"], "status: expected one run, got 3; name one of them"),
         (["presets", "a"], "presets: unexpected argument a"),
-        (["train", "CartPole-v1", "--workers", "0"], "workers: expected int >= 1, got 0"),
-        (["train", "CartPole-v1", "--workers", "two"], "workers: expected int, got two"),
-        (["train", "CartPole-v1", "--learning-rate", "x y"], "learning_rate: expected float, got 'x y'"),
-        (["train", "CartPole-v1", "--transport", "udp"], "transport: expected one of inproc, ipc, tcp, got udp"),
-        (["train", "CartPole-v1", "--core", "rnn"], "core: expected one of lstm, gru, none, got rnn"),
-        (["train", "CartPole-v1", "--net", "64", "x"], "net: expected int, got 64 x"),
+        (["train", "CartPole-v1", "--workers", "0"], "--workers: expected int >= 1, got 0"),
+        (["train", "CartPole-v1", "--workers", "two"], "--workers: expected int, got two"),
+        (["train", "CartPole-v1", "--learning-rate", "x y"], "--learning-rate: expected float, got 'x y'"),
+        (["train", "CartPole-v1", "--transport", "udp"], "--transport: expected one of inproc, ipc, tcp, got udp"),
+        (["train", "CartPole-v1", "--core", "rnn"], "--core: expected one of lstm, gru, none, got rnn"),
+        (["train", "CartPole-v1", "--net", "64", "x"], "--net: expected int, got 64 x"),
         (
             ["train", "CartPole-v1", "--env-kwargs", "a"],
-            "env_kwargs: expected NAME VALUE NAME VALUE ..., got a; "
+            "--env-kwargs: expected NAME VALUE NAME VALUE ..., got a; "
             "a text that begins with a dash is written in quotes: a '\"-x\"'",
         ),
         (
@@ -110,7 +110,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
             "train: --shared-net=1: expected --shared-net or --no-shared-net",
         ),
         (["worker", "ipc://x", "--proceses", "2"], "worker: unknown flag --proceses; did you mean --processes?"),
-        (["conform", "--copies", "0"], "copies: expected int >= 1, got 0"),
+        (["conform", "--copies", "0"], "--copies: expected int >= 1, got 0"),
         (["train", "CartPole-v1", "--envs", "6"], "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
         (["train", "CartPole-v1", "--algo", "pp0"], f"algo pp0: expected one of {ALGORITHMS}; did you mean ppo?"),
         (
@@ -127,13 +127,13 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["report"], "report: which runs? expected run folders, as in: millrace report runs/*"),
         (["report", "/no"], "run /no: no such folder"),
         (["record", "/no", "--out", "cartpole/expert-v0"], "run /no: no such folder"),
-        (["record", "/no", "--out", "cartpole/expert-v0", "--steps", "0"], "steps: expected int >= 1, got 0"),
-        (["record", "/no", "--out", "cartpole/expert-v0", "--seed", "-1"], "seed: expected int >= 0, got -1"),
+        (["record", "/no", "--out", "cartpole/expert-v0", "--steps", "0"], "--steps: expected int >= 1, got 0"),
+        (["record", "/no", "--out", "cartpole/expert-v0", "--seed", "-1"], "--seed: expected int >= 0, got -1"),
         (
             ["record", "/no", "--out", "cartpole/expert-v0", "--step", "9"],
             "record: unknown flag --step; did you mean --steps?",
         ),
-        (["evaluate", "/no", "--episodes", "0"], "episodes: expected int >= 1, got 0"),
+        (["evaluate", "/no", "--episodes", "0"], "--episodes: expected int >= 1, got 0"),
         (["evaluate", "/no", "--video"], "run /no: no such folder"),
         (["evaluate", "/no"], "run /no: no such folder"),
         (["evaluate", "/no", "--episode", "3"], "evaluate: unknown flag --episode; did you mean --episodes?"),
@@ -463,8 +463,8 @@ def test_a_worker_without_a_token_does_not_go_to_another_machine(tmp_path: Path,
         (["--name", "\udcff"], r"worker name '\udcff': expected 1 to 200 bytes without control characters, got 1 bytes"),
         (["--name", "x" * 198, "--processes", "2"], "expected 1 to 200 bytes without control characters, got 201 bytes"),
         (["--core", "-1"], "core: expected one that this process may use, of ["),
-        (["--join-timeout-s", "-5"], "join_timeout_s: expected float >= 0.0, got -5"),
-        (["--join-timeout-s", "nan"], "join_timeout_s: expected float >= 0.0, got nan"),
+        (["--join-timeout-s", "-5"], "--join-timeout-s: expected float >= 0.0, got -5"),
+        (["--join-timeout-s", "nan"], "--join-timeout-s: expected float >= 0.0, got nan"),
         (["--processes", "0"], "processes: expected int >= 1, got 0"),
         (["inproc://x"], "address inproc://x: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process"),
     ],
@@ -488,7 +488,7 @@ def test_a_command_runs_in_a_folder_that_was_deleted(
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan"])
 def test_a_status_needs_time_for_the_answer(capsys: Captured, seconds: str) -> None:
     says = refusal(capsys, "status", "tcp://127.0.0.1:5", "--timeout-s", seconds)
-    assert says == f"timeout_s: expected float > 0.0, got {seconds}"
+    assert says == f"--timeout-s: expected float > 0.0, got {seconds}"
 
 
 # ------------------------------------------------------------------------------------------------- evaluate, plot, help

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from millrace.flags.fields import Flag, fields_of
 from millrace.flags.help import help_text
-from millrace.flags.parse import parse_flags, words_of
+from millrace.flags.parse import first_words, parse_flags, typed_flags
 from millrace.protocol.errors import UsageError
 
 
@@ -86,22 +86,22 @@ def test_words_become_values(words: str, expected: dict[str, Any] | None) -> Non
         ("--no-gentl", "do: unknown flag --no-gentl; did you mean --no-gentle?"),
         ("-x", "do: unknown flag -x"),
         ("--rate --gentle", "do: expected --rate FLOAT, got no value; millrace do --help tells more"),
-        ("--rate -5", "rate: expected float > -5.0, got -5"),
-        ("--inner 1.5", "inner: expected int, got 1.5"),
-        ("--sizes 3,x", "sizes: expected int, got 3,x"),
-        ("--sizes 3 0", "sizes: expected int >= 1, got 3 0"),
-        ("--level 3", "level: expected one of 1, 2, none, got 3"),
+        ("--rate -5", "--rate: expected float > -5.0, got -5"),
+        ("--inner 1.5", "--inner: expected int, got 1.5"),
+        ("--sizes 3,x", "--sizes: expected int, got 3,x"),
+        ("--sizes 3 0", "--sizes: expected int >= 1, got 3 0"),
+        ("--level 3", "--level: expected one of 1, 2, none, got 3"),
         (
             "--table a",
-            "table: expected NAME VALUE NAME VALUE ..., got a; "
+            "--table: expected NAME VALUE NAME VALUE ..., got a; "
             "a text that begins with a dash is written in quotes: a '\"-x\"'",
         ),
-        ("--table a=1", "table: expected NAME VALUE, got a=1; write them apart: a 1"),
-        ("--table a=-x", "table: expected NAME VALUE, got a=-x; write them apart: a '\"-x\"'"),
-        ("--table a=-3", "table: expected NAME VALUE, got a=-3; write them apart: a -3"),
-        ("--table a 1 b=2 c=3", "table: expected NAME VALUE, got b=2; write them apart: b 2"),
-        ("--inner \udce9", "inner: expected text in UTF-8, got '\\udce9'"),
-        ("--sizes 3 \udce9", "sizes: expected text in UTF-8, got 3 '\\udce9'"),
+        ("--table a=1", "--table: expected NAME VALUE, got a=1; write them apart: a 1"),
+        ("--table a=-x", "--table: expected NAME VALUE, got a=-x; write them apart: a '\"-x\"'"),
+        ("--table a=-3", "--table: expected NAME VALUE, got a=-3; write them apart: a -3"),
+        ("--table a 1 b=2 c=3", "--table: expected NAME VALUE, got b=2; write them apart: b 2"),
+        ("--inner \udce9", "--inner: expected text in UTF-8, got '\\udce9'"),
+        ("--sizes 3 \udce9", "--sizes: expected text in UTF-8, got 3 '\\udce9'"),
         ("--gentle=yes", "do: --gentle=yes: expected --gentle or --no-gentle"),
         ("a b", "do: unexpected argument b"),
     ],
@@ -114,7 +114,7 @@ def test_what_is_wrong_is_one_line(words: str, why: str) -> None:
 
 def test_flags_are_read_ahead_whatever_the_others_are() -> None:
     words = ["--unknown", "--algo", "a", "E", "--file=b", "--algo", "c", "--empty"]
-    assert words_of(words, "algo", "file", "empty") == {"algo": "c", "file": "b"}
+    assert first_words(typed_flags(words), "algo", "file", "empty") == {"algo": "c", "file": "b"}
 
 
 def test_a_redefined_field_keeps_its_place_and_the_help_hides_what_is_not_for_the_user() -> None:

@@ -54,7 +54,7 @@ def test_a_value_of_another_language_is_refused_in_a_line_that_says_what_to_writ
     with pytest.raises(UsageError) as refused:
         read_words(FIELD, ["name", word])
     line = str(refused.value)
-    assert line.startswith(f"env_kwargs: name: expected a value as in TOML, got {word}; {write}, or ")
+    assert line.startswith(f"--env-kwargs: name: expected a value as in TOML, got {word}; {write}, or ")
     (typed,) = shlex.split(line.rpartition(", or ")[2].removesuffix(" for this text"))
     assert read_words(FIELD, ["name", typed]) == {"name": word}
     if write.startswith("write ") and " " not in (value := write.removeprefix("write ")):
@@ -67,7 +67,8 @@ def test_a_value_that_no_environment_can_get_is_refused(word: str) -> None:
         read_words(FIELD, ["name", word])
     line = str(refused.value)
     assert (
-        line == f"env_kwargs: name: expected a number, text, true or false, got {word}; write {as_text(word)} for this text"
+        line
+        == f"--env-kwargs: name: expected a number, text, true or false, got {word}; write {as_text(word)} for this text"
     )
     (typed,) = shlex.split(as_text(word))
     assert read_words(FIELD, ["name", typed]) == {"name": word}
