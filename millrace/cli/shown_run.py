@@ -1,4 +1,4 @@
-"""Train, show the progress meanwhile, and print how the run ended, and commands that go on with it.
+"""Shows the progress of a run that a command trains, and prints how it ended, and commands that go on with it.
 
 Rule: output that cannot be written is dropped; the run goes on.
 """
@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,18 +29,31 @@ if TYPE_CHECKING:
 log = logging.getLogger("millrace.learner")
 
 
-def show_run(argv: list[str], train: Callable[[Watch], Path], new: Config | None = None, command: str = "train") -> int:
-    """Train. `new`: the settings of a new run, whose origin is shown before its first progress. Returns the exit code.
+class ShownRun:
+    """Shows the progress of a run, and prints how it ended."""
 
-    `command`: that of millrace which resumes the run.
-    """
-    log_json = "--log-json" in argv
-    with unfailing("stdout"):
-        with progress_view(log_json) as watch:
-            run = train(watch if new is None else _after_origin(new, watch))
+    def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
+        """`new`: the settings of a new run, whose origin is shown before its first progress.
+
+        `command`: that of millrace which resumes the run.
+        """
+        self._log_json = "--log-json" in argv
+        self._new = new
+        self._command = command
+
+    @contextmanager
+    def progress(self) -> Iterator[Watch]:
+        """Shows the progress that it is called with, while it is entered."""
+        with unfailing("stdout"), progress_view(self._log_json) as watch:
+            yield watch if self._new is None else _after_origin(self._new, watch)
+
+    def end(self, run: Path) -> int:
+        """Print how the run in this folder ended. Returns the exit code."""
         summary = RunFolder(run).summary()
         lines = [] if summary is None else result(summary)
-        print("\n".join([*lines, *([f"run folder: {run}"] if log_json else next_commands(run, summary, command))]))
+        lines += [f"run folder: {run}"] if self._log_json else next_commands(run, summary, self._command)
+        with unfailing("stdout"):
+            print("\n".join(lines))
         return 0
 
 

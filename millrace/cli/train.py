@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from millrace.cli.shown_run import show_run
+from millrace.cli.shown_run import ShownRun
 from millrace.learner.config.command_line import read_config
 
 
@@ -22,6 +22,7 @@ def _train(argv: list[str], command: Literal["train", "learner"]) -> int:
     config, resume = read_config(command, argv)
     from millrace.launch import training  # takes 0.2 s to import: not before the flags are known to be right
 
-    elsewhere = command == "learner"
-    new = None if resume else config
-    return show_run(argv, lambda watch: training.train(config, resume, watch, elsewhere=elsewhere), new, command)
+    shown = ShownRun(argv, new=None if resume else config, command=command)
+    with shown.progress() as watch:
+        run = training.train(config, resume, watch, elsewhere=command == "learner")
+    return shown.end(run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from millrace.cli.shown_run import show_run
+from millrace.cli.shown_run import ShownRun
 from millrace.cli.subcommands import chosen_subcommand
 from millrace.extras.launchers.command_line import SET_BY_LAUNCHER, read_flags
 from millrace.extras.launchers.flags import KubernetesFlags, LaunchFlags, RayFlags, SlurmFlags
@@ -38,4 +38,7 @@ def _ray(argv: list[str]) -> int:
         if error.name != "ray":
             raise
         raise UsageError("launch ray: Ray is not installed; pip install ray") from None
-    return show_run(argv, lambda watch: launch(flags, learner, watch))
+    shown = ShownRun(argv)
+    with shown.progress() as watch:
+        run = launch(flags, learner, watch)
+    return shown.end(run)
