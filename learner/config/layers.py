@@ -44,6 +44,13 @@ class SettingsLayer(NamedTuple):
         """What an error calls a setting of this layer."""
         return f"{self.where}: {field.name}" if self.where else field.written
 
+    def without_tables(self) -> SettingsLayer:
+        """Without the arguments of the environment."""
+        return SettingsLayer(self.where, {name: value for name, value in self.settings.items() if name not in TABLES})
+
+
+NOTHING = SettingsLayer("", {})
+
 
 class LowerLayers(NamedTuple):
     """What lies below flags and keyword arguments, as it was read, and the algorithm that all layers together name."""
@@ -63,13 +70,13 @@ class LowerLayers(NamedTuple):
         env = env or str(self.file.settings.get("env", self.named.settings.get("env", "")))
         layers = [self._of_environment(env), self.named]
         if self.file.settings.keys() >= ALL_BUT_TABLES:  # those of a whole run: its tables are whole, too
-            layers = [SettingsLayer(where, _without_tables(settings)) for where, settings in layers]
+            layers = [layer.without_tables() for layer in layers]
         return [*layers, self.file]
 
     def _of_environment(self, env: str) -> SettingsLayer:
         """The preset of this algorithm and environment, or of the environment that --preset names."""
         if self.preset == "none":
-            return SettingsLayer(str(PRESETS), {})
+            return NOTHING
         presets, named = environment_presets(self.algo), named_presets()
         name = env if self.preset == "auto" or self.preset in named else self.preset
         if name not in presets and name == self.preset:
@@ -104,7 +111,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 
     `where`: the file's name for error messages.
     """
-    return _settings_of_file(parse_toml(text, where), where)
+    return settings_of_run(_file_alone(parse_toml(text, where), where), NOTHING)
 
 
 def config_of_run(run: Path, algo: str | None = None) -> Config:
@@ -112,7 +119,8 @@ def config_of_run(run: Path, algo: str | None = None) -> Config:
 
     `algo`: the name that its algorithm has now, if it may be another one (`algorithm_names.moved`).
     """
-    return _settings_of_file(with_algorithm(read_config(run), algo), str(run / CONFIG_FILE))
+    table = with_algorithm(read_config(run), algo)
+    return settings_of_run(_file_alone(table, str(run / CONFIG_FILE)), NOTHING)
 
 
 def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | None, preset: str) -> LowerLayers:
@@ -129,12 +137,17 @@ def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | Non
         table = with_algorithm(read_config(resume), algo)
     else:
         table = {} if file is None else _read_toml(file)
-    presets = named_presets()
-    named = presets[preset].settings if preset in presets else {}
-    where = str(file)
+    whole_runs = named_presets()
+    named = SettingsLayer(f"preset {preset}", whole_runs[preset].settings if preset in whole_runs else {})
     if algo is None:
-        algo = _known_algorithm(table, where) if "algo" in table else str(named.get("algo", "ppo"))
-    return LowerLayers(algo, preset, SettingsLayer(f"preset {preset}", named), _layer_of_file(table, algo, where), resume)
+        algo = _algorithm_of_file({**named.settings, **table}, str(file))
+    return LowerLayers(algo, preset, named, _layer_of_file(table, algo, str(file)), resume)
+
+
+def _file_alone(table: dict[str, Any], where: str) -> LowerLayers:
+    """A file over the defaults, without a preset."""
+    algo = _algorithm_of_file(table, where)
+    return LowerLayers(algo, "none", NOTHING, _layer_of_file(table, algo, where), None)
 
 
 def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
@@ -170,7 +183,7 @@ def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
                 check_table(value, origins[name])
                 value = {**values.get(name, {}), **value}
             values[name] = _plain(fields[name], value)
-    values["algo"] = algo
+    values["algo"] = algo  # a layer may have named another one, which a stronger one replaced
     of_algorithm = {name: values.pop(name) for name in record.__struct_fields__ if name in values}
     algorithm = convert(of_algorithm, record, origins)
     config = convert(values, Config, origins)
@@ -188,7 +201,7 @@ def _plain(field: FlagField, value: Any) -> Any:
     return with_whole_numbers(field, value)
 
 
-def _known_algorithm(table: Mapping[str, Any], where: str) -> str:
+def _algorithm_of_file(table: Mapping[str, Any], where: str) -> str:
     """The algorithm that a file names. Raises `UsageError`."""
     algo = str(table.get("algo", "ppo"))
     try:
@@ -196,17 +209,6 @@ def _known_algorithm(table: Mapping[str, Any], where: str) -> str:
     except UsageError as error:
         raise UsageError(f"{where}: {error}", error.detail) from error
     return algo
-
-
-def _settings_of_file(table: dict[str, Any], where: str) -> Config:
-    """The settings of a file alone, over the defaults."""
-    algo = _known_algorithm(table, where)
-    config = merged(algo, [_layer_of_file(table, algo, where)])
-    try:
-        validate(config)
-    except UsageError as error:
-        raise UsageError(f"{where}: {error}") from error
-    return config
 
 
 def _is_wrong_alone(algo: str, layers: Sequence[SettingsLayer], why: UsageError) -> bool:
@@ -234,10 +236,6 @@ def _layer_of_file(table: dict[str, Any], algo: str, where: str) -> SettingsLaye
 def _header(algo: str) -> str:
     """The header of an algorithm's table in TOML."""
     return f'["{algo}"]' if is_own(algo) else f"[{algo}]"
-
-
-def _without_tables(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name not in TABLES}
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -28,19 +28,15 @@ class Typed(NamedTuple):
     """A flag as it was typed, and the words behind it up to the next flag."""
 
     flag: str
-    """`--net`, or `--net=64`; empty for the words before the first flag"""
+    """`--net`; empty for the words before the first flag"""
+    value: str | None
+    """behind a sign, as in `--net=64`; None without a sign"""
     words: list[str]
 
     @property
     def name(self) -> str:
         """As a field is named."""
-        return self.flag.partition("=")[0].lstrip("-").replace("-", "_")
-
-    @property
-    def value(self) -> str | None:
-        """Behind the sign; None without a sign."""
-        _, sign, value = self.flag.partition("=")
-        return value if sign else None
+        return self.flag.lstrip("-").replace("-", "_")
 
 
 def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
@@ -74,12 +70,13 @@ def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def typed_flags(argv: Sequence[str]) -> list[Typed]:
     """The flags that were typed, in order, whatever flags there are. First come the words before the first flag."""
-    found = [Typed("", [])]
+    found = [Typed("", None, [])]
     for word in argv:
         if word in EVERYWHERE:
             continue
         if is_flag(word):
-            found.append(Typed(word, []))
+            flag, sign, value = word.partition("=")
+            found.append(Typed(flag, value if sign else None, []))
         else:
             found[-1].words.append(word)
     return found
@@ -112,7 +109,8 @@ def given_values(
             raise UsageError(f"{command}: {_unknown(fields, typed, command, hint(typed.name))}")
         if field.kind is bool and not field.optional:
             if typed.value is not None:
-                raise UsageError(f"{command}: {typed.flag}: expected {field.written} or --no-{field.written[2:]}")
+                expected = f"expected {field.written} or --no-{field.written[2:]}"
+                raise UsageError(f"{command}: {typed.flag}={typed.value}: {expected}")
             given[field.name] = typed.name == field.name
             arguments += typed.words
             continue
@@ -168,8 +166,7 @@ def _unknown(fields: Mapping[str, FlagField], typed: Typed, command: str, hint: 
     known = [field for field in fields.values() if not field.flag.positional]
     names = [field.written[2:] for field in known]
     names += [f"no-{field.written[2:]}" for field in known if field.kind is bool]
-    flag = typed.flag.partition("=")[0]
-    return f"unknown flag {flag}{hint or did_you_mean(flag.lstrip('-'), names, '--')}"
+    return f"unknown flag {typed.flag}{hint or did_you_mean(typed.flag.lstrip('-'), names, '--')}"
 
 
 def _more(command: str) -> str:
