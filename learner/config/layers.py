@@ -178,11 +178,12 @@ def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
                 hint = in_place_of(name, fields) or did_you_mean(name, fields)
                 raise UsageError(f"{layer.where}: unknown setting {name}{hint}")
             origins[name] = layer.origin(fields[name])
-            check_text(name, value, origins[name])
+            plain = _plain(fields[name], value)
+            check_text(name, plain, origins[name])
             if name in TABLES:
-                check_table(value, origins[name])
-                value = {**values.get(name, {}), **value}
-            values[name] = _plain(fields[name], value)
+                check_table(plain, origins[name])
+                plain = {**values.get(name, {}), **plain}
+            values[name] = plain
     values["algo"] = algo  # a layer may have named another one, which a stronger one replaced
     of_algorithm = {name: values.pop(name) for name in record.__struct_fields__ if name in values}
     algorithm = convert(of_algorithm, record, origins)

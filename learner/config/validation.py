@@ -128,8 +128,10 @@ def unused_setting(config: Config) -> str:
 def convert_rollout_settings(settings: dict[str, Any], where: str) -> RolloutConfig:
     """The record of these settings, checked. Raises `UsageError`. `where` begins the message."""
     origins = {name: f"{where}: {name}" for name in settings}
-    for table in settings.keys() & {*TABLES}:
-        check_table(settings[table], origins[table])
+    for name, value in settings.items():
+        check_text(name, value, origins[name])
+        if name in TABLES:
+            check_table(value, origins[name])
     config = convert(settings, RolloutConfig, origins)
     check_numbers(config, origins)
     try:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from millrace.flags.parse import typed_flags
 from millrace.flags.program_name import typed_name
 from millrace.learner.config.presets import origin
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
@@ -37,7 +38,7 @@ class ShownRun:
 
         `command`: that of millrace which resumes the run.
         """
-        self._log_json = "--log-json" in argv
+        self._log_json = any(typed.name == "log_json" for typed in typed_flags(argv))
         self._new = new
         self._command = command
 

@@ -178,6 +178,7 @@ def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
         ({"env": "caf\udce9"}, "env: expected text in UTF-8, got 'caf\\udce9'"),
         ({"env": "Any-v0", "wrappers": ("a:B", "caf\udce9")}, "wrappers: expected text in UTF-8, got 'caf\\udce9'"),
         ({"encoder": "caf\udce9:x"}, "encoder: expected text in UTF-8, got 'caf\\udce9:x'"),
+        ({"opponents": Path("caf\udce9")}, "opponents: expected text in UTF-8, got 'caf\\udce9'"),
         ({"bind": "0.0.0.0:5555"}, "address 0.0.0.0:5555: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT"),
         ({"file": Path("/no/such.toml")}, "config file /no/such.toml cannot be read: No such file or directory"),
         ({"file": Path("/dev/zero")}, "config file /dev/zero cannot be read: expected at most 4,194,304 bytes, got more"),

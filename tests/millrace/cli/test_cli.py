@@ -266,8 +266,9 @@ def test_the_next_commands_are_for_a_shell_and_more_steps_for_a_run_that_made_al
     assert len(next_commands(Path("a"), replace(ended, stop_reason="target return 9 reached"), "train")) == 3
 
 
-def test_for_programs_the_last_line_is_the_run_folder(asked: list[Any], capsys: Captured) -> None:
-    assert main(["train", "CartPole-v1", "--log-json"]) == 0
+@pytest.mark.parametrize("flag", ["--log-json", "--log_json"])
+def test_for_programs_the_last_line_is_the_run_folder(asked: list[Any], capsys: Captured, flag: str) -> None:
+    assert main(["train", "CartPole-v1", flag]) == 0
     assert capsys.readouterr().out == "run folder: runs/a-run\n"
 
 
