@@ -109,7 +109,7 @@ class PolicyPlayer:
     @property
     def workers(self) -> int:
         """Number of workers that have joined since the first `play`."""
-        return 0 if self._hub is None else len(self._hub.snapshot().members)
+        return 0 if self._hub is None else len(self._hub.snapshot().roles)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
         """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""

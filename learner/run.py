@@ -30,6 +30,7 @@ from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from millrace.learner.run_folder.lease import Closed, Listens
+from millrace.learner.run_folder.progress_file import ProgressFile
 from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.learner.run_setup import RunSetup
 from millrace.learner.run_spec import run_spec
@@ -164,7 +165,14 @@ def open_run(
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
     past = (state.ledger, state.incarnations)
     pool = _opponent_pool(config, spec, state.opponents)
-    hub = open_hub(config, spec, link, processes, setup.check_running, observer, past, pool)
+    progress_file = ProgressFile(folder.path)
+
+    def watch_hub(listened: Hub) -> None:
+        observer(listened)
+        if folder.lock is None or not folder.lock.taken_over:
+            progress_file.write(listened.progress)
+
+    hub = open_hub(config, spec, link, processes, setup.check_running, watch_hub, past, pool)
     if state.opponent_policies is not None and pool is not None:
         hub.keep_opponents(*state.opponent_policies)
     state.opponent_policies = None

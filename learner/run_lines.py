@@ -6,26 +6,33 @@ no process trains it, and it has no results.
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from millrace.learner.config.presets import environment_name
 from millrace.learner.run_folder.last_line import resume_command
 from millrace.learner.run_folder.lease import Owner
-from millrace.learner.run_folder.metrics_log import newest_row
-from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY
+from millrace.learner.run_folder.progress_file import last_progress
 from millrace.learner.run_folder.regular_files import reason
 from millrace.learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
 from millrace.learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
 from millrace.learner.run_folder.run_lock import living_owner
-from millrace.learner.run_folder.sentences import ending, per_second
+from millrace.learner.run_folder.sentences import (
+    duration,
+    ending,
+    last_sign,
+    per_second,
+    percent,
+    return_in_words,
+    steps_in_words,
+)
 from millrace.protocol.bounds import INVALID, LARGEST, MAX_NAME, one_line
 from millrace.protocol.errors import UsageError
+from millrace.protocol.progress import RunProgress
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
 MOST_RUNS = 1_000  # of a folder
@@ -43,14 +50,9 @@ class RunLine(NamedTuple):
     env: str = ""
     algo: str = ""
     seed: int = 0
-    return_mean: float | None = None
-    """mean return of the last 100 training episodes"""
-    env_steps: float = 0
-    total_steps: float = 0
-    steps_per_s: float = 0.0
-    updates: float = 0
-    wall_s: float = 0.0
     started: str = ""
+    progress: RunProgress = RunProgress()
+    """how far it is"""
     summary: Summary | None = None
     problem: str = ""
     """why it cannot be read"""
@@ -63,7 +65,7 @@ class RunLine(NamedTuple):
     @property
     def begins(self) -> bool:
         """Whether it trains, and nobody knows how far it is: its folder has no numbers before the first update."""
-        return self.state == "training" and not (self.updates or self.env_steps)
+        return self.state == "training" and not (self.progress.updates or self.progress.env_steps_made)
 
     @property
     def done(self) -> str:
@@ -72,14 +74,13 @@ class RunLine(NamedTuple):
             return "before its first update"
         if self.summary is not None and (reason := self.summary.stop_reason) != self.state:
             return "100%" if reason == ALL_STEPS_DONE else one_line(reason, MOST_REASON)
-        return f"{math.floor(100 * min(1.0, self.env_steps / self.total_steps)) if self.total_steps > 0 else 0}%"
+        sign = last_sign(self.progress) if self.state == "dead" else ""
+        return f"{percent(self.progress)}, {sign}" if sign else percent(self.progress)
 
     @property
     def left_s(self) -> float | None:
         """Seconds of training that are left, at the speed so far; None if that is not known."""
-        if self.state != "training" or self.steps_per_s <= 0:
-            return None
-        return max(0.0, self.total_steps - self.env_steps) / self.steps_per_s
+        return self.progress.left_s if self.state == "training" else None
 
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
@@ -103,41 +104,24 @@ def read_line(path: Path, now: float) -> RunLine:
     except UsageError as error:
         return RunLine(path, "unreadable", problem=str(error))
     summary, owner = None, None
-    row: dict[str, Any] = {}
     with suppress(UsageError):
         owner = living_owner(path, now)
-    with suppress(OSError):
-        row = newest_row(path)
     if owner is None:
         try:
             summary = read_summary(path)
         except (OSError, *INVALID):
             summary = None
     steps = config.get("steps")
-    line = RunLine(
+    return RunLine(
         path=path,
         state="training" if owner else "dead" if summary is None else "interrupted" if summary.cut_short else "finished",
         owner=owner,
         env=one_line(name, MAX_NAME),
         algo=one_line(config["algo"], MAX_NAME),
         seed=config["seed"],
-        return_mean=row.get(RETURN_KEY),
-        env_steps=row.get(ENV_STEPS_KEY, 0),
-        total_steps=steps if isinstance(steps, int | float) and 0 <= steps <= LARGEST else 0,
-        steps_per_s=row.get("time/fps") or 0.0,
-        updates=row.get(UPDATES_KEY) or 0,
-        wall_s=row.get("time/time_elapsed") or 0.0,
         started=_started(path),
-    )
-    if summary is None:
-        return line
-    return line._replace(
+        progress=last_progress(path, summary, steps if isinstance(steps, int) and 0 <= steps <= LARGEST else 0),
         summary=summary,
-        return_mean=summary.return_mean_100,
-        env_steps=summary.env_steps,
-        steps_per_s=summary.env_steps_per_s,
-        updates=summary.updates,
-        wall_s=summary.wall_s,
     )
 
 
@@ -149,11 +133,13 @@ def headline(line: RunLine) -> str:
             return f"Training: {line.done}."
         case "training":
             left = "" if line.left_s is None else f", about {duration(line.left_s)} left"
-            return f"Training: {line.done} done, {per_second(line.steps_per_s)} env steps per second{left}."
+            return f"Training: {line.done} done, {per_second(line.progress.steps_per_s)} env steps per second{left}."
         case "unreadable":
             return f"It cannot be read: {line.problem}."
         case "dead":
-            return f"Dead: no process trains it, and it has no results. It was killed, or its machine went down; {resume}"
+            sign = last_sign(line.progress)
+            known = f"no process trains it, and it has no results{f'; {sign}' if sign else ''}"
+            return f"Dead: {known}. It was killed, or its machine went down; {resume}"
         case _:
             assert line.summary is not None
             said = ending(one_line(line.summary.stop_reason), cut_short=line.summary.cut_short)
@@ -162,20 +148,13 @@ def headline(line: RunLine) -> str:
 
 def in_sentences(line: RunLine) -> str:
     """The last state of a run that nobody trains, as lines for a terminal."""
-    score = "none yet" if line.return_mean is None else f"{line.return_mean:,.1f}"
-    done = f"{line.env_steps:,.0f} of {line.total_steps:,.0f} env steps in {duration(line.wall_s)}"
-    lines = [headline(line), f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}: {done}, return {score}"]
+    progress = line.progress
+    done = f"{steps_in_words(progress)} env steps in {duration(progress.wall_s)}"
+    score = f"return {return_in_words(progress.return_mean)}"
+    lines = [headline(line), f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}: {done}, {score}"]
     if line.summary is not None and line.summary.evaluation is not None:
         lines.append(one_line(f"greedy {line.summary.evaluation}"))
     return "\n".join(lines)
-
-
-def duration(seconds: float) -> str:
-    """A duration in s, min or h."""
-    if not 100 <= seconds < math.inf:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def algorithm_label(algo: str) -> str:

@@ -388,7 +388,7 @@ class RolloutService:
         ['w0']
         """
         with self._lock:
-            return sorted(member.hello.worker for member in self._hub.snapshot().members)
+            return sorted(self._hub.snapshot().roles)
 
     def close(self, reason: str = "the learner has ended") -> None:
         """Ask the workers to leave, and release everything. Does nothing the second time.

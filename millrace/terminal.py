@@ -8,7 +8,6 @@ that a stream which is full or closed does not end the run.
 from __future__ import annotations
 
 import logging
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -27,7 +26,19 @@ from millrace.learner.rollouts.opponent_pool import ELO_KEY
 from millrace.learner.run_folder.json_log import JsonLines, progress_line
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
-from millrace.learner.run_folder.sentences import bottleneck, ending, lag_in_words, per_second, went_wrong
+from millrace.learner.run_folder.sentences import (
+    bottleneck,
+    ending,
+    lag_in_words,
+    per_second,
+    percent,
+    return_in_words,
+    slowest_part,
+    steps_in_words,
+    went_wrong,
+    who_waits,
+    workers_in_words,
+)
 from millrace.protocol.bounds import escaped, one_line
 from millrace.protocol.logs.notices import is_notice
 from millrace.protocol.specs import SCORE
@@ -207,7 +218,7 @@ class PlainLines(ProgressView):
     def show(self, progress: Progress) -> None:
         """Print one line. Which part is the slowest, and what went wrong, is said at the end."""
         ended = bool(progress.stop_reason)
-        said = bottleneck("", progress.stages) if ended else bottleneck(progress.waiting, {})
+        said = slowest_part(progress.stages) if ended else who_waits(progress)
         parts = [main_figures(progress), said, went_wrong(progress.ledger) if ended else ""]
         self.print_line(" | ".join(filter(None, parts)))
 
@@ -297,12 +308,12 @@ class LiveBlock(ProgressView):
 def main_figures(progress: Progress) -> str:
     """The most important figures in one line."""
     figures = [
-        f"{progress.env_steps_made:,} of {progress.total_steps:,} env steps",
+        f"{steps_in_words(progress)} env steps",
         f"{per_second(progress.steps_per_s)} steps/s",
-        f"return {_return(progress)}",
+        f"return {return_in_words(progress.return_mean)}",
         _strength(progress),
-        _lag(progress),
-        f"workers {_workers(progress)}",
+        lag_in_words(progress),
+        f"workers {workers_in_words(progress)}",
         f"update {progress.updates:,}",
     ]
     return " | ".join(filter(None, figures))
@@ -311,14 +322,14 @@ def main_figures(progress: Progress) -> str:
 def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
     """What a block shows below its head, as text by name. `returns`: of the run so far."""
     best = progress.best
-    steps = f"{progress.env_steps_made:,} of {progress.total_steps:,}"
+    speed = f"{per_second(progress.steps_per_s)} a second"
     evaluated = "" if best is None else f"best evaluation {best[0]:,.1f} at {best[1]:,} env steps"
     rows = {
-        "env steps": GAP.join((steps, f"{per_second(progress.steps_per_s)} a second", f"update {progress.updates:,}")),
-        "return": GAP.join(filter(None, (_return(progress), str(returns), evaluated))),
+        "env steps": GAP.join((steps_in_words(progress), speed, f"update {progress.updates:,}")),
+        "return": GAP.join(filter(None, (return_in_words(progress.return_mean), str(returns), evaluated))),
         "opponents": _strength(progress),
-        "workers": GAP.join(filter(None, (_workers(progress), _lag(progress)))),
-        "time": bottleneck("" if progress.stop_reason else progress.waiting, progress.stages),
+        "workers": GAP.join(filter(None, (workers_in_words(progress), lag_in_words(progress)))),
+        "time": bottleneck(progress),
         "lost": went_wrong(progress.ledger),
         "run": progress.run,
     }
@@ -332,10 +343,9 @@ def how_far(progress: Progress) -> tuple[float | None, str]:
         return 1.0, f"100%  done in {took}"
     if progress.stop_reason:
         return None, ending(one_line(progress.stop_reason, MOST_REASON), f" after {took}", cut_short=progress.cut_short)
-    made = progress.env_steps_made
-    share = min(1.0, made / progress.total_steps) if progress.total_steps else 0.0
-    left_s = (progress.total_steps - made) / progress.steps_per_s if progress.steps_per_s else 0.0
-    return share, f"{math.floor(100 * share)}%  {took}" + (f", {_clock_time(left_s)} left" if left_s >= 1 else "")
+    left_s = progress.left_s or 0.0
+    left = f", {_clock_time(left_s)} left" if left_s >= 1 else ""
+    return progress.share, f"{percent(progress)}  {took}{left}"
 
 
 def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
@@ -356,23 +366,11 @@ def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
     return Group(head, rows)
 
 
-def _return(progress: Progress) -> str:
-    return "none yet" if progress.return_mean is None else f"{progress.return_mean:,.1f}"
-
-
 def _strength(progress: Progress) -> str:
     """Score and rating against opponents, if there are any."""
     if (elo := progress.metrics.get(ELO_KEY)) is None:
         return ""
     return f"score {progress.facts[SCORE]}, Elo {elo:,.0f}"
-
-
-def _lag(progress: Progress) -> str:
-    return lag_in_words(progress.lag_mean, progress.lag_max, progress.ledger.get("used", 0))
-
-
-def _workers(progress: Progress) -> str:
-    return f"{progress.workers_alive}" + (f" of {progress.workers_expected}" if progress.workers_expected else "")
 
 
 def _clock_time(seconds: float) -> str:

@@ -41,6 +41,8 @@ Whole = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
 Version = Annotated[int, Meta(ge=-1, le=LARGEST)]
 Pid = Annotated[int, Meta(ge=0, le=2**31)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
+Moment = Annotated[float, Meta(ge=0, le=1e11)]
+"""Seconds since 1970."""
 Real = Annotated[float, Meta(ge=-1.7976931348623157e308, le=1.7976931348623157e308)]
 """A finite number."""
 Versions = Annotated[tuple[Natural, ...], Meta(max_length=MAX_TICKETS)]

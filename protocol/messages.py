@@ -30,6 +30,7 @@ from millrace.protocol.bounds import (
 )
 from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.message_base import Message
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.space_spec import EnvDescription
 from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
@@ -421,34 +422,16 @@ class Status(Message, frozen=True):
     """The answer to Inquire."""
 
     env: str
+    progress: RunProgress
+    """how far the run, or the vector environment, is"""
     workers: tuple[WorkerStatus, ...]
     """in the order in which they joined; of very many, the first"""
     workers_wanted: int = 0
     """number of workers with which each lane has one of its own, and none is spare; 0 while the environment is described"""
-    version: int = -1
-    """how many updates the learner has made; -1 before the first weights"""
-    env_steps: int = 0
-    """env steps used by updates since the run began, and those of the rollouts that the next update waits for"""
-    total_steps: int = 0
-    """env steps at which the run ends; 0 for one without an end: a learner of one's own, or a vector environment"""
-    steps_per_s: float = 0.0
-    """these env steps per second, since this learner started"""
-    return_mean: float | None = None
-    """mean return of the last 100 episodes, in raw rewards"""
-    lag_mean: float = 0.0
-    """mean lag of the rollouts of the last update, in versions"""
-    lag_max: int = 0
-    """largest lag of the rollouts of the last update, in versions"""
-    ledger: dict[str, int] = {}
-    """counts of what happened to every ticket, transition and message"""
     workers_left_out: int = 0
     """number of workers that are not in `workers`, because the message would be too long"""
-    waiting: str = ""
-    """who waits for whom, and for what share of the time, in one line for people; empty if nobody waits long"""
-    phase: str = ""
-    """what the learner of a run does: starting, gathering rollouts, learning, or evaluating"""
-    stages: dict[str, float] = {}
-    """seconds that the learner, and all workers together, have spent in each stage"""
+    version: int = -1
+    """version of the newest weights; -1 before the first"""
 
 
 ToLearner = (

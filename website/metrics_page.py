@@ -8,8 +8,9 @@ from prometheus_client.metrics_core import Metric
 
 from benchmarks.markdown_tables import table
 from millrace.extras.monitoring.metric_names import METRICS, label
-from millrace.extras.monitoring.prometheus import MetricsCollector, MetricsSnapshot
+from millrace.extras.monitoring.prometheus import MetricsCollector, Observed
 from millrace.learner.config.config import Config
+from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import FactMean
@@ -25,12 +26,9 @@ A number that does not exist yet is missing or null. `ledger/…` and `stage/…
 In a name, NAME stands for a name that you chose.
 
 """
-SAMPLE = MetricsSnapshot(
-    at_s=1.0,
-    progress=Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)}),
-    ledger=Ledger().counts(),
-)
-"""A snapshot in which every metric has a value."""
+EVERY_NUMBER = Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)})
+SAMPLE = Observed(1.0, HubSnapshot(Ledger(), incarnations=[], lags=[], progress=EVERY_NUMBER))
+"""A hub of which every metric has a value."""
 PROMETHEUS = """## Prometheus
 
 A learner with `--metrics-bind 127.0.0.1:9464` shows these at `http://127.0.0.1:9464/metrics`. Prometheus itself adds
@@ -51,7 +49,7 @@ def page() -> str:
 
 def prometheus() -> Iterator[tuple[str, str, str, str]]:
     """Name as Prometheus shows it, type, labels and text of each metric of a learner that trains."""
-    for metric in MetricsCollector(Config(env="CartPole-v1"), snapshot=SAMPLE).collect():
+    for metric in MetricsCollector(Config(env="CartPole-v1"), observed=SAMPLE).collect():
         labels = {label for sample in metric.samples for label in sample.labels} - {"le"}
         shown = "" if metric.type == "info" else ", ".join(f"`{label}`" for label in sorted(labels))
         yield _shown_name(metric), metric.type, shown or "–", metric.documentation

@@ -142,6 +142,7 @@ class Audience:
         """`collected`: env steps that wait for the next update, if that is awaited."""
         state, tally, wall_s, lags = self._state, self._tally, self._tally.wall_s(snapshot), snapshot.lags or [0]
         return Progress(
+            at_s=time.time(),
             run=self._files.path,
             env_steps=state.env_steps,
             collected=collected,

@@ -23,6 +23,7 @@ from millrace.protocol.messages import (
     Status,
     ToLearner,
 )
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import DescribeSpec
 
 Accept = Callable[[DescribedEnv], None]
@@ -61,7 +62,7 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def status(self, total_steps: int, now: float) -> Status:
         """The answer to `millrace status`. There are no weights yet, and no ledger."""
-        return Status(self.spec.env.id, self.membership.status(now), total_steps=total_steps)
+        return Status(self.spec.env.id, RunProgress(total_steps=total_steps), self.membership.status(now))
 
     # ---------------------------------------------------------------- inside
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -21,12 +20,11 @@ from millrace.learner.members.held_up import LONG_S
 from millrace.learner.members.member_server import MemberServer, ServerCallbacks
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.members.process_callbacks import ProcessCallbacks
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ledger import Ledger
-from millrace.learner.rollouts.run_status import status
+from millrace.learner.rollouts.run_status import progress_now, status
 from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.rollouts.waiting import LearnerTime
@@ -37,6 +35,7 @@ from millrace.protocol.bounds import Stages, one_line
 from millrace.protocol.errors import BadRollout, Stalled
 from millrace.protocol.logs.long_wait import LongWait
 from millrace.protocol.messages import Evaluated, Rollout, Status, ToLearner, Weights
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import rollout_bytes
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.wire.learner_link import LearnerLink
@@ -63,46 +62,44 @@ class HubSettings:
 
 
 class HubSnapshot(NamedTuple):
-    """State of the hub at one moment, for metrics, checkpoints and status. Cheap to make."""
+    """State of the hub at one moment, for metrics and checkpoints. Cheap to make, and nothing of it changes later."""
 
-    taken_s: float
-    """That moment, by the hub's clock."""
-    progress: Progress
-    """Progress as it was reported last."""
-    version: int
-    """Version of the newest weights; -1 before the first."""
     ledger: Ledger
     """Copy of the hub's ledger."""
     incarnations: list[int]
     """Next incarnation of each lane."""
     lags: list[int]
     """Lag of each rollout of the last `gather`."""
-    collected: int
+    taken_s: float = 0.0
+    """That moment, by the hub's clock."""
+    progress: Progress = Progress()
+    """Progress as it was reported last."""
+    version: int = -1
+    """Version of the newest weights; -1 before the first."""
+    collected: int = 0
     """Env steps of the next update's rollouts that are made, as workers report them."""
-    lag_counts: Mapping[int, int]
+    lag_counts: Mapping[int, int] = {}
     """Number of rollouts used since this learner started, by lag."""
-    wait_s: float
+    wait_s: float = 0.0
     """Seconds spent waiting for rollouts since this learner started."""
-    evaluate_s: float
+    evaluate_s: float = 0.0
     """Seconds spent in evaluations since this learner started."""
-    learn_s: float
+    learn_s: float = 0.0
     """Seconds in which it did neither, since it first waited for rollouts."""
-    waiting: str
+    waiting: str = ""
     """Who waits for whom, in one line for people; empty if nobody waits long."""
-    members: tuple[CollectingMember, ...]
-    worker_stages: Stages
+    roles: Mapping[str, str] = {}
+    """`Member.role` of each worker, by its name."""
+    worker_stages: Stages = {}
     """Seconds in each stage, of all workers since this learner started, also of those that have left."""
-    received: tuple[int, int]
+    received: tuple[int, int] = (0, 0)
     """Number of messages and of bytes."""
-    sent: tuple[int, int]
+    sent: tuple[int, int] = (0, 0)
     """Number of messages and of bytes."""
-    refused_messages: int
+    refused_messages: int = 0
     """Number of messages under revoked keys."""
-    refused_handshakes: int
-
-    def worker_states(self) -> Counter[str]:
-        """Number of workers by `Member.role`."""
-        return Counter(member.role for member in self.members)
+    refused_handshakes: int = 0
+    """Number of handshakes that failed."""
 
 
 HubObserver = Callable[["Hub"], None]
@@ -279,8 +276,12 @@ class Hub:
     # ---------------------------------------------------------------- what others ask and tell
 
     def report_progress(self, progress: Progress) -> None:
-        """Store the progress of the run for `millrace status`."""
+        """Store the progress of the run for those who ask how far it is."""
         self._progress = progress
+
+    def progress(self) -> RunProgress:
+        """How far the run is: as it was reported last, with what the hub knows better now."""
+        return progress_now(self.coordinator, self._progress, self.waiting(self._clock()), self._time.phase)
 
     @property
     def workers_expected(self) -> int:
@@ -297,19 +298,19 @@ class Hub:
         link, coordinator, now = self.link, self.coordinator, self._clock()
         spent_s = self._time.until(now)
         return HubSnapshot(
-            taken_s=now,
-            progress=self._progress,
-            version=coordinator.version,
             ledger=coordinator.rollouts.ledger.copy(),
             incarnations=coordinator.rollouts.incarnations(),
             lags=self._lags,
+            taken_s=now,
+            progress=self._progress,
+            version=coordinator.version,
             collected=coordinator.collected(),
             lag_counts=dict(self.lag_statistics.lags),
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],
             learn_s=spent_s["learning"],
             waiting=self.waiting(now),
-            members=tuple(coordinator.members.values()),
+            roles={member.hello.worker: member.role for member in coordinator.members.values()},
             worker_stages=coordinator.membership.stages(),
             received=(link.received.messages, link.received.bytes),
             sent=(link.sent.messages, link.sent.bytes),
@@ -404,4 +405,4 @@ class Hub:
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
-        return status(self.coordinator, self._progress, now, self.waiting(now), self._time.phase)
+        return status(self.coordinator, self.progress(), now)

@@ -1,27 +1,26 @@
-"""The answer to `millrace status` during a run. Pure."""
+"""How far a run is by what the hub knows now, and the answer to `millrace status`. Pure."""
 
 from __future__ import annotations
+
+from msgspec.structs import replace
 
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.messages import Status
+from millrace.protocol.progress import RunProgress
 
 
-def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str, phase: str) -> Status:
-    """The status message of a run; `progress` is the newest that was reported, `waiting` says who waits for whom."""
+def progress_now(coordinator: TicketCoordinator, reported: Progress, waiting: str, phase: str) -> RunProgress:
+    """The progress that was reported last, with what has changed since. `waiting` says who waits for whom."""
+    return replace(reported.plain(), ledger=coordinator.rollouts.ledger.counts(), waiting=waiting, phase=phase)
+
+
+def status(coordinator: TicketCoordinator, progress: RunProgress, now: float) -> Status:
+    """The status message of a run."""
     return Status(
         coordinator.run.env.id,
+        progress,
         coordinator.membership.status(now),
-        len(coordinator.rollouts.lanes),
+        workers_wanted=len(coordinator.rollouts.lanes),
         version=coordinator.version,
-        env_steps=progress.env_steps_made,
-        total_steps=progress.total_steps,
-        steps_per_s=progress.steps_per_s,
-        return_mean=progress.return_mean,
-        lag_mean=progress.lag_mean,
-        lag_max=progress.lag_max,
-        ledger=coordinator.rollouts.ledger.counts(),
-        waiting=waiting,
-        phase=phase,
-        stages=progress.stages,
     )

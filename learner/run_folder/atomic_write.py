@@ -1,8 +1,9 @@
 """Writes files that are there whole or not at all, and again what a disk refused.
 
 Rule: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
-target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed. What the
-disk of a run refuses costs a warning while the run trains, and the run if it is still refused at the end.
+target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed. Only what
+nobody needs after a power failure is not flushed. What the disk of a run refuses costs a warning while the run trains, and
+the run if it is still refused at the end.
 """
 
 from __future__ import annotations
@@ -29,20 +30,25 @@ Write = Callable[[], object]
 """Writes the present state of something. Raises `RunError` if the disk refuses it."""
 
 
-def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill the file and replace the target by it. Raises what `write` or the file system raises."""
+def write_atomically(target: Path, write: Callable[[BinaryIO], object], *, flush: bool = True) -> None:
+    """Let `write` fill the file and replace the target by it. Raises what `write` or the file system raises.
+
+    `flush`: wait until the disk has it.
+    """
     temporary = target.with_name(target.name + TEMPORARY)
     temporary.unlink(missing_ok=True)  # from a process that was killed, or a link
     try:
         with os.fdopen(open_regular(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
             write(file)
-            file.flush()
-            os.fsync(file.fileno())
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, target)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _flush_folder(target.parent)
+    if flush:
+        _flush_folder(target.parent)
 
 
 def write_file(target: Path, write: Callable[[BinaryIO], object]) -> None:

@@ -26,6 +26,7 @@ from msgspec.structs import replace
 from millrace.learner.run_folder.atomic_write import write_atomically
 from millrace.learner.run_folder.progress import NOT_SHOWN, Progress
 from millrace.learner.run_folder.regular_files import open_regular
+from millrace.learner.run_folder.sentences import steps_in_words
 from millrace.protocol.bounds import INVALID, escaped_json
 from millrace.protocol.logs.notices import is_notice
 
@@ -48,7 +49,7 @@ class JsonLines(logging.Formatter):
 
 def progress_line(progress: Progress, now: float) -> str:
     """The progress of the run as one line of JSON. `now` is wall-clock time."""
-    message = f"{progress.env_steps_made} of {progress.total_steps} env steps"
+    message = f"{steps_in_words(progress)} env steps"
     shown = (name for name in progress.__struct_fields__ if name not in NOT_SHOWN)
     fields = {name: msgspec.to_builtins(getattr(progress, name)) for name in shown}
     return _line(now, "info", "progress", message, fields)

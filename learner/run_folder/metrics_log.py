@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,14 @@ import msgspec
 from millrace.learner.run_folder.atomic_write import write_atomically
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
 from millrace.learner.run_folder.record_file import RecordFile
-from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular, read
+from millrace.learner.run_folder.regular_files import MOST_BYTES, read
 from millrace.protocol.bounds import INVALID, Natural
 from millrace.protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
-MOST_LINE_BYTES = 1 << 16  # of a row that is read without the rest of the file
+MOST_LINE_BYTES = 1 << 16  # of a row that is read while the file grows
 
 
 class MetricsLog:
@@ -105,14 +104,6 @@ def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
     *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := decoded_row(line)) is not None]
     return rows, len(lines) - len(rows)
-
-
-def newest_row(run: Path) -> dict[str, Any]:
-    """The last whole row of a metrics.jsonl; empty if there is none. Reads its end only. Raises OSError."""
-    with os.fdopen(open_regular(run / METRICS_FILE), "rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES))
-        lines = file.read(MOST_LINE_BYTES).split(b"\n")[:-1]
-    return next((row for line in reversed(lines) if (row := decoded_row(line)) is not None), {})
 
 
 _DECODER = msgspec.json.Decoder(dict[str, int | float | None])

@@ -8,23 +8,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
-import msgspec
-
 from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, FactMean, fact_metrics
 from millrace.protocol.errors import UsageError
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import Episode, Rollout
 
 ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
-NOT_SHOWN = ("settings", "episodes", "rollouts", "incarnations", "requests")
+NOT_SHOWN = ("at_s", "settings", "episodes", "rollouts", "incarnations", "requests")
 """Fields of `Progress` that a log of it leaves out."""
 Row = Mapping[str, float | None]
 
 
-class Progress(msgspec.Struct, frozen=True, kw_only=True):
-    """The progress of a run: the terminal shows it, the metrics record it after each update, and callbacks get it.
+class Progress(RunProgress, frozen=True, kw_only=True):
+    """The progress of a run as callbacks get it, the terminal among them: how far it is, what is new, and what they may ask.
 
     Returns are sums of raw rewards, undiscounted. Times are in seconds, speeds in env steps a second over all workers. A
     number that does not exist yet is None. What only some methods of `Callback` get says so. Do not keep the arrays of
@@ -41,42 +40,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
 
     run: str = ""
     """path of the run folder"""
-    env_steps: int = 0
-    """env steps that updates have used so far, those before a resume included"""
-    collected: int = 0
-    """env steps of the rollouts that the learner waits for, as workers report them; 0 while it waits for none"""
-    total_steps: int = 0
-    """env steps to train for"""
-    updates: int = 0
-    """updates made so far, those before a resume included"""
-    wall_s: float = 0.0
-    """seconds of training, those before a resume included; evaluations do not count"""
-    steps_per_s: float = 0.0
-    """env steps per second of training since this process started, `collected` included"""
-    return_mean: float | None = None
-    """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
-    length_mean: float | None = None
-    """mean length of the same episodes, in env steps"""
     facts: dict[str, FactMean] = {}
-    """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
-    lag_mean: float = 0.0
-    """mean lag of the rollouts of the last update, in versions of the weights"""
-    lag_max: int = 0
-    """the largest of these lags"""
-    workers_alive: int = 0
-    """workers that have joined and are not lost"""
-    workers_expected: int = 0
-    """workers that this run starts; 0: any number may join"""
-    ledger: dict[str, int] = {}
-    """number of tickets and transitions in each state"""
-    stages: dict[str, float] = {}
-    """seconds spent in each stage so far"""
+    """of each name in `info_keys`: what the environment reported at the ends of the last 100 training episodes"""
     note: str = ""
     """a message to the user, in one line"""
-    waiting: str = ""
-    """who waits for whom, and for what share of the time, or how far an evaluation is: "evaluating for 41 s: 37 of 100
-    episodes (…"; empty if nobody waits long"""
-
     settings: dict[str, Any] = {}
     """all settings of the run, by name; those of the algorithm in `algorithm`"""
     metrics: dict[str, float] = {}
@@ -100,17 +67,12 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """in `Callback.on_rollouts`: for each rollout the incarnation of its lane, which rises when the lane gets new copies;
     `Rollout.sequence` then starts from 0 again
     """
-    stop_reason: str = ""
-    """in `Callback.on_end`: why the run ended"""
-    cut_short: bool = False
-    """in `Callback.on_end`: whether an error or an interrupt ended the run"""
     requests: Requests | None = None
     """what callbacks ask of the run"""
 
-    @property
-    def env_steps_made(self) -> int:
-        """Env steps that updates have used, and those that the next one waits for."""
-        return self.env_steps + self.collected
+    def plain(self) -> RunProgress:
+        """What of it can be sent and written."""
+        return RunProgress(**{name: getattr(self, name) for name in RunProgress.__struct_fields__})
 
     def log(self, name: str, value: SupportsFloat) -> None:
         """Log a number with the metrics of this update. A name without a slash is logged as custom/NAME.

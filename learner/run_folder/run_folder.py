@@ -10,6 +10,7 @@
       best.safetensors      the same of the best policy in the run's own evaluations
       observation*.png      what the policy sees, if that is an image (image_sample.py)
       policy.json           the meaning of these arrays: with it, another program can act
+      progress.json         how far the run is, once a second while it trains (progress_file.py)
       summary.json          the results of the run (results.py)
       log.jsonl             warnings and notices of the learner (json_log.py)
       workers/              the logs of local worker processes

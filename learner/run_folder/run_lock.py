@@ -108,6 +108,11 @@ class RunLock:
             self._owner = self._owner.listening(where)
         self._rewrite()
 
+    @property
+    def taken_over(self) -> bool:
+        """Whether another process is known to have taken the run over. Costs nothing."""
+        return self._other is not None
+
     def check(self) -> None:
         """Raise `RunTakenOver` if another process is known to have taken the run over. Costs nothing."""
         if self._other is not None:

@@ -1,4 +1,6 @@
-"""Sentences for people: what slows a run down, what went wrong in it, and how it ended. Pure.
+"""Words and sentences for people: how far a run is, what slows it down, what went wrong in it, and how it ended. Pure.
+
+Whoever shows a `RunProgress` takes its words from here, so that all say the same.
 
 Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
 the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits. If they add up
@@ -8,7 +10,11 @@ than it works, because otherwise faster workers or messages would change little.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Mapping
+
+from millrace.protocol.progress import RunProgress
 
 ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
 BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once
@@ -25,13 +31,51 @@ WRONG = {
 """What is said of one and of several, by name in the ledger"""
 
 
-def bottleneck(waiting: str, stages: Mapping[str, float | None]) -> str:
-    """Who is waited for now, or else which part of the run takes most of the time. Empty while nothing is known.
+def steps_in_words(progress: RunProgress) -> str:
+    """How many env steps are made, and of how many."""
+    made = f"{progress.env_steps_made:,}"
+    return f"{made} of {progress.total_steps:,}" if progress.total_steps else made
 
-    `waiting`: `Progress.waiting`. `stages`: seconds in each stage, as `Progress.stages`.
-    """
-    if waiting:
-        return f"The learner {'' if waiting.startswith('waited') else 'has been '}{waiting}."
+
+def percent(progress: RunProgress) -> str:
+    """How much of the run is done. It is 100% only once all is."""
+    return f"{math.floor(100 * progress.share)}%"
+
+
+def return_in_words(mean: float | None) -> str:
+    """The mean return of the last training episodes."""
+    return "none yet" if mean is None else f"{mean:,.1f}"
+
+
+def workers_in_words(progress: RunProgress) -> str:
+    """How many workers are alive, and of how many."""
+    expected = f" of {progress.workers_expected}" if progress.workers_expected else ""
+    return f"{progress.workers_alive}{expected}"
+
+
+def lag_in_words(progress: RunProgress) -> str:
+    """The lag of the rollouts of the last update. Empty before the first."""
+    if not progress.ledger.get("used", 0):
+        return ""
+    largest = f", largest {progress.lag_max}" if progress.lag_max > progress.lag_mean else ""
+    return f"lag {progress.lag_mean:.1f}{largest}"
+
+
+def bottleneck(progress: RunProgress) -> str:
+    """Who is waited for now, or else which part of the run takes most of the time. Empty while nothing is known."""
+    return who_waits(progress) or slowest_part(progress.stages)
+
+
+def who_waits(progress: RunProgress) -> str:
+    """Whom the learner waits for now. Empty if it does not wait long, or the run has ended."""
+    waiting = progress.waiting
+    if not waiting or progress.stop_reason:
+        return ""
+    return f"The learner {'' if waiting.startswith('waited') else 'has been '}{waiting}."
+
+
+def slowest_part(stages: Mapping[str, float | None]) -> str:
+    """Which part of a run takes most of the time, by the seconds spent in each stage. Empty while nothing is known."""
     learner = {name: stages.get(f"learner_{name}") or 0.0 for name in ("wait", "update", "other", "evaluate")}
     worker = {name: stages.get(f"worker_{name}") or 0.0 for name in COLLECTING}
     all_s, collecting_s = sum(learner.values()), sum(worker.values())
@@ -62,11 +106,19 @@ def per_second(steps: float) -> str:
     return f"{steps:.2g}" if LEAST_PER_S <= steps < 9.95 else f"{steps:,.0f}"
 
 
-def lag_in_words(mean: float, largest: int, used: int) -> str:
-    """The lag of the rollouts of the last update. Empty before the first. `used`: number of rollouts used so far."""
-    if not used:
+def duration(seconds: float) -> str:
+    """A duration in s, min or h."""
+    if not 100 <= seconds < math.inf:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def last_sign(progress: RunProgress) -> str:
+    """Since when there is no sign of a run that has no results, by local time. Empty if that is not known."""
+    if not progress.at_s:
         return ""
-    return f"lag {mean:.1f}" + (f", largest {largest}" if largest > mean else "")
+    return time.strftime("no sign since %Y-%m-%d %H:%M:%S", time.localtime(progress.at_s))
 
 
 def ending(reason: str, after: str = "", *, cut_short: bool) -> str:

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.protocol.messages import Status
+from millrace.protocol.progress import RunProgress
 
 
 def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], Status] | None = None) -> Status:
@@ -19,10 +20,9 @@ def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], 
     members = coordinator.members.values()
     if of_run is not None:
         return replace(of_run(now), workers=workers)
-    return Status(
-        ", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs)),
-        workers,
-        len(coordinator.lanes),
+    progress = RunProgress(
         env_steps=sum(member.heartbeat.steps for member in members if member.heartbeat is not None),
         steps_per_s=sum(row.steps_per_s for row in workers),
     )
+    envs = ", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs))
+    return Status(envs, progress, workers, workers_wanted=len(coordinator.lanes))

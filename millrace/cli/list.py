@@ -11,7 +11,7 @@ import msgspec
 from millrace.cli.status import table
 from millrace.flags.fields import Flag
 from millrace.flags.parse import parse_flags
-from millrace.learner.run_folder.sentences import per_second
+from millrace.learner.run_folder.sentences import per_second, return_in_words
 from millrace.learner.run_lines import RunLine, algorithm_label, find_runs, read_line
 
 
@@ -31,14 +31,15 @@ def list_runs(argv: list[str]) -> int:
 
 
 def _cells(line: RunLine) -> dict[str, str]:
+    progress = line.progress
     return {
         "run": line.name,
         "state": line.state,
         "environment": line.env,
         "algorithm": algorithm_label(line.algo),
-        "return": "-" if line.return_mean is None else f"{line.return_mean:,.1f}",
-        "env steps": "-" if line.begins else f"{line.env_steps:,.0f}",
+        "return": "-" if progress.return_mean is None else return_in_words(progress.return_mean),
+        "env steps": "-" if line.begins else f"{progress.env_steps_made:,}",
         "done": line.done,
-        "steps/s": "-" if line.begins else per_second(line.steps_per_s),
+        "steps/s": "-" if line.begins else per_second(progress.steps_per_s),
         "started": line.started,
     }

@@ -25,7 +25,14 @@ from millrace.flags.parse import parse_flags
 from millrace.learner.members.held_up import in_words
 from millrace.learner.run_folder.run_format import is_run_folder
 from millrace.learner.run_folder.run_lock import learner_of_run
-from millrace.learner.run_folder.sentences import bottleneck, lag_in_words, per_second, went_wrong
+from millrace.learner.run_folder.sentences import (
+    bottleneck,
+    lag_in_words,
+    per_second,
+    return_in_words,
+    steps_in_words,
+    went_wrong,
+)
 from millrace.learner.run_lines import RunLine, in_sentences, read_line
 from millrace.protocol.errors import Refused, RunError, UsageError
 from millrace.protocol.keys.key_folder import KeyFolder
@@ -155,7 +162,7 @@ def in_json(status: Status) -> str:
 
 def last_in_json(line: RunLine) -> str:
     """One line of JSON about a run that nobody trains."""
-    known = line._asdict() | {"path": str(line.path), "type": "LastState"}
+    known = {"type": "LastState"} | line._asdict() | {"path": str(line.path)}
     return msgspec.json.encode({name: value for name, value in known.items() if name not in ("owner", "problem")}).decode()
 
 
@@ -165,7 +172,7 @@ def as_table(status: Status) -> str:
     evaluating = sum(worker.state == "evaluating" for worker in status.workers)
     here = len(status.workers) + status.workers_left_out - evaluating
     wanted = f"workers: {here} here, {status.workers_wanted} wanted (one for each lane)\n" if status.workers_wanted else ""
-    held_up = bottleneck(status.waiting, status.stages)
+    held_up = bottleneck(status.progress)
     return "\n".join(
         [
             _run_line(status),
@@ -173,7 +180,7 @@ def as_table(status: Status) -> str:
             "",
             *table([_cells(worker, status.version, late) for worker in status.workers], LEFT_ALIGNED, "no worker is here"),
             "",
-            f"{wanted}{went_wrong(status.ledger) or 'nothing was lost or dropped'}",
+            f"{wanted}{went_wrong(status.progress.ledger) or 'nothing was lost or dropped'}",
         ]
     )
 
@@ -188,14 +195,14 @@ def redraw(text: str, out: TextIO) -> None:
 
 def _run_line(status: Status) -> str:
     env = _printable(status.env)
-    speed = f"{per_second(status.steps_per_s)} steps/s"
-    if not (status.total_steps or status.ledger):
-        return f"{env}, a vector environment: {status.env_steps:,} env steps, {speed}"
-    done = f"{status.env_steps:,} of {status.total_steps:,}" if status.total_steps else f"{status.env_steps:,}"
-    score = "none yet" if status.return_mean is None else f"{status.return_mean:,.1f}"
-    figures = [f"{env}: {done} env steps", speed, f"return {score}", f"update {max(status.version, 0)}"]
-    lag = lag_in_words(status.lag_mean, status.lag_max, status.ledger.get("used", 0))
-    return ", ".join([*figures, lag] if lag else figures)
+    progress = status.progress
+    steps = f"{steps_in_words(progress)} env steps"
+    speed = f"{per_second(progress.steps_per_s)} steps/s"
+    if not (progress.total_steps or progress.ledger):
+        return f"{env}, a vector environment: {steps}, {speed}"
+    score = f"return {return_in_words(progress.return_mean)}"
+    figures = [f"{env}: {steps}", speed, score, f"update {max(status.version, 0):,}", lag_in_words(progress)]
+    return ", ".join(filter(None, figures))
 
 
 def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:

@@ -8,12 +8,13 @@ import pytest
 from msgspec.structs import replace
 
 from millrace.learner.run_folder.lease import Listens, decoded
-from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.progress_file import PROGRESS_FILE
 from millrace.learner.run_folder.run_format import CONFIG_FILE
 from millrace.learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
 from millrace.learner.run_lines import find_runs, headline, in_sentences, read_line
 from millrace.protocol.errors import UsageError
-from tests.support.run_folders import a_run
+from millrace.protocol.progress import RunProgress
+from tests.support.run_folders import LAST_SIGN_S, a_run
 
 GONE = 2**22 + 1  # no process has so high a number
 
@@ -37,10 +38,14 @@ def test_a_run_without_a_process_and_without_results_is_dead(tmp_path: Path) -> 
     run = a_run(tmp_path, finished=False)
     line = read_line(run, time.time())
     assert line.state == "dead"
-    assert (line.env_steps, line.updates, line.return_mean, line.done) == (2000, 20, 101.0, "2%")
-    assert line._replace(env_steps=99_999).done == "99%", "it is not done"
-    (run / METRICS_FILE).unlink()
-    assert (read_line(run, time.time()).env_steps, line.left_s) == (0, None)
+    assert (line.progress.env_steps, line.progress.updates, line.progress.return_mean) == (2000, 20, 101.0)
+    sign = time.strftime("no sign since %Y-%m-%d %H:%M:%S", time.localtime(LAST_SIGN_S))
+    assert line.done == f"2%, {sign}"
+    assert headline(line).startswith(f"Dead: no process trains it, and it has no results; {sign}. It was killed, or ")
+    (run / PROGRESS_FILE).unlink()
+    line = read_line(run, time.time())
+    assert (line.progress.env_steps, line.done, line.left_s) == (0, "0%", None)
+    assert headline(line).startswith("Dead: no process trains it, and it has no results. It was killed, or ")
 
 
 def test_a_run_trains_as_long_as_its_lock_is_held(tmp_path: Path) -> None:
@@ -95,9 +100,10 @@ def test_odd_numbers_of_a_folder_are_a_line_too(tmp_path: Path, steps: str) -> N
     run = a_run(tmp_path, finished=False)
     config = (run / CONFIG_FILE).read_text()
     (run / CONFIG_FILE).write_text(config.replace("steps = 100000\n", f"steps = {steps}\n"))
-    (run / METRICS_FILE).write_text('{"time/total_timesteps": 5, "time/fps": 1e-320}\n')
+    (run / PROGRESS_FILE).write_text('{"env_steps": -5}')
     with RunLock(run):
         line = read_line(run, time.time())
         assert line.state == "training"
-        assert line.total_steps == 0
-        assert headline(line._replace(total_steps=100.0)) == "Training: 5% done, 0 env steps per second, about inf s left."
+        assert (line.progress, headline(line)) == (RunProgress(), "Training: before its first update.")
+        slow = RunProgress(env_steps=5, total_steps=100, steps_per_s=1e-320)
+        assert headline(line._replace(progress=slow)) == "Training: 5% done, 0 env steps per second, about inf s left."

@@ -23,7 +23,7 @@ import pytest
 from millrace.learner.members import join_limiter, membership
 from millrace.learner.members import member_states as standing
 from millrace.learner.rollouts import ticket_coordinator
-from millrace.protocol import bounds, call_timeouts, env_spec, messages, rollout, space_spec, specs
+from millrace.protocol import bounds, call_timeouts, env_spec, messages, progress, rollout, space_spec, specs
 from millrace.protocol.keys import handshake_failures
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
@@ -50,6 +50,7 @@ RECORDS: tuple[type, ...] = (
     messages.LaneIncarnation,
     messages.WorkerActivity,
     messages.WorkerExit,
+    progress.RunProgress,
     messages.WorkerStatus,
     rollout.Episode,
     space_spec.EnvDescription,

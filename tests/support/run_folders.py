@@ -8,12 +8,22 @@ from typing import Any
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.progress_file import ProgressFile
 from millrace.learner.run_folder.results import Evaluation, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.progress import RunProgress
 
 LEDGER = {"issued": 30, "used": 20, "outstanding": 4, "lost": 6, "transitions_received": 900,
           "transitions_used": 800, "transitions_waiting": 50, "transitions_late": 50, "messages_bad": 0}  # fmt: skip
 STAGES = {"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 2.0, "worker_wait": 2.0}
+
+
+LAST_SIGN_S = 1_800_000_000.0
+
+
+def write_progress(run: Path, progress: RunProgress) -> None:
+    """The progress.json of a run, written at `LAST_SIGN_S`."""
+    ProgressFile(run, lambda: LAST_SIGN_S).write(lambda: progress)
 
 
 def a_run(
@@ -29,11 +39,19 @@ def a_run(
     log = MetricsLog(run.path)
     for i in range(1, length + 1):
         mean = None if i == 1 else 5.0 * i + seed
-        log.write(
-            Progress(env_steps=100 * i, updates=i, wall_s=2.0 * i, return_mean=mean, ledger=ledger, stages=STAGES),
-            {"eval/mean_reward": 77.0} if i == 10 else {},
+        progress = Progress(
+            env_steps=100 * i,
+            total_steps=100_000,
+            updates=i,
+            wall_s=2.0 * i,
+            steps_per_s=50.0,
+            return_mean=mean,
+            ledger=ledger,
+            stages=STAGES,
         )
+        log.write(progress, {"eval/mean_reward": 77.0} if i == 10 else {})
     log.close()
+    write_progress(run.path, progress.plain())
     if finished:
         evaluation = None
         if not failure:

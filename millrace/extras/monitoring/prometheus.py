@@ -11,12 +11,13 @@ import logging
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
+from typing import NamedTuple
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
-import msgspec
 from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
 from prometheus_client.exposition import ThreadingWSGIServer
 from prometheus_client.metrics_core import (
@@ -30,8 +31,7 @@ from prometheus_client.metrics_core import (
 from prometheus_client.registry import Collector
 
 from millrace.learner.config.config import Config
-from millrace.learner.rollouts.hub import Hub, HubObserver
-from millrace.learner.run_folder.progress import Progress
+from millrace.learner.rollouts.hub import Hub, HubObserver, HubSnapshot
 from millrace.learner.run_folder.results import FactMean
 from millrace.learner.run_folder.run_format import versions
 from millrace.protocol.address import WILDCARDS, is_local
@@ -50,40 +50,21 @@ TRANSITION_ENDS = ("used", "duplicate", "late", "invalid")
 STATES = ("active", "spare", "evaluating", "draining")
 
 
-class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """State of the learner at one moment."""
+class Observed(NamedTuple):
+    """The hub at one moment."""
 
-    at_s: float = 0.0
-    """seconds since 1970; 0: the learner has not begun"""
-    progress: Progress = Progress()
-    """Progress as of the last update."""
-    version: int = -1
-    ledger: Mapping[str, int] = {}
-    workers: Mapping[str, int] = {}
-    """Number of workers in each state."""
-    lags: Mapping[int, int] = {}
-    """Number of rollouts that updates used, by lag in versions."""
-    received: tuple[int, int] = (0, 0)
-    """Number of messages and of bytes."""
-    sent: tuple[int, int] = (0, 0)
-    refused_messages: int = 0
-    """Number of messages under revoked keys."""
-    refused_handshakes: int = 0
-    """Number of handshakes that failed."""
-
-
-BEFORE_IT_BEGAN = MetricsSnapshot()
+    at_s: float
+    """seconds since 1970"""
+    hub: HubSnapshot
 
 
 class MetricsCollector(Collector):
     """Keeps the newest snapshot and turns it into metrics."""
 
-    def __init__(
-        self, config: Config, clock: Callable[[], float] = time.time, snapshot: MetricsSnapshot = BEFORE_IT_BEGAN
-    ) -> None:
-        """`clock` tells seconds since 1970. `snapshot` is what there is to show until the first is taken."""
+    def __init__(self, config: Config, clock: Callable[[], float] = time.time, observed: Observed | None = None) -> None:
+        """`clock` tells seconds since 1970. `observed` is what there is to show until the hub is observed."""
         self._clock = clock
-        self._snapshot = snapshot
+        self._observed = observed
         self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
         self._wanted = config.lanes
@@ -91,24 +72,12 @@ class MetricsCollector(Collector):
     def observe(self, hub: Hub) -> None:
         """Take a new snapshot if the last one is old enough. Called whenever the hub has listened."""
         now = self._clock()
-        if 0.0 <= now - self._snapshot.at_s < EVERY_S:
+        if self._observed is not None and 0.0 <= now - self._observed.at_s < EVERY_S:
             return
-        known = hub.snapshot()
+        snapshot = hub.snapshot()
         if self._updates_before is None:
-            self._updates_before = known.progress.updates
-        states = known.worker_states()
-        self._snapshot = MetricsSnapshot(
-            at_s=now,
-            progress=known.progress,
-            version=known.version,
-            ledger=known.ledger.counts(),
-            workers={state: states[state] for state in STATES},
-            lags=known.lag_counts,
-            received=known.received,
-            sent=known.sent,
-            refused_messages=known.refused_messages,
-            refused_handshakes=known.refused_handshakes,
-        )
+            self._updates_before = snapshot.progress.updates
+        self._observed = Observed(now, snapshot)
 
     def describe(self) -> Iterator[Metric]:
         """Describe nothing in advance, so that the registry does not collect at registration."""
@@ -121,19 +90,21 @@ class MetricsCollector(Collector):
         # Also before the first worker is there: an autoscaler may start none without it.
         wanted = "Workers with which each lane has one of its own: the number to scale to."
         yield GaugeMetricFamily("millrace_workers_wanted", wanted, self._wanted)
-        now = self._snapshot
-        if now.at_s:
-            updates = now.progress.updates - (self._updates_before or 0)
-            yield from (*_of_progress(now, updates), *_of_ledger(now.ledger), *_of_workers(now), *_of_link(now))
+        if (observed := self._observed) is not None:
+            at_s, hub = observed
+            yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", at_s)
+            yield from _of_progress(hub, hub.progress.updates - (self._updates_before or 0))
+            yield from _of_ledger(hub.ledger.counts())
+            yield from _of_workers(hub)
+            yield from _of_link(hub)
 
 
-def _of_progress(now: MetricsSnapshot, updates: int) -> Iterator[Metric]:
-    done = now.progress
-    yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", now.at_s)
+def _of_progress(hub: HubSnapshot, updates: int) -> Iterator[Metric]:
+    done = hub.progress
     yield CounterMetricFamily("millrace_env_steps", "Env steps that updates have used, since the run began.", done.env_steps)
     yield GaugeMetricFamily("millrace_target_env_steps", "Env steps to train for.", done.total_steps)
     yield GaugeMetricFamily("millrace_env_steps_per_second", "Mean since this learner began.", done.steps_per_s)
-    yield GaugeMetricFamily("millrace_weights_version", "Updates that made the newest weights; -1 before any.", now.version)
+    yield GaugeMetricFamily("millrace_weights_version", "Updates that made the newest weights; -1 before any.", hub.version)
     if done.return_mean is not None and done.length_mean is not None:
         yield GaugeMetricFamily(
             "millrace_episode_return_mean", "Of the last 100 training episodes, raw rewards.", done.return_mean
@@ -188,30 +159,33 @@ def _of_ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
     yield GaugeMetricFamily("millrace_transitions_waiting", "Transitions not yet used.", ledger["transitions_waiting"])
 
 
-def _of_workers(now: MetricsSnapshot) -> Iterator[Metric]:
+def _of_workers(hub: HubSnapshot) -> Iterator[Metric]:
     workers = GaugeMetricFamily("millrace_workers", "Workers by state; a spare one has no lane.", labels=("state",))
+    counts = Counter(hub.roles.values())
     for state in STATES:
-        workers.add_metric((state,), now.workers.get(state, 0))
+        workers.add_metric((state,), counts[state])
     yield workers
-    upto = [sum(count for lag, count in now.lags.items() if lag <= bound) for bound in LAGS]
-    buckets = [*((str(bound), count) for bound, count in zip(LAGS, upto, strict=True)), ("+Inf", sum(now.lags.values()))]
+    lags = hub.lag_counts
+    upto = [sum(count for lag, count in lags.items() if lag <= bound) for bound in LAGS]
+    buckets = [*((str(bound), count) for bound, count in zip(LAGS, upto, strict=True)), ("+Inf", sum(lags.values()))]
     yield HistogramMetricFamily(
         "millrace_rollout_lag_versions",
         "Rollouts that updates used, by how many versions old their weights were.",
         buckets=buckets,
-        sum_value=sum(lag * count for lag, count in now.lags.items()),
+        sum_value=sum(lag * count for lag, count in lags.items()),
     )
 
 
-def _of_link(now: MetricsSnapshot) -> Iterator[Metric]:
-    for name, (messages, size) in (("received", now.received), ("sent", now.sent)):
+def _of_link(hub: HubSnapshot) -> Iterator[Metric]:
+    for name, (messages, size) in (("received", hub.received), ("sent", hub.sent)):
         yield CounterMetricFamily(f"millrace_{name}_messages", f"Messages {name} by this learner.", messages)
         yield CounterMetricFamily(f"millrace_{name}_bytes", f"Bytes of the messages {name}.", size)
-    refused = {"unreadable": now.ledger["messages_bad"], "key": now.refused_messages}
+    ledger = hub.ledger.counts()
+    refused = {"unreadable": ledger["messages_bad"], "key": hub.refused_messages}
     yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
     late = "Actions that came too late for a program that owns its loop."
-    yield CounterMetricFamily("millrace_late_actions", late, now.ledger["late_actions"])
-    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", now.refused_handshakes)
+    yield CounterMetricFamily("millrace_late_actions", late, ledger["late_actions"])
+    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", hub.refused_handshakes)
 
 
 def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetricFamily:

@@ -206,7 +206,7 @@ def test_the_status_says_who_is_here() -> None:
     made = coordinator()
     join(made, A)
     answer = made.status(500, 1.0)
-    assert (answer.env, answer.version, answer.total_steps) == ("Fake-v0", -1, 500)
+    assert (answer.env, answer.version, answer.progress.total_steps) == ("Fake-v0", -1, 500)
     assert [worker.worker for worker in answer.workers] == ["w0"]
 
 

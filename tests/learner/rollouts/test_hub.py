@@ -167,7 +167,7 @@ def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
 
     def watch() -> None:
         assert link.now - began_s >= LONG_S, "what is short is not shown"
-        seen.append(hub.status(link.now).waiting)
+        seen.append(hub.status(link.now).progress.waiting)
 
     link.poll = poll_until_it_has_come  # type: ignore[method-assign]
     hub.gather(watch)

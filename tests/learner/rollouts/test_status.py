@@ -16,11 +16,12 @@ from millrace.cli.status import as_table, ask, in_json, observer_name
 from millrace.learner.members.events import Event, RejoinRequested, WorkerLeft, describe
 from millrace.learner.members.membership import MAX_LATE_ACTIONS
 from millrace.learner.rollouts.hub import Hub, HubSettings
-from millrace.learner.rollouts.run_status import status
+from millrace.learner.rollouts.run_status import progress_now, status
 from millrace.learner.run_folder.json_log import JsonLines, progress_line
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.errors import RunError
 from millrace.protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello, Inquire, Status
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.worker_link import WorkerLink
@@ -32,7 +33,8 @@ PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, retur
 
 
 def told(learner: Learner, waiting: str = "") -> Status:
-    return status(learner.coordinator, PROGRESS, learner.now, waiting, "gathering")
+    progress = progress_now(learner.coordinator, PROGRESS, waiting, "gathering")
+    return status(learner.coordinator, progress, learner.now)
 
 
 def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
@@ -48,13 +50,21 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
     learner.deliver_all()
     found = told(learner)
     assert (found.env, found.version) == (learner.coordinator.run.env.id, 0)
-    assert (found.env_steps, found.total_steps, found.return_mean, found.lag_max) == (1_000, 10_000, 12.5, 2)
+    assert found.progress == RunProgress(
+        env_steps=1_000,
+        total_steps=10_000,
+        steps_per_s=50.0,
+        return_mean=12.5,
+        lag_mean=0.5,
+        lag_max=2,
+        ledger=learner.coordinator.rollouts.ledger.counts(),
+        phase="gathering",
+    )
     assert [(w.worker, w.host, w.pid, w.state) for w in found.workers] == [
         ("b", "host", 7, "active"),
         ("a", "far", 1, "active"),
     ]
     assert sorted(lane for worker in found.workers for lane in worker.lanes) == [0, 1, 2]
-    assert found.ledger == learner.coordinator.rollouts.ledger.counts()
     learner.coordinator.drain("done")
     assert {worker.state for worker in told(learner).workers} == {"draining"}
 
@@ -69,15 +79,15 @@ def test_late_actions_are_counted_once_also_when_a_worker_joins_again() -> None:
     for actions in (0, 3, 3, 5):
         late(learner, b"a", actions)
     assert told(learner).workers[0].late_actions == 5
-    assert told(learner).ledger["late_actions"] == 5
+    assert told(learner).progress.ledger["late_actions"] == 5
     learner.joins(b"a", attempt=2)  # the same process
     late(learner, b"a", 7)
-    assert told(learner).ledger["late_actions"] == 5
+    assert told(learner).progress.ledger["late_actions"] == 5
     late(learner, b"a", 8)
-    assert told(learner).ledger["late_actions"] == 6
+    assert told(learner).progress.ledger["late_actions"] == 6
     learner.joins(b"a", pid=2)
     late(learner, b"a", 2)
-    assert told(learner).ledger["late_actions"] == 8
+    assert told(learner).progress.ledger["late_actions"] == 8
 
 
 def test_a_number_of_late_actions_that_no_loop_can_reach_is_not_counted() -> None:
@@ -85,7 +95,7 @@ def test_a_number_of_late_actions_that_no_loop_can_reach_is_not_counted() -> Non
     learner.joins(b"a")
     for actions in (2, 2**60, 1, MAX_LATE_ACTIONS + 1):
         late(learner, b"a", actions)
-    assert told(learner).ledger["late_actions"] == 2 + MAX_LATE_ACTIONS
+    assert told(learner).progress.ledger["late_actions"] == 2 + MAX_LATE_ACTIONS
 
 
 def test_late_actions_have_a_column_if_there_are_any() -> None:
@@ -179,7 +189,7 @@ def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[
     thread.join(10.0)
     asking.close(0)
     link.close(0)
-    assert found == [status(learner.coordinator, PROGRESS, 0.0, "", "starting")]
+    assert found == [status(learner.coordinator, progress_now(learner.coordinator, PROGRESS, "", "starting"), 0.0)]
     assert not learner.coordinator.members
 
 
@@ -196,15 +206,15 @@ def test_nobody_there_is_said_at_the_deadline(context: zmq.Context[zmq.Socket[by
 def test_who_waits_for_whom_stands_below_the_line_of_the_run() -> None:
     learner = Learner(lanes=2)
     assert as_table(told(learner)).splitlines()[1] == ""
-    busy = Progress(stages={"learner_update": 3.0, "worker_wait": 1.0})
-    updating = status(learner.coordinator, busy, learner.now, "", "learning")
+    busy = RunProgress(stages={"learner_update": 3.0, "worker_wait": 1.0})
+    updating = status(learner.coordinator, busy, learner.now)
     assert as_table(updating).splitlines()[1].startswith("Updates are the slowest part: ")
     waiting = told(learner, "waiting 12 s for lane 3 (worker \x1b[7m on cpu2: in reset for 11 s)")
     assert as_table(waiting).splitlines()[1:3] == [
         "The learner has been waiting 12 s for lane 3 (worker \\x1b[7m on cpu2: in reset for 11 s).",
         "",
     ]
-    assert json.loads(in_json(waiting))["waiting"] == waiting.waiting
+    assert json.loads(in_json(waiting))["progress"]["waiting"] == waiting.progress.waiting
 
 
 def test_it_is_shown_as_a_table() -> None:
@@ -237,7 +247,7 @@ def test_in_json_every_field_has_its_name() -> None:
     learner.joins(b"a")
     found = json.loads(in_json(told(learner)))
     assert list(found) == ["type", *Status.__struct_fields__]
-    assert (found["type"], found["env_steps"]) == ("Status", 1_000)
+    assert (found["type"], found["progress"]["env_steps"]) == ("Status", 1_000)
     assert (found["workers"][0]["worker"], found["workers"][0]["lanes"]) == ("a", [0])
 
 

@@ -2,7 +2,15 @@
 
 import pytest
 
-from millrace.learner.run_folder.sentences import bottleneck, went_wrong
+from millrace.learner.run_folder.sentences import (
+    bottleneck,
+    percent,
+    return_in_words,
+    steps_in_words,
+    went_wrong,
+    workers_in_words,
+)
+from millrace.protocol.progress import RunProgress
 
 IN_TURN = "Updates are the slowest part: the learner updates for 80% of the time, and workers wait for 80%."
 
@@ -54,13 +62,30 @@ def test_the_side_that_waits_less_is_the_slowest_part(
     learner: dict[str, float], worker: dict[str, float], said: str
 ) -> None:
     stages = {f"learner_{name}": s for name, s in learner.items()} | {f"worker_{name}": s for name, s in worker.items()}
-    assert bottleneck("", stages) == said
+    assert bottleneck(RunProgress(stages=stages)) == said
 
 
 def test_a_long_wait_is_said_first() -> None:
     stages = {"learner_wait": 2.0, "learner_update": 8.0, "worker_wait": 8.0}
-    assert bottleneck("waiting 3 s for lane 1", stages) == "The learner has been waiting 3 s for lane 1."
-    assert bottleneck("waited 3 s for rollouts", stages) == "The learner waited 3 s for rollouts."
+    waiting = RunProgress(waiting="waiting 3 s for lane 1", stages=stages)
+    assert bottleneck(waiting) == "The learner has been waiting 3 s for lane 1."
+    waited = RunProgress(waiting="waited 3 s for rollouts", stages=stages)
+    assert bottleneck(waited) == "The learner waited 3 s for rollouts."
+
+
+def test_a_run_that_has_ended_waits_for_nobody() -> None:
+    ended = RunProgress(waiting="waiting 3 s for lane 1", stop_reason="all steps done")
+    assert bottleneck(ended) == ""
+
+
+def test_numbers_have_the_same_words_everywhere() -> None:
+    progress = RunProgress(env_steps=9_000, collected=999, total_steps=10_000, workers_alive=1, workers_expected=2)
+    assert steps_in_words(progress) == "9,999 of 10,000"
+    assert percent(progress) == "99%", "it is not done"
+    assert workers_in_words(progress) == "1 of 2"
+    without_end = RunProgress(env_steps=9_000, workers_alive=3)
+    assert (steps_in_words(without_end), percent(without_end), workers_in_words(without_end)) == ("9,000", "0%", "3")
+    assert (return_in_words(None), return_in_words(-1_234.56)) == ("none yet", "-1,234.6")
 
 
 def test_only_what_went_wrong_is_said() -> None:

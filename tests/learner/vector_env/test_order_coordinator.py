@@ -31,6 +31,7 @@ from millrace.protocol.messages import (
     Step,
     Stepped,
 )
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import Leaf, StepSpec
 from millrace.protocol.wire.plain_values import pack
 from tests.support.conversation.fake_ends import fake_rollout, process_ends
@@ -280,7 +281,8 @@ def test_it_says_how_it_is() -> None:
     beat(made, B, 12.0, steps=300)
     beat(made, A, 12.0, steps=50)
     found = status(made, 13.0)
-    assert (found.env, found.env_steps, found.steps_per_s, found.total_steps) == ("Fake-v0", 350, 100.0, 0)
+    assert found.env == "Fake-v0"
+    assert found.progress == RunProgress(env_steps=350, steps_per_s=100.0)
     assert [(one.worker, one.lanes, one.silent_s) for one in found.workers] == [("b", (1,), 1.0), ("a", (0,), 1.0)]
 
 

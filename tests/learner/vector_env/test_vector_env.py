@@ -243,7 +243,7 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
             env.step(zeros)
         link.close(0)
         status = reply.result()
-    assert (status.env, status.total_steps) == ("CartPole-v1", 0)
+    assert (status.env, status.progress.total_steps) == ("CartPole-v1", 0)
     assert [(worker.worker, worker.lanes) for worker in sorted(status.workers, key=lambda one: one.worker)] == [
         ("w0", (0,)),
         ("w1", (1,)),

@@ -15,13 +15,13 @@ from msgspec.structs import replace
 from millrace.cli.main import main
 from millrace.cli.status import status, whom_to_ask
 from millrace.learner.run_folder.lease import Listens, Owner, decoded
-from millrace.learner.run_folder.metrics_log import METRICS_FILE
 from millrace.learner.run_folder.run_lock import LOCK_FILE, RunLock
 from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import KeyFolder
 from millrace.protocol.keys.keys import Key, Token
 from millrace.protocol.keys.worker_token import read_token
-from tests.support.run_folders import a_run
+from millrace.protocol.progress import RunProgress
+from tests.support.run_folders import a_run, write_progress
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 WIDE, HERE = "tcp://box:5555", "tcp://127.0.0.1:5555"
@@ -125,8 +125,9 @@ def test_runs_are_listed_in_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     head, row = capsys.readouterr().out.splitlines()
     columns = ["run", "state", "environment", "algorithm", "return", "env steps", "done", "steps/s", "started"]
     assert re.split(r"  +", head) == columns
-    assert row.split()[:7] == [run.name, "dead", "CartPole-v1", "PPO", "101.0", "2,000", "2%"]
-    (run / METRICS_FILE).write_text("")
+    assert "2%, no sign since 20" in row
+    assert row.split()[:7] == [run.name, "dead", "CartPole-v1", "PPO", "101.0", "2,000", "2%,"]
+    write_progress(run, RunProgress(total_steps=100_000))
     with RunLock(run):
         assert main(["list", str(tmp_path / "runs")]) == 0
     row = capsys.readouterr().out.splitlines()[1]

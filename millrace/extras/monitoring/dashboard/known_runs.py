@@ -16,6 +16,7 @@ from millrace.extras.monitoring.report.metrics_tail import MetricsTail
 from millrace.extras.monitoring.report.reported_runs import ReportedRun, read_run
 from millrace.learner.run_folder.json_log import RUN_LOG_FILE
 from millrace.learner.run_folder.metrics_log import METRICS_FILE
+from millrace.learner.run_folder.progress_file import PROGRESS_FILE
 from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files
 from millrace.learner.run_folder.results import SUMMARY_FILE
 from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
@@ -24,7 +25,7 @@ from millrace.learner.run_lines import RunLine, find_runs, read_line
 from millrace.protocol.bounds import escaped
 from millrace.protocol.errors import UsageError
 
-CHANGES = ("", CONFIG_FILE, RUN_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
+CHANGES = ("", CONFIG_FILE, RUN_FILE, PROGRESS_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
 MOST_KEPT = 64  # runs whose rows are in memory
 MOST_LOGS, LOG_BYTES = 4, 4_096
 

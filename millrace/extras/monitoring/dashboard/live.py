@@ -93,7 +93,7 @@ def sample(status: Status, now: float) -> LaneSample:
     """What an answer says about the learner and each lane."""
     lanes = {lane: _doing(worker) for worker in status.workers for lane in worker.lanes}
     shown = {lane: lanes.get(lane, "no worker") for lane in range(min(status.workers_wanted, MOST_LANES))}
-    return LaneSample(now, LEARNER.get(status.phase, ""), shown)
+    return LaneSample(now, LEARNER.get(status.progress.phase, ""), shown)
 
 
 def _doing(worker: WorkerStatus) -> str:

@@ -20,13 +20,13 @@ from millrace.extras.monitoring.report.charts import DOT_KEY, Segment, Series, b
 from millrace.extras.monitoring.report.curve import points
 from millrace.extras.monitoring.report.history import clock_time
 from millrace.extras.monitoring.report.html_parts import return_text, section
-from millrace.extras.monitoring.report.reported_runs import ReportedRun, RunResults
+from millrace.extras.monitoring.report.reported_runs import ReportedRun
 from millrace.learner.members.held_up import in_words
 from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
-from millrace.learner.run_folder.sentences import bottleneck, per_second, went_wrong
-from millrace.learner.run_lines import RunLine, algorithm_label, duration, headline
+from millrace.learner.run_folder.sentences import bottleneck, duration, per_second, went_wrong
+from millrace.learner.run_lines import RunLine, algorithm_label, headline
 from millrace.protocol.arrays import Doubles
 from millrace.protocol.bounds import escaped
 from millrace.protocol.messages import Status, WorkerStatus
@@ -71,48 +71,28 @@ class Choice(NamedTuple):
         return Choice(first("metric", RETURN_KEY), first("over", "") == "time", min(max(rows, 1), MOST_SMOOTHED))
 
 
-def as_of_now(line: RunLine, seen: Seen) -> RunLine:
-    """The line with what the learner says: its folder knows the last update alone, and nothing before the first."""
-    status = seen.status
-    if status is None or status.env_steps < line.env_steps:
-        return line
-    learner_s = sum(status.stages.get(f"learner_{stage}", 0.0) for stage in ("wait", "update", "other"))
-    return line._replace(
-        env_steps=status.env_steps,
-        steps_per_s=status.steps_per_s or line.steps_per_s,
-        updates=max(line.updates, status.version),
-        wall_s=line.wall_s or learner_s,
-    )
-
-
 def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
     """Which run it is, in one sentence what it does, or how it ended, and its newest warning.
 
     `home`: the page of all runs, if it shows others.
     """
-    results, warned = (report.results, last_warning(report.log)) if report is not None else (None, "")
+    warned = "" if report is None else last_warning(report.log)
     kicker = f'<a href="{home}">millrace: all runs</a>' if home else "millrace"
     title = f"{escape(line.env or line.name)} <small>{escape(algorithm_label(line.algo))}, seed {line.seed}</small>"
     return (
         f'<header><p class="kicker">{kicker}</p><h1>{title}</h1>'
-        f'<p class="now {line.state}">{escape(now_sentence(line, seen, results))}</p>{warned}'
+        f'<p class="now {line.state}">{escape(now_sentence(line, seen.problem))}</p>{warned}'
         f'<p class="kicker">{escape(line.name)}</p></header>'
     )
 
 
-def now_sentence(line: RunLine, seen: Seen, results: RunResults | None) -> str:
-    """What the run does now, and what holds it up or is wrong with it."""
+def now_sentence(line: RunLine, problem: str) -> str:
+    """What the run does now, and what holds it up or is wrong with it. `problem`: why its learner does not answer."""
     if line.state != "training":
         return headline(line)
-    text = [headline(line)]
-    if seen.problem:
-        text.append(f"Who waits for whom is not known: {seen.problem}.")
-    elif results is not None:
-        status = seen.status or Status("", ())
-        text.append(bottleneck(status.waiting, status.stages or results.stages))
-    if results is not None and (wrong := went_wrong(results.ledger)):
-        text.append(f"{wrong}.")
-    return " ".join(filter(None, text))
+    held_up = f"Who waits for whom is not known: {problem}." if problem else bottleneck(line.progress)
+    wrong = went_wrong(line.progress.ledger)
+    return " ".join(filter(None, [headline(line), held_up, f"{wrong}." if wrong else ""]))
 
 
 def last_warning(log: Sequence[LoggedLine]) -> str:
@@ -127,13 +107,14 @@ def last_warning(log: Sequence[LoggedLine]) -> str:
 
 def facts(line: RunLine) -> str:
     """The most important numbers."""
+    progress = line.progress
     evaluation = line.summary.evaluation if line.summary else None
     cells = {
-        "Return, last 100 episodes": "none yet" if line.return_mean is None else return_text(line.return_mean),
-        f"Env steps of {line.total_steps:,.0f}": f"{line.env_steps:,.0f}",
-        "Env steps per second": per_second(line.steps_per_s),
-        "Updates": f"{line.updates:,.0f}",
-        "Time of training": duration(line.wall_s),
+        "Return, last 100 episodes": "none yet" if progress.return_mean is None else return_text(progress.return_mean),
+        f"Env steps of {progress.total_steps:,}": f"{progress.env_steps_made:,}",
+        "Env steps per second": per_second(progress.steps_per_s),
+        "Updates": f"{progress.updates:,}",
+        "Time of training": duration(progress.wall_s),
         "Started": line.started,
     }
     if evaluation is not None:

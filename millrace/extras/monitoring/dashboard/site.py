@@ -26,8 +26,8 @@ from millrace.extras.monitoring.report.html_parts import document, return_text, 
 from millrace.extras.monitoring.report.page import STYLE
 from millrace.extras.monitoring.report.reported_runs import ReportData, group_runs
 from millrace.learner.run_folder.regular_files import open_regular
-from millrace.learner.run_folder.sentences import per_second
-from millrace.learner.run_lines import RunLine, algorithm_label, duration
+from millrace.learner.run_folder.sentences import duration, per_second
+from millrace.learner.run_lines import RunLine, algorithm_label
 from millrace.protocol.errors import UsageError
 
 SCRIPT = Path(__file__).with_name("page.js")
@@ -79,7 +79,6 @@ class Site:
     def _run(self, run: Path, request: PageRequest, home: str) -> str:
         line, back = self._runs.line(run), "" if self._runs.only else home
         seen = self._look(run) if line.state == "training" else Seen()
-        line = run_page.as_of_now(line, seen)
         try:
             content = self._runs.content(run)
         except UsageError as error:
@@ -187,13 +186,14 @@ def _run_row(line: RunLine, home: str) -> str:
     choose = f'<td><input type="checkbox" name="run" value="{key}" aria-label="Compare {escape(line.name)}"></td>'
     about = f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}" if line.env else line.problem
     name = f'<th scope="row"><a href="{home}run/{key}">{escape(about)}</a><small>{escape(line.name)}</small></th>'
-    score = "–" if line.return_mean is None else return_text(line.return_mean)
+    progress = line.progress
+    score = "–" if progress.return_mean is None else return_text(progress.return_mean)
     left = "" if line.left_s is None else f"<small>{duration(line.left_s)} left</small>"
     cells = [
         f'<td><b class="state {line.state}">{line.state}</b></td>',
         f'<td class="number">{score}</td>',
         f'<td class="number">{escape(line.done)}{left}</td>',
-        f'<td class="number late">{"–" if line.begins else per_second(line.steps_per_s)}</td>',
+        f'<td class="number late">{"–" if line.begins else per_second(progress.steps_per_s)}</td>',
         f'<td class="late">{line.started}</td>',
     ]
     return f'<tr id="run-{key}">{choose}{name}{"".join(cells)}</tr>'

@@ -7,7 +7,7 @@ from html import escape
 from millrace.extras.monitoring.report.charts import COLORS, MINUS, Segment, bar, key
 from millrace.extras.monitoring.report.html_parts import section
 from millrace.extras.monitoring.report.reported_runs import ReportData
-from millrace.learner.run_lines import duration
+from millrace.learner.run_folder.sentences import duration
 
 TICKETS = ("issued", ("used", "outstanding", "lost"))
 TRANSITIONS = ("received", ("used", "waiting", "duplicate", "late", "invalid"))
@@ -17,7 +17,7 @@ PROCESSES = {"learner": "The learner", "worker": "All workers together"}
 def ledgers(report: ReportData) -> str:
     """The ledger: the number of tickets and transitions that ended in each state, as sums."""
     tables = _balance(report, "Tickets", "", TICKETS) + _balance(report, "Transitions", "transitions_", TRANSITIONS)
-    bad = sum(run.results.ledger.get("messages_bad", 0) for _, run in report.runs)
+    bad = sum(run.progress.ledger.get("messages_bad", 0) for _, run in report.runs)
     about = "What became of every ticket that was dealt, and of every transition that reached the learner."
     if bad:
         about += f" {bad:,} messages could not be read."
@@ -30,7 +30,7 @@ def _balance(report: ReportData, name: str, prefix: str, terms: tuple[str, tuple
     heads += "".join(f'<th></th><th scope="col" class="number">{part}</th>' for part in parts)
     rows = []
     for short, (group, run) in zip(report.short_names(), report.runs, strict=True):
-        counts = run.results.ledger
+        counts = run.progress.ledger
         row = f'<th scope="row">{key(group.color)}{escape(short)}</th>'
         if prefix + total not in counts:
             rows.append(f'<tr>{row}<td class="none" colspan="{2 * len(parts) + 1}">not known</td><td></td></tr>')
@@ -56,7 +56,7 @@ def stages(report: ReportData) -> str:
 def _bars(report: ReportData, process: str, name: str) -> str:
     """A bar for each run. A stage has the same color in all runs; waiting is grey."""
     spent = [
-        {key.removeprefix(f"{process}_"): s for key, s in run.results.stages.items() if key.startswith(f"{process}_")}
+        {key.removeprefix(f"{process}_"): s for key, s in run.progress.stages.items() if key.startswith(f"{process}_")}
         for _, run in report.runs
     ]
     kinds = sorted(dict.fromkeys(kind for seconds in spent for kind in seconds), key=lambda kind: kind == "wait")

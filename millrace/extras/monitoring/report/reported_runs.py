@@ -1,6 +1,6 @@
 """The data of the page: the runs, read from their folders, and the groups of runs.
 
-Rule: of a run that has not finished, the page shows what its metrics contain. Runs with other keyword arguments of the
+Rule: of a run that has not finished, the page shows its curve and how far it is. Runs with other keyword arguments of the
 environment are runs of another environment. Runs form a group if they differ only in their seeds and in settings on which it
 does not depend what is learned from an env step. A run that an error or an interrupt ended is in its group, and in no mean.
 """
@@ -11,21 +11,17 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import msgspec
+from typing import Any
 
 from millrace.extras.monitoring.report.curve import Curve, points, read_run_files
 from millrace.learner.run_folder.json_log import LoggedLine, newest_lines
-from millrace.learner.run_folder.metrics_log import METRICS_FILE
-from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
+from millrace.learner.run_folder.progress_file import last_progress
 from millrace.learner.run_folder.regular_files import regular_files
-from millrace.learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
+from millrace.learner.run_folder.results import EVALUATION_KEY, Evaluation, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_lines import algorithm_label
 from millrace.protocol.arrays import Doubles
-from millrace.protocol.bounds import Natural, Real, Seconds
-from millrace.protocol.errors import UsageError
+from millrace.protocol.progress import RunProgress
 
 MAY_DIFFER_IN_A_GROUP = frozenset({
     # what a group is for
@@ -48,26 +44,6 @@ ELSEWHERE = "started elsewhere"
 """What is shown as the number of workers if the learner started none."""
 
 
-class RunResults(NamedTuple):
-    """The numbers of one run."""
-
-    env_steps: Natural
-    updates: Natural
-    wall_s: Seconds
-    env_steps_per_s: Real
-    return_mean_100: Real | None
-    """mean return of the last 100 training episodes"""
-    evaluation: Evaluation | None
-    stop_reason: str
-    """why the run stopped, or that it has not stopped"""
-    cut_short: bool
-    """whether an error or an interrupt ended it"""
-    ledger: dict[str, Natural]
-    stages: dict[str, Seconds]
-    facts: dict[str, FactMean] = {}
-    """of each name in `info_keys`: mean over the last training episodes"""
-
-
 @dataclass(frozen=True)
 class ReportedRun:
     """One run."""
@@ -80,7 +56,10 @@ class ReportedRun:
     """All settings of config.toml, as text."""
     algorithm_settings: frozenset[str]
     """Names of the settings that belong to the algorithm."""
-    results: RunResults
+    progress: RunProgress
+    """how far it is, or was when it ended"""
+    summary: Summary | None
+    """None if it has not ended"""
     curve: Curve | None
     """None before the first episode has ended"""
     evaluations: Doubles  # [K, 2] env steps and mean return of the evaluations during training
@@ -89,6 +68,11 @@ class ReportedRun:
     """pictures of what the policy sees, one for each image of an observation"""
     log: tuple[LoggedLine, ...] = ()
     """its newest warnings and notices, the oldest first"""
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """The evaluation of its final policy."""
+        return None if self.summary is None else self.summary.evaluation
 
     @property
     def of_group(self) -> dict[str, str]:
@@ -120,7 +104,7 @@ class RunGroup:
     @property
     def averaged(self) -> list[Curve]:
         """The curves of which mean and band are drawn; empty if there is no mean. Runs that were cut short are left out."""
-        whole = [run.curve for run in self.runs if run.curve is not None and not run.results.cut_short]
+        whole = [run.curve for run in self.runs if run.curve is not None and not run.progress.cut_short]
         return whole if len(whole) > 1 else []
 
     @property
@@ -134,7 +118,7 @@ class RunGroup:
         if not curves:
             return f"{label}: no episode has ended yet"
         one_each = len({curve.seed for curve in curves}) == len(curves)
-        ended = [run.seed for run in self.runs if run.curve is not None and run.results.cut_short]
+        ended = [run.seed for run in self.runs if run.curve is not None and run.progress.cut_short]
         early = f"seed {', '.join(map(str, ended))} ended early" if one_each else f"{len(ended)} of them ended early"
         if mean := self.averaged:
             kind = "seeds" if one_each else "runs"
@@ -176,6 +160,7 @@ def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRu
     """Read a run folder. `rows`: of its metrics, if they are read already. Raises `UsageError`, with a one-line message."""
     files = read_run_files(path, rows)
     of_algorithm = files.config.get(files.algo)
+    summary = RunFolder(path).summary()
     return ReportedRun(
         path=path,
         env=files.env,
@@ -183,7 +168,8 @@ def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRu
         seed=files.seed,
         settings=_flatten(files.config, files.algo) | ({"workers": ELSEWHERE} if files.workers_elsewhere else {}),
         algorithm_settings=frozenset(of_algorithm if isinstance(of_algorithm, dict) else ()),
-        results=_results(path, files.rows),
+        progress=last_progress(path, summary),
+        summary=summary,
         curve=files.curve(),
         evaluations=points(files.rows, EVALUATION_KEY),
         videos=tuple(regular_files(path, "videos/*.mp4")),
@@ -247,34 +233,6 @@ def _distinguishing(runs: Sequence[ReportedRun], names: Sequence[str]) -> list[s
 def _letters(i: int) -> str:
     """A to Z, then AA, AB and so on."""
     return (_letters(i // 26 - 1) if i >= 26 else "") + chr(ord("A") + i % 26)
-
-
-def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
-    """The results from summary.json, or from the newest row of metrics if the run has not finished."""
-    summary = RunFolder(path).summary()
-    if summary is not None:
-        return RunResults(
-            summary.env_steps, summary.updates, summary.wall_s, summary.env_steps_per_s, summary.return_mean_100,
-            summary.evaluation, summary.stop_reason, summary.cut_short, summary.ledger, summary.stages, summary.facts_100,
-        )  # fmt: skip
-    last = rows[-1] if rows else {}
-    env_steps, wall_s = last.get(ENV_STEPS_KEY, 0), last.get("time/time_elapsed") or 0.0
-    results = RunResults(
-        env_steps=env_steps,
-        updates=last.get(UPDATES_KEY) or 0,
-        wall_s=wall_s,
-        env_steps_per_s=steps_per_second(env_steps, wall_s),
-        return_mean_100=last.get(RETURN_KEY),
-        evaluation=None,
-        stop_reason="not finished",
-        cut_short=False,
-        ledger={name.removeprefix("ledger/"): last[name] for name in last if name.startswith("ledger/")},
-        stages={name.removeprefix("stage/"): last[name] for name in last if name.startswith("stage/")},
-    )
-    try:
-        return msgspec.convert(tuple(results), RunResults)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"run {path}: the last row of {METRICS_FILE} is damaged: {error}; remove it") from error
 
 
 def _flatten(config: dict[str, Any], algo: str) -> dict[str, str]:

@@ -17,8 +17,7 @@ from millrace.extras.monitoring.report.reported_runs import ReportData, RunGroup
 from millrace.learner.run_folder.episode_window import WINDOW_EPISODES
 from millrace.learner.run_folder.regular_files import read
 from millrace.learner.run_folder.results import FactMean
-from millrace.learner.run_folder.sentences import per_second
-from millrace.learner.run_lines import duration
+from millrace.learner.run_folder.sentences import duration, per_second
 
 WIDE, NARROW = (1080, 360), (540, 320)
 MOST_BYTES_OF_ONE, MOST_BYTES_OF_ALL = 4 * 2**20, 24 * 2**20  # films or pictures
@@ -31,11 +30,11 @@ def title(report: ReportData) -> str:
 
 def head(report: ReportData) -> str:
     """Title and totals."""
-    results = [run.results for _, run in report.runs]
+    runs = [run.progress for _, run in report.runs]
     facts = [
-        f"{len(results)} runs" if len(results) > 1 else "1 run",
-        f"{sum(result.env_steps for result in results):,} env steps",
-        f"{duration(sum(result.wall_s for result in results))} of training",
+        f"{len(runs)} runs" if len(runs) > 1 else "1 run",
+        f"{sum(run.env_steps for run in runs):,} env steps",
+        f"{duration(sum(run.wall_s for run in runs))} of training",
     ]
     return (
         f'<header><p class="kicker">millrace report</p><h1>{escape(title(report))}</h1><p>{" · ".join(facts)}</p></header>'
@@ -56,32 +55,32 @@ def results(report: ReportData) -> str:
 def _rows_of_group(group: RunGroup) -> str:
     rows = []
     for run in group.runs:
-        results = run.results
-        if results.evaluation is None:
+        progress, evaluation = run.progress, run.evaluation
+        if evaluation is None:
             greedy = '<strong class="none">–</strong><small>not evaluated</small>'
         else:
-            spread = f"± {results.evaluation.return_std:,.1f}, {results.evaluation.episodes} episodes"
-            cut = f", {results.evaluation.cut} cut" if results.evaluation.cut else ""
-            greedy = f"<strong>{return_text(results.evaluation.return_mean)}</strong><small>{escape(spread + cut)}</small>"
-            greedy += _facts(results.evaluation.facts)
-        mean = "" if results.return_mean_100 is None else return_text(results.return_mean_100)
-        mean += _facts(results.facts)
+            spread = f"± {evaluation.return_std:,.1f}, {evaluation.episodes} episodes"
+            cut = f", {evaluation.cut} cut" if evaluation.cut else ""
+            greedy = f"<strong>{return_text(evaluation.return_mean)}</strong><small>{escape(spread + cut)}</small>"
+            greedy += _facts(evaluation.facts)
+        mean = "" if progress.return_mean is None else return_text(progress.return_mean)
+        mean += "" if run.summary is None else _facts(run.summary.facts_100)
         cells = [
             greedy,
             mean,
-            f"{results.env_steps:,}",
-            per_second(results.env_steps_per_s),
-            duration(results.wall_s),
-            f"{results.updates:,}",
+            f"{progress.env_steps:,}",
+            per_second(progress.steps_per_s),
+            duration(progress.wall_s),
+            f"{progress.updates:,}",
         ]
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
         where = f'<th scope="row" title="{escape(str(run.path))}">seed {run.seed}</th>'
-        rows.append(f'<tr>{where}{numbers}<td class="text">{escape(results.stop_reason)}</td></tr>')
+        rows.append(f'<tr>{where}{numbers}<td class="text">{escape(progress.stop_reason or "not finished")}</td></tr>')
     name = f"{key(group.color)}<b>{escape(group.env)}</b> {escape(group.name)}"
     if group.differences:
         name += f"<span>{escape(group.differences)}</span>"
-    whole = [run.results for run in group.runs if not run.results.cut_short]
-    returns = [results.evaluation.return_mean for results in whole if results.evaluation is not None]
+    whole = [run.evaluation for run in group.runs if not run.progress.cut_short]
+    returns = [evaluation.return_mean for evaluation in whole if evaluation is not None]
     if len(returns) > 1:
         mean, worst, best = map(return_text, (sum(returns) / len(returns), min(returns), max(returns)))
         which = f" of {len(returns)} of {len(group.runs)} runs" if len(returns) < len(group.runs) else ""

@@ -75,7 +75,7 @@ def test_a_learner_is_asked_as_long_as_somebody_looks(tmp_path: Path, address: s
             lock.announce(Listens(address, address))
             seen = looked(lookout, tmp_path, 3)
             assert seen.status is not None
-            assert seen.status.waiting == "waiting 3 s for lane 0"
+            assert seen.status.progress.waiting == "waiting 3 s for lane 0"
             assert seen.samples[-1].lanes == {0: "collecting", 1: "no worker"}
             assert seen.samples[-1].learner == "waiting"
             monkeypatch.setattr(live, "LOOKED_AT_S", 0.0)

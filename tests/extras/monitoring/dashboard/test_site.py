@@ -8,7 +8,6 @@ import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -26,8 +25,9 @@ from millrace.learner.run_folder.results import Best, Evaluation
 from millrace.learner.run_folder.run_lock import RunLock
 from millrace.protocol.logs.notices import log_notice
 from millrace.protocol.messages import Status, WorkerStatus
+from millrace.protocol.progress import RunProgress
 from tests.extras.monitoring.report.test_page import Reader
-from tests.support.run_folders import a_run
+from tests.support.run_folders import a_run, write_progress
 
 log = logging.getLogger("millrace.learner")
 
@@ -85,7 +85,7 @@ def worker(
 
 
 def status(*workers: WorkerStatus, waiting: str = "", phase: str = "gathering", wanted: int = 2) -> Status:
-    return Status("CartPole-v1", workers, wanted, version=3, waiting=waiting, phase=phase)
+    return Status("CartPole-v1", RunProgress(waiting=waiting, phase=phase), workers, wanted, version=3)
 
 
 def a_hostile_run(folder: Path) -> Path:
@@ -170,7 +170,8 @@ def test_of_equally_good_evaluations_the_newest_is_the_best_as_in_the_run() -> N
 def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
     run = a_run(tmp_path, finished=False)
     waits = "waiting 12 s for lane 1 (worker w1 on far: in reset for 11 s)"
-    two = status(worker(), worker("w1", "far", (1,), "resetting", doing_s=11.0), waiting=waits)
+    write_progress(run, RunProgress(env_steps=2_000, total_steps=100_000, updates=20, waiting=waits))
+    two = status(worker(), worker("w1", "far", (1,), "resetting", doing_s=11.0))
     with RunLock(run):
         pages = Pages(tmp_path, seen=Seen(two, (sample(two, 5.0),)))
         said = pages.said(f"run/{key_of(run)}")
@@ -186,15 +187,14 @@ def test_a_running_run_says_first_what_holds_it_up(tmp_path: Path) -> None:
 
 def test_before_the_first_update_it_shows_what_workers_have_made(tmp_path: Path) -> None:
     run = a_run(tmp_path, finished=False)
-    (run / METRICS_FILE).write_text("")
+    write_progress(run, RunProgress(total_steps=100_000))
     waits = "waiting 23 s for lane 0 (worker w0 on box: 1.0 steps/s); first rollouts: 45 of 512 env steps, about 4 min left"
-    known = msgspec.structs.replace(
-        status(worker()), version=0, env_steps=45, steps_per_s=1.9, waiting=waits, stages={"learner_wait": 23.4}
-    )
     with RunLock(run):
-        pages = Pages(tmp_path, seen=Seen(known))
-        said, all_runs = pages.said(f"run/{key_of(run)}"), pages.said()
+        pages = Pages(tmp_path, seen=Seen(status(worker())))
+        all_runs = pages.said()
         silent = Pages(tmp_path, seen=Seen(problem="its learner does not answer")).said(f"run/{key_of(run)}")
+        write_progress(run, RunProgress(collected=45, total_steps=100_000, wall_s=23.4, steps_per_s=1.9, waiting=waits))
+        said = pages.said(f"run/{key_of(run)}")
     assert "training – before its first update – " in all_runs
     assert "Training: before its first update. Who waits for whom is not known" in silent
     assert f"1.9 env steps per second, about 14 h 36 min left. The learner has been {waits}." in said
@@ -288,9 +288,9 @@ def test_nothing_of_a_learner_becomes_markup(tmp_path: Path) -> None:
     hostile = status(
         worker(HOSTILE, HOSTILE, (0,), HOSTILE, state=HOSTILE),
         worker("w1", lanes=(), state=HOSTILE),
-        waiting=HOSTILE,
         phase=HOSTILE,
     )
+    write_progress(run, RunProgress(updates=1, waiting=HOSTILE))
     with RunLock(run):
         seen = Seen(hostile, (sample(hostile, 1.0),))
         assert "alert(1)" in Pages(tmp_path, seen=seen).said(f"run/{key_of(run)}")
@@ -346,8 +346,7 @@ def test_the_page_grows_with_its_run(tmp_path: Path) -> None:
     before = pages.text(f"run/{key_of(run)}?part=main")
     assert before.startswith("<main>")
     assert pages.text(f"run/{key_of(run)}?part=main") == before
-    with (run / METRICS_FILE).open("a") as file:
-        file.write('{"time/total_timesteps": 2100, "rollout/ep_rew_mean": 500.0}\n')
+    write_progress(run, RunProgress(env_steps=2_100, total_steps=100_000, return_mean=500.0))
     after = pages.said(f"run/{key_of(run)}?part=main")
     assert "Env steps of 100,000 2,100" in after
     assert "500.0" in after

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from millrace.extras.monitoring.report.metrics_tail import MetricsTail
-from millrace.learner.run_folder.metrics_log import METRICS_FILE, MOST_LINE_BYTES, MetricsLog, newest_row, read_rows
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, MOST_LINE_BYTES, MetricsLog, read_rows
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, Progress
 
 
@@ -93,12 +93,10 @@ def test_a_file_that_is_no_table_is_refused_before_it_fills_the_memory(tmp_path:
     os.truncate(path, 1 << 40)  # a hole takes no room
     with pytest.raises(OSError, match="expected at most"):
         MetricsTail(tmp_path).read()
-    assert newest_row(tmp_path) == {}
     path.unlink()
     os.mkfifo(path)
-    for reads in (MetricsTail(tmp_path).read, lambda: newest_row(tmp_path)):
-        with pytest.raises(OSError, match="got a FIFO"):
-            reads()
+    with pytest.raises(OSError, match="got a FIFO"):
+        MetricsTail(tmp_path).read()
 
 
 def test_short_lines_take_little_memory_and_a_long_one_is_refused(tmp_path: Path) -> None:
@@ -113,10 +111,3 @@ def test_short_lines_take_little_memory_and_a_long_one_is_refused(tmp_path: Path
     path.write_bytes(b"{}\n" + b"x" * (MOST_LINE_BYTES + 1) + b"\n{}\n")
     with pytest.raises(OSError, match="a row has more than"):
         MetricsTail(tmp_path).read()
-
-
-def test_the_newest_row_is_found_at_the_end(tmp_path: Path) -> None:
-    write(tmp_path, range(100_000))
-    with (tmp_path / METRICS_FILE).open("a") as file:
-        file.write('not a row\n{"time/total_times')
-    assert newest_row(tmp_path) == {ENV_STEPS_KEY: 99_999}

@@ -25,7 +25,7 @@ from millrace.extras.monitoring.report.reported_runs import MAY_DIFFER_IN_A_GROU
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.run_folder import RunFolder
-from millrace.learner.run_lines import duration
+from millrace.learner.run_folder.sentences import duration
 from millrace.protocol.errors import RunError, UsageError
 from tests.support.run_folders import LEDGER, a_run
 
@@ -122,7 +122,7 @@ def test_a_run_that_goes_on_is_told_as_far_as_it_got(tmp_path: Path) -> None:
     new = a_run(tmp_path, seed=2, finished=False, length=1)
     text = Reader(page([new])).text
     assert "PPO: no episode has ended yet" in text
-    (new / "metrics.jsonl").write_text("")
+    (new / "progress.json").unlink()
     assert "Tickets issued used outstanding lost seed 2 not known" in Reader(page([new])).text
 
 

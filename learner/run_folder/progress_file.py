@@ -1,0 +1,77 @@
+"""progress.json: how far a run is, once a second while it trains. Of a killed run it tells when the last sign of it was.
+
+Rule: nothing depends on it. It is there whole or not at all, but not flushed to the disk, because that would slow the
+training loop; a power failure may cost it. What the disk refuses is dropped. Once the run has a summary, that counts.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+from msgspec.structs import replace
+
+from millrace.learner.run_folder.atomic_write import write_atomically
+from millrace.learner.run_folder.regular_files import read
+from millrace.learner.run_folder.results import Summary
+from millrace.protocol.bounds import INVALID
+from millrace.protocol.progress import RunProgress
+
+PROGRESS_FILE = "progress.json"
+EVERY_S = 1.0
+
+
+class ProgressFile:
+    """The progress.json of a run that this process trains."""
+
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
+        """`clock` tells seconds since 1970."""
+        self._path, self._clock = folder / PROGRESS_FILE, clock
+        self._written = RunProgress()
+        self._looked_s = 0.0
+
+    def write(self, progress: Callable[[], RunProgress]) -> None:
+        """Write the progress of now, if a second has passed since the last was written, and it is another one."""
+        now = self._clock()
+        if 0.0 <= now - self._looked_s < EVERY_S:
+            return
+        newest = replace(progress(), at_s=now)
+        self._looked_s = now
+        if replace(newest, at_s=self._written.at_s) == self._written:
+            return
+        with suppress(OSError, ValueError):  # ValueError: a text of the environment that is not UTF-8
+            content = msgspec.json.encode(newest)
+            write_atomically(self._path, lambda file: file.write(content), flush=False)
+            self._written = newest
+
+
+def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> RunProgress:
+    """How far a run is, or was when it ended: as its `summary` says, or else its progress.json.
+
+    `total_steps`: by its settings. If neither can be read, nothing but these is known.
+    """
+    if summary is not None:
+        return of_summary(summary, total_steps)
+    try:
+        return msgspec.json.decode(read(run / PROGRESS_FILE), type=RunProgress)
+    except (OSError, *INVALID):
+        return RunProgress(total_steps=total_steps)
+
+
+def of_summary(summary: Summary, total_steps: int) -> RunProgress:
+    """How far a run was when it ended."""
+    return RunProgress(
+        env_steps=summary.env_steps,
+        total_steps=total_steps,
+        updates=summary.updates,
+        wall_s=summary.wall_s,
+        steps_per_s=summary.env_steps_per_s,
+        return_mean=summary.return_mean_100,
+        ledger=summary.ledger,
+        stages=summary.stages,
+        stop_reason=summary.stop_reason,
+        cut_short=summary.cut_short,
+    )

@@ -1,0 +1,72 @@
+"""How far a run is: one record, which the learner answers with, writes into the run folder, and shows. Pure.
+
+Rule: it is plain data of bounded size, so that it can be sent, and read from a folder that may come from a stranger. Whoever
+tells people how far a run is renders this record, and counts nothing of its own.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from millrace.protocol.bounds import Moment, Natural
+
+
+class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
+    """How far a run is at one moment. Returns are sums of raw rewards. A number that does not exist is None."""
+
+    at_s: Moment = 0.0
+    """when this was so; 0 if that is not known"""
+    env_steps: Natural = 0
+    """env steps that updates have used so far, those before a resume included"""
+    collected: Natural = 0
+    """env steps of the rollouts that the learner waits for, as workers report them; 0 while it waits for none"""
+    total_steps: Natural = 0
+    """env steps to train for; 0 for what has no end: a learner of one's own, or a vector environment"""
+    updates: Natural = 0
+    """updates made so far, those before a resume included"""
+    wall_s: float = 0.0
+    """seconds of training, those before a resume included; evaluations do not count"""
+    steps_per_s: float = 0.0
+    """env steps per second of training since this process started, `collected` included"""
+    return_mean: float | None = None
+    """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
+    length_mean: float | None = None
+    """mean length of the same episodes, in env steps"""
+    lag_mean: float = 0.0
+    """mean lag of the rollouts of the last update, in versions of the weights"""
+    lag_max: Natural = 0
+    """the largest of these lags"""
+    workers_alive: Natural = 0
+    """workers that have joined and are not lost"""
+    workers_expected: Natural = 0
+    """workers that this run starts; 0: any number may join"""
+    ledger: dict[str, Natural] = {}
+    """number of tickets and transitions in each state"""
+    stages: dict[str, float] = {}
+    """seconds that the learner, and all workers together, have spent in each stage so far"""
+    phase: str = ""
+    """what the learner does: starting, gathering rollouts, learning, or evaluating; empty if that is not known"""
+    waiting: str = ""
+    """who waits for whom, and for what share of the time, or how far an evaluation is: "evaluating for 41 s: 37 of 100
+    episodes (…"; empty if nobody waits long"""
+    stop_reason: str = ""
+    """why the run ended; empty while it goes on"""
+    cut_short: bool = False
+    """whether an error or an interrupt ended it"""
+
+    @property
+    def env_steps_made(self) -> int:
+        """Env steps that updates have used, and those that the next one waits for."""
+        return self.env_steps + self.collected
+
+    @property
+    def share(self) -> float:
+        """How much of the run is done, from 0 to 1; 0 for what has no end."""
+        return min(1.0, self.env_steps_made / self.total_steps) if self.total_steps else 0.0
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds of training that are left, at the speed so far; None if that is not known."""
+        if self.steps_per_s <= 0:
+            return None
+        return max(0, self.total_steps - self.env_steps_made) / self.steps_per_s

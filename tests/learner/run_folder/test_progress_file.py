@@ -1,0 +1,145 @@
+"""progress.json: how far a run is, also once its process is gone."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.progress_file import EVERY_S, PROGRESS_FILE, ProgressFile, last_progress
+from millrace.learner.run_folder.results import Summary
+from millrace.protocol.progress import RunProgress
+from tests.support.run_folders import a_run
+
+BEGAN_S = 1_800_000_000.0
+
+
+class Clock:
+    """Tells the time that a test sets."""
+
+    now = BEGAN_S
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def at(env_steps: int) -> RunProgress:
+    return RunProgress(env_steps=env_steps, total_steps=100)
+
+
+def test_it_is_written_once_a_second(tmp_path: Path) -> None:
+    clock = Clock()
+    file = ProgressFile(tmp_path, clock)
+    file.write(lambda: at(10))
+    clock.now += EVERY_S / 2
+    file.write(lambda: pytest.fail("it is not even asked for"))
+    assert last_progress(tmp_path, None) == msgspec.structs.replace(at(10), at_s=BEGAN_S)
+    clock.now += EVERY_S / 2
+    file.write(lambda: at(20))
+    assert last_progress(tmp_path, None) == msgspec.structs.replace(at(20), at_s=BEGAN_S + EVERY_S)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [PROGRESS_FILE]
+
+
+def test_a_clock_that_is_set_back_does_not_stop_it(tmp_path: Path) -> None:
+    clock = Clock()
+    file = ProgressFile(tmp_path, clock)
+    file.write(lambda: at(10))
+    clock.now -= 3_600.0
+    file.write(lambda: at(20))
+    assert last_progress(tmp_path, None).env_steps == 20
+
+
+def test_what_has_not_changed_is_not_written_again(tmp_path: Path) -> None:
+    clock = Clock()
+    file = ProgressFile(tmp_path, clock)
+    file.write(lambda: at(10))
+    before = (tmp_path / PROGRESS_FILE).stat()
+    clock.now += EVERY_S
+    file.write(lambda: at(10))
+    assert os.path.samestat((tmp_path / PROGRESS_FILE).stat(), before), "another file stands in its place"
+
+
+def test_what_the_disk_refuses_is_dropped_and_written_later(tmp_path: Path) -> None:
+    clock = Clock()
+    run = tmp_path / "run"
+    file = ProgressFile(run, clock)
+    file.write(lambda: at(10))  # the folder was deleted
+    run.mkdir()
+    clock.now += EVERY_S
+    file.write(lambda: at(20))
+    assert last_progress(run, None).env_steps == 20
+
+
+def test_what_was_refused_is_written_although_nothing_has_changed_since(tmp_path: Path) -> None:
+    clock = Clock()
+    run = tmp_path / "run"
+    file = ProgressFile(run, clock)
+    file.write(lambda: at(10))
+    run.mkdir()
+    clock.now += EVERY_S
+    file.write(lambda: at(10))
+    assert last_progress(run, None).env_steps == 10
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b'{"env_steps": -5}', b'{"at_s": 1e300}', b'{"stages": {"a": 1e999}}', b"\xff"]
+)
+def test_of_a_damaged_file_nothing_is_known_but_the_settings(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / PROGRESS_FILE).write_bytes(content)
+    assert last_progress(tmp_path, None, 100) == RunProgress(total_steps=100)
+
+
+def test_no_link_is_followed_and_no_pipe_is_waited_for(tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text('{"env_steps": 7}')
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / PROGRESS_FILE).symlink_to(secret)
+    assert last_progress(run, None) == RunProgress()
+    (run / PROGRESS_FILE).unlink()
+    os.mkfifo(run / PROGRESS_FILE)
+    assert last_progress(run, None) == RunProgress()
+    ProgressFile(run, Clock()).write(lambda: at(10))
+    assert last_progress(run, None).env_steps == 10
+    assert secret.read_text() == '{"env_steps": 7}'
+
+
+def test_a_summary_counts_more(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    summary = Summary(
+        env="CartPole-v1",
+        algo="ppo",
+        seed=1,
+        env_steps=123,
+        updates=4,
+        wall_s=5.0,
+        env_steps_per_s=6.0,
+        stop_reason="interrupted",
+        cut_short=True,
+        return_mean_100=7.0,
+        evaluation=None,
+        ledger={"used": 8},
+        stages={"learner_wait": 9.0},
+    )
+    assert last_progress(run, summary, 200) == RunProgress(
+        env_steps=123,
+        total_steps=200,
+        updates=4,
+        wall_s=5.0,
+        steps_per_s=6.0,
+        return_mean=7.0,
+        ledger={"used": 8},
+        stages={"learner_wait": 9.0},
+        stop_reason="interrupted",
+        cut_short=True,
+    )
+    assert last_progress(run, None).env_steps == 2_000
+
+
+def test_what_callbacks_get_besides_is_not_written() -> None:
+    told = Progress(env_steps=5, settings={"seed": 1}, metrics={"a": 1.0}, checkpoint="here")
+    assert told.plain() == RunProgress(env_steps=5)
+    assert told.plain().__class__ is RunProgress
