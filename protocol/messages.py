@@ -35,7 +35,7 @@ from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.space_spec import EnvDescription
 from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
 
-PROTOCOL_VERSION = 10
+PROTOCOL_VERSION = 11
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
 

@@ -12,7 +12,7 @@ import { readToken, routingId } from "./token.js";
 
 export { box, discrete, UsageError };
 
-const PROTOCOL_VERSION = 10;
+const PROTOCOL_VERSION = 11;
 const FIELDS = { // how many fields each message of the learner has
   Welcome: 3, Rejoin: 1, Weights: 4, Collect: 4, Release: 2, Evaluate: 10, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
 };
