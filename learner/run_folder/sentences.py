@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Mapping
 
+from millrace.protocol.messages import Status
 from millrace.protocol.progress import RunProgress
 
 ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
@@ -59,6 +60,20 @@ def lag_in_words(progress: RunProgress) -> str:
         return ""
     largest = f", largest {progress.lag_max}" if progress.lag_max > progress.lag_mean else ""
     return f"lag {progress.lag_mean:.1f}{largest}"
+
+
+def weights_in_words(version: int, newest: int) -> str:
+    """Which weights a worker holds, by their version and that of the newest; -1: none."""
+    if version < 0:
+        return "none"
+    return f"{newest - version} behind" if version < newest else "newest"
+
+
+def workers_here(status: Status) -> str:
+    """How many workers collect for a learner, and how many could have a lane."""
+    evaluating = sum(worker.state == "evaluating" for worker in status.workers)
+    here = f"{len(status.workers) + status.workers_left_out - evaluating} here"
+    return f"{here}, {status.workers_wanted} wanted (one for each lane)" if status.workers_wanted else here
 
 
 def bottleneck(progress: RunProgress) -> str:

@@ -31,7 +31,9 @@ from millrace.learner.run_folder.sentences import (
     per_second,
     return_in_words,
     steps_in_words,
+    weights_in_words,
     went_wrong,
+    workers_here,
 )
 from millrace.learner.run_lines import RunLine, in_sentences, read_line
 from millrace.protocol.errors import Refused, RunError, UsageError
@@ -169,9 +171,7 @@ def last_in_json(line: RunLine) -> str:
 def as_table(status: Status) -> str:
     """A line about the run, what holds it up, a table of its workers, how many there could be, and what went wrong."""
     late = any(worker.late_actions for worker in status.workers)
-    evaluating = sum(worker.state == "evaluating" for worker in status.workers)
-    here = len(status.workers) + status.workers_left_out - evaluating
-    wanted = f"workers: {here} here, {status.workers_wanted} wanted (one for each lane)\n" if status.workers_wanted else ""
+    wanted = f"workers: {workers_here(status)}\n" if status.workers_wanted else ""
     held_up = bottleneck(status.progress)
     return "\n".join(
         [
@@ -207,7 +207,6 @@ def _run_line(status: Status) -> str:
 
 def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
     """A row of the table, by column. `late`: with the column of late actions."""
-    behind = version - worker.version
     return {
         "worker": _printable(worker.worker) + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
         "host": _printable(worker.host),
@@ -215,7 +214,7 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
         "lanes": ",".join(map(str, worker.lanes)) if worker.state == "active" else _printable(worker.state),
         "tickets": str(worker.tickets),
         "steps/s": per_second(worker.steps_per_s),
-        "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",
+        "weights": weights_in_words(worker.version, version),
         "silent": f"{worker.silent_s:.1f} s",
         "doing": in_words(_printable(worker.doing), worker.doing_s),
         "memory": f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-",

@@ -8,8 +8,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from millrace import Progress
 from millrace.extras.monitoring.run_rows import RowCallback, flat_settings, run_name, tool
-from millrace.learner.run_folder.progress import Progress
 
 MOST_PARAMETERS = 100  # of one request
 MOST_CHARACTERS = 500  # of the value of a parameter

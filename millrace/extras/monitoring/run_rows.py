@@ -12,8 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from millrace.learner.callbacks.callback import Callback
-from millrace.learner.run_folder.progress import Progress
+from millrace import Callback, Progress
 from millrace.learner.run_folder.results import EVALUATED_AT_KEY
 from millrace.protocol.errors import UsageError, refusals_of
 

@@ -15,8 +15,8 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+from millrace import Progress
 from millrace.extras.monitoring.run_rows import RowCallback
-from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.record_file import RecordFile
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.errors import RunError

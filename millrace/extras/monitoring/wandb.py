@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from millrace import Progress
 from millrace.extras.monitoring.run_rows import RowCallback, flat_settings, run_name, tool
-from millrace.learner.run_folder.progress import ENV_STEPS_KEY, Progress
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY
 
 
 class WandbCallback(RowCallback):

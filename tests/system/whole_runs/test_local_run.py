@@ -472,15 +472,16 @@ def test_a_run_that_goes_on_has_no_summary_until_it_ends_again(tmp_path: Path) -
     folder = run(tmp_path, "CartPole-v1", steps=512, transport="inproc", workers=1, **SMALL)
     ended = millrace.Run(folder)
     assert ended.summary is not None
-    meanwhile: list[str] = []
+    meanwhile: list[tuple[str, int, bool]] = []
 
     def watch(progress: Progress) -> None:
         if progress.env_steps > 1_000 and not meanwhile:
             assert ended.summary is None
-            meanwhile.append(read_run(folder).progress.stop_reason)
+            shown = read_run(folder).progress
+            meanwhile.append((shown.stop_reason, shown.total_steps, shown.at_s > 0))
 
     run(tmp_path, watch=watch, resume=folder, steps=1_536)
-    assert meanwhile == [""]
+    assert meanwhile == [("", 1_536, True)]
     assert ended.summary.env_steps > 1_000
 
 
@@ -526,9 +527,10 @@ def test_status_asks_the_learner_of_a_run_that_acts_in_the_learner(tmp_path: Pat
         asked = status("--json")
         assert asked.returncode == 0, asked.stderr
         answer = json.loads(asked.stdout)
-        assert (answer["env"], answer["total_steps"]) == ("CartPole-v1", 100_000_000)
-        assert answer["env_steps"] > 0
-        assert answer["ledger"]["used"] > 0
+        progress = answer["progress"]
+        assert (answer["env"], progress["total_steps"]) == ("CartPole-v1", 100_000_000)
+        assert progress["env_steps"] > 0
+        assert progress["ledger"]["used"] > 0
         assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in preloaded.workers_of(learner.pid)}
 
 

@@ -25,7 +25,14 @@ from millrace.learner.members.held_up import in_words
 from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
-from millrace.learner.run_folder.sentences import bottleneck, duration, per_second, went_wrong
+from millrace.learner.run_folder.sentences import (
+    bottleneck,
+    duration,
+    per_second,
+    weights_in_words,
+    went_wrong,
+    workers_here,
+)
 from millrace.learner.run_lines import RunLine, algorithm_label, headline
 from millrace.protocol.arrays import Doubles
 from millrace.protocol.bounds import escaped
@@ -201,20 +208,18 @@ def workers(seen: Seen) -> str:
         bodies.append(
             f'<tbody><tr class="line"><th scope="rowgroup" colspan="{len(COLUMNS)}">{title}</th></tr>{rows}</tbody>'
         )
-    here, wanted = len(seen.status.workers) + seen.status.workers_left_out, seen.status.workers_wanted
-    about = f"{here} here; {wanted} can have a lane each." if wanted else f"{here} here."
+    about = f"{workers_here(seen.status)}."
     table = f'<table class="runs workers"><thead><tr>{heads}</tr></thead>{"".join(bodies)}</table>'
     return section("Workers", about, f'<div class="scroll">{table}</div>', "workers")
 
 
 def _worker(worker: WorkerStatus, status: Status) -> str:
-    behind = status.version - worker.version
     strikes = f' <span class="bad">{worker.strikes} bad messages</span>' if worker.strikes else ""
     name = f'<th scope="row">{escape(worker.worker)}{strikes}</th>'
     slow = worker.doing_s >= 10 and worker.doing != "waiting"
     doing = f"<td{' class=bad' * slow}>{escape(in_words(worker.doing, worker.doing_s))}</td>"
     lanes = ", ".join(map(str, worker.lanes)) if worker.state == "active" else worker.state
-    weights = "none yet" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind"
+    weights = weights_in_words(worker.version, status.version)
     numbers = (
         per_second(worker.steps_per_s),
         f"{worker.silent_s:.0f} s ago",

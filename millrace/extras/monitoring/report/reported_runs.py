@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from millrace import Evaluation, Summary
 from millrace.extras.monitoring.report.curve import Curve, points, read_run_files
 from millrace.learner.run_folder.json_log import LoggedLine, newest_lines
 from millrace.learner.run_folder.progress_file import last_progress
 from millrace.learner.run_folder.regular_files import regular_files
-from millrace.learner.run_folder.results import EVALUATION_KEY, Evaluation, Summary
+from millrace.learner.run_folder.results import EVALUATION_KEY
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_lines import algorithm_label
 from millrace.protocol.arrays import Doubles
