@@ -43,9 +43,12 @@ from millrace.learner.run_folder.json_log import kept_log
 from millrace.learner.run_folder.lease import Owner
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.newest_run import newest_run
+from millrace.learner.run_folder.progress_file import last_progress
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_folder.run_format import END, HEAD
 from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_of_run
+from millrace.learner.run_folder.sentences import bottleneck, lag_in_words, went_wrong
+from millrace.learner.run_lines import RunLine, headline, in_sentences
 from millrace.learner.run_spec import run_spec
 from millrace.learner.run_state import RunState, restore
 from millrace.protocol.env_spec import EnvSpec
@@ -101,6 +104,14 @@ def look(run: Path) -> list[Any]:
     return [repr(found), found._repr_html_(), found.summary, found.metrics, found.config]
 
 
+def told(run: Path) -> list[str]:
+    """All that is said of a run without a summary."""
+    progress = last_progress(run, None)
+    lines = [RunLine(run, state, progress=progress) for state in ("training", "dead")]
+    said = [f"{headline(line)} {line.done} {line.left_s}" for line in lines]
+    return [*said, in_sentences(lines[1]), bottleneck(progress), went_wrong(progress.ledger), lag_in_words(progress)]
+
+
 def locked(run: Path) -> None:
     with RunLock(run, PACE, clock=lambda: 0.0, sleep=lambda seconds: None):
         pass
@@ -119,6 +130,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "plot": lambda run: draw([run]).svg,
     "load": lambda run: millrace.load(run)(OBSERVED[0][0]),
     "Run": look,
+    "told": told,
     "lock": locked,
     "status": learner_of_run,
 }
@@ -126,6 +138,7 @@ FILES = {
     "config.toml": ("resume", "resume auto", "is_finished", "evaluate", "report", "plot", "Run"),
     "run.json": ("resume", "resume auto", "is_finished", "evaluate", "report", "plot"),
     "metrics.jsonl": ("resume", "report", "plot", "Run"),
+    "progress.json": ("told", "report"),
     "log.jsonl": ("report", "resume"),
     "summary.json": ("resume", "is_finished", "report", "Run"),
     "policy.json": ("resume", "evaluate", "evaluate --best", "load"),
