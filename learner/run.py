@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import socket
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -170,7 +171,7 @@ def open_run(
     def watch_hub(listened: Hub) -> None:
         observer(listened)
         if folder.lock is None or not folder.lock.taken_over:
-            progress_file.write(listened.progress)
+            progress_file.write(listened.progress, time.time())
 
     hub = open_hub(config, spec, link, processes, setup.check_running, watch_hub, past, pool)
     if state.opponent_policies is not None and pool is not None:

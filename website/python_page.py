@@ -99,6 +99,8 @@ GROUPS = {
 """The groups, by the names of their pages"""
 WITHOUT_MEMBERS = ("Config", ".PPO", ".A2C", ".IMPALA", ".REINFORCE", ".DQN", ".SAC", ".TD3")
 """Ends of names whose members are on another page, or are those of a base"""
+WITH_INHERITED_MEMBERS = {"millrace.Progress"}
+"""Names whose base is no public name of its own"""
 
 
 def pages() -> dict[str, Callable[[], str]]:
@@ -118,9 +120,16 @@ def index() -> str:
 def page(name: str) -> str:
     """The page of a group."""
     group = GROUPS[name]
-    alone = "    options: {members: false}\n"
-    shown = (f"::: {each}\n{alone if each.endswith(WITHOUT_MEMBERS) else ''}\n" for each in names_of(group))
+    shown = (f"::: {each}\n{_options(each)}\n" for each in names_of(group))
     return f"# {group.title}\n\n{group.about}\n\n" + "".join(shown)
+
+
+def _options(name: str) -> str:
+    if name.endswith(WITHOUT_MEMBERS):
+        return "    options: {members: false}\n"
+    if name in WITH_INHERITED_MEMBERS:
+        return "    options: {inherited_members: true}\n"
+    return ""
 
 
 def names_of(group: Group) -> list[str]:

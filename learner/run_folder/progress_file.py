@@ -6,7 +6,6 @@ training loop; a power failure may cost it. What the disk refuses is dropped. On
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -27,15 +26,16 @@ EVERY_S = 1.0
 class ProgressFile:
     """The progress.json of a run that this process trains."""
 
-    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
-        """`clock` tells seconds since 1970."""
-        self._path, self._clock = folder / PROGRESS_FILE, clock
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / PROGRESS_FILE
         self._written = RunProgress()
         self._looked_s = 0.0
 
-    def write(self, progress: Callable[[], RunProgress]) -> None:
-        """Write the progress of now, if a second has passed since the last was written, and it is another one."""
-        now = self._clock()
+    def write(self, progress: Callable[[], RunProgress], now: float) -> None:
+        """Write how far the run is, if a second has passed since the last time, and something has changed.
+
+        `now`: seconds since 1970.
+        """
         if 0.0 <= now - self._looked_s < EVERY_S:
             return
         newest = replace(progress(), at_s=now)

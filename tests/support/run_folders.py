@@ -23,7 +23,7 @@ LAST_SIGN_S = 1_800_000_000.0
 
 def write_progress(run: Path, progress: RunProgress) -> None:
     """The progress.json of a run, written at `LAST_SIGN_S`."""
-    ProgressFile(run, lambda: LAST_SIGN_S).write(lambda: progress)
+    ProgressFile(run).write(lambda: progress, LAST_SIGN_S)
 
 
 def a_run(

@@ -17,70 +17,61 @@ from tests.support.run_folders import a_run
 BEGAN_S = 1_800_000_000.0
 
 
-class Clock:
-    """Tells the time that a test sets."""
-
-    now = BEGAN_S
-
-    def __call__(self) -> float:
-        return self.now
-
-
 def at(env_steps: int) -> RunProgress:
     return RunProgress(env_steps=env_steps, total_steps=100)
 
 
 def test_it_is_written_once_a_second(tmp_path: Path) -> None:
-    clock = Clock()
-    file = ProgressFile(tmp_path, clock)
-    file.write(lambda: at(10))
-    clock.now += EVERY_S / 2
-    file.write(lambda: pytest.fail("it is not even asked for"))
+    now = BEGAN_S
+    file = ProgressFile(tmp_path)
+    file.write(lambda: at(10), now)
+    now += EVERY_S / 2
+    file.write(lambda: pytest.fail("it is not even asked for"), now)
     assert last_progress(tmp_path, None) == msgspec.structs.replace(at(10), at_s=BEGAN_S)
-    clock.now += EVERY_S / 2
-    file.write(lambda: at(20))
+    now += EVERY_S / 2
+    file.write(lambda: at(20), now)
     assert last_progress(tmp_path, None) == msgspec.structs.replace(at(20), at_s=BEGAN_S + EVERY_S)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [PROGRESS_FILE]
 
 
 def test_a_clock_that_is_set_back_does_not_stop_it(tmp_path: Path) -> None:
-    clock = Clock()
-    file = ProgressFile(tmp_path, clock)
-    file.write(lambda: at(10))
-    clock.now -= 3_600.0
-    file.write(lambda: at(20))
+    now = BEGAN_S
+    file = ProgressFile(tmp_path)
+    file.write(lambda: at(10), now)
+    now -= 3_600.0
+    file.write(lambda: at(20), now)
     assert last_progress(tmp_path, None).env_steps == 20
 
 
 def test_what_has_not_changed_is_not_written_again(tmp_path: Path) -> None:
-    clock = Clock()
-    file = ProgressFile(tmp_path, clock)
-    file.write(lambda: at(10))
+    now = BEGAN_S
+    file = ProgressFile(tmp_path)
+    file.write(lambda: at(10), now)
     before = (tmp_path / PROGRESS_FILE).stat()
-    clock.now += EVERY_S
-    file.write(lambda: at(10))
+    now += EVERY_S
+    file.write(lambda: at(10), now)
     assert os.path.samestat((tmp_path / PROGRESS_FILE).stat(), before), "another file stands in its place"
 
 
 def test_what_the_disk_refuses_is_dropped_and_written_later(tmp_path: Path) -> None:
-    clock = Clock()
+    now = BEGAN_S
     run = tmp_path / "run"
-    file = ProgressFile(run, clock)
-    file.write(lambda: at(10))  # the folder was deleted
+    file = ProgressFile(run)
+    file.write(lambda: at(10), now)  # the folder was deleted
     run.mkdir()
-    clock.now += EVERY_S
-    file.write(lambda: at(20))
+    now += EVERY_S
+    file.write(lambda: at(20), now)
     assert last_progress(run, None).env_steps == 20
 
 
 def test_what_was_refused_is_written_although_nothing_has_changed_since(tmp_path: Path) -> None:
-    clock = Clock()
+    now = BEGAN_S
     run = tmp_path / "run"
-    file = ProgressFile(run, clock)
-    file.write(lambda: at(10))
+    file = ProgressFile(run)
+    file.write(lambda: at(10), now)
     run.mkdir()
-    clock.now += EVERY_S
-    file.write(lambda: at(10))
+    now += EVERY_S
+    file.write(lambda: at(10), now)
     assert last_progress(run, None).env_steps == 10
 
 
@@ -102,7 +93,7 @@ def test_no_link_is_followed_and_no_pipe_is_waited_for(tmp_path: Path) -> None:
     (run / PROGRESS_FILE).unlink()
     os.mkfifo(run / PROGRESS_FILE)
     assert last_progress(run, None) == RunProgress()
-    ProgressFile(run, Clock()).write(lambda: at(10))
+    ProgressFile(run).write(lambda: at(10), BEGAN_S)
     assert last_progress(run, None).env_steps == 10
     assert secret.read_text() == '{"env_steps": 7}'
 
