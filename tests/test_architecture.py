@@ -59,8 +59,9 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "copies": {"activity", "copy_slots"},
     "acting": {"activity"},
     "opponents": {"acting", "activity"},
-    "collect": {"activity", "acting", "conversation", "copies", "copy_slots", "opponents"},
-    "evaluate": {"acting", "activity", "copies", "opponents"},
+    "lanes": {"acting", "activity", "copies", "opponents"},
+    "collect": {"activity", "acting", "conversation", "copies", "copy_slots", "lanes", "opponents"},
+    "evaluate": {"acting", "activity", "copies", "lanes", "opponents"},
     "vector_env": {"activity", "copies"},
 }
 MILLRACE = {  # the same for each folder of the public package

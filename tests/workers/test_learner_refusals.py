@@ -446,7 +446,8 @@ def test_the_largest_rewards_make_a_return_that_the_learner_takes() -> None:
 
 
 def test_whatever_its_reason_is_a_worker_sends_no_episode_that_the_learner_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("millrace.workers.collect.seat_rows.whole_episode", lambda *_: Episode(1e300, 1, 0.0, (0.0, 0.0)))
+    counted = "millrace.workers.lanes.running_episodes.whole_episode"
+    monkeypatch.setattr(counted, lambda *_: Episode(1e300, 1, 0.0, (0.0, 0.0)))
     assert collected(Two).startswith("lane 0, copy 0, episode: expected a finite return of 1 to ")
-    monkeypatch.setattr("millrace.workers.evaluate.evaluator.whole_episode", lambda *_: Episode(1.0, 51, 0.0, (0.0, 0.0)))
+    monkeypatch.setattr(counted, lambda *_: Episode(1.0, 51, 0.0, (0.0, 0.0)))
     assert evaluated(Two).startswith("while the policy was evaluated: copy 0, episode: expected a finite return of 1 to 50")

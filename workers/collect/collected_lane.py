@@ -8,7 +8,6 @@ collector steps it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from time import perf_counter
 
@@ -29,6 +28,7 @@ from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.episode_facts import Facts
 from millrace.workers.copies.row_writers import ObservationWriter
 from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.lanes.running_episodes import RunningEpisodes
 from millrace.workers.opponents import Opponent
 
 
@@ -44,15 +44,12 @@ class CollectedLane:
         self.state = zero_state(run.policy, run.columns)  # [N, S] recurrent state of the policy
         self.state_before = self.state  # of this rollout
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
-        self.seats = SeatRows(run, number, incarnation) if run.seats else None
+        self.episodes = RunningEpisodes(run, run.copies, number)
+        self.seats = SeatRows(run, number, incarnation, self.episodes) if run.seats else None
         self._run = run
         self._seeds = copy_seeds(run.seed, number, incarnation, run.copies)
-        self._return = [0.0] * run.copies  # of the running episodes, as are the next two
-        self._length = [0] * run.copies
-        self._start_s = [0.0] * run.copies  # by perf_counter
         self._attributes = b""  # that were set in the copies
         self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended in this rollout
-        self._no_facts = (math.nan,) * len(run.facts)
         self.writer = ObservationWriter(stored_leaves(run), run.columns, run.seats)
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
@@ -77,10 +74,10 @@ class CollectedLane:
             self.writer.write(self.writer.joined(array[None] for array in self.obs), 0, leaves)
         except CopyFailed as error:
             raise environment_failed(self.number, error, "first reset") from error
-        self._start_s = [perf_counter()] * len(self._start_s)
+        self.episodes.begin(perf_counter())
         if self.seats is not None:
             assert isinstance(self.copies, SeatedCopies)
-            self.seats.start(self.copies.columns, self._start_s[0])
+            self.seats.start(self.copies.columns)
 
     def begin(self, opponent: Opponent | None) -> None:
         """A rollout begins. `opponent`: of the episodes that begin in it, if the policy plays one team alone."""
@@ -109,28 +106,9 @@ class CollectedLane:
         """
         if self.seats is not None:
             return self.seats.valid, self.seats.episodes
-        valid = ~np.concatenate([self.ended[None], done[:-1]])
-        reward[~valid] = 0.0
+        resets = np.concatenate([self.ended[None], done])
+        reward[resets[:-1]] = 0.0
         self.ended = done[-1].copy()
-        rewards = reward.T.tolist()  # by copy
-        # For each copy, the first row that is not yet added to its episode, and whether that row only resets the copy.
-        first, resets = [0] * len(rewards), (~valid[0]).tolist()
-        episodes = []
-
-        def add(n: int, end: int) -> None:
-            """Add the rows of copy n up to `end` to its episode."""
-            self._return[n] += sum(rewards[n][first[n] : end])
-            self._length[n] += end - first[n] - resets[n]  # only the first of these rows can be a reset
-            first[n], resets[n] = end, True
-
-        for t, n in np.argwhere(done).tolist():
-            add(n, t + 1)
-            if valid[t, n]:
-                facts = self._facts.get((t, n), self._no_facts)
-                episodes.append(Episode(self._return[n], self._length[n], step_end_s[t] - self._start_s[n], facts))
-            self._return[n], self._length[n], self._start_s[n] = 0.0, 0, step_end_s[t]
-        for n in range(len(rewards)):
-            if first[n] < len(step_end_s):
-                add(n, len(step_end_s))
+        ended = self.episodes.add_rows(reward, resets, step_end_s, self._facts)
         self._facts.clear()
-        return valid, tuple(episodes)
+        return ~resets[:-1], tuple(each.episode for each in ended)

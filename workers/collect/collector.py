@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.bounds import Stages
 from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.kinds_of_copies import copies_kind
@@ -25,7 +25,7 @@ from millrace.protocol.messages import Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.policy.policy import Policy
-from millrace.protocol.rollout import Rollout
+from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import RolloutActions, acting_of
 from millrace.workers.activity import ENV_CALLS, activity
@@ -176,7 +176,15 @@ class Collector:
         actions = self._acting.begin([lane.generator for lane in lanes])
         under_way = self._under_way = _UnderWay(rows, lanes, self._run.copies)
         try:
-            self._act_and_step(rows, actions, lanes, pulse)
+            try:
+                self._act_and_step(rows, actions, lanes, pulse)
+            finally:
+                self._ended_steps += under_way.env_steps()
+                self._under_way = None
+            finished = [
+                lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.step_end_s)
+                for i, lane in enumerate(lanes)
+            ]
         except (EnvironmentFailed, PolicyFailed, IndexError):
             # An invalid observation or reward may have caused the error. Then these checks raise the clearer one.
             done = len(rows.step_end_s)
@@ -184,11 +192,8 @@ class Collector:
                 check_observed(lane.number, self._stored, [array[i, : done + 1] for array in rows.obs], self._run.row_axes)
                 check_rewards(lane.number, rows.reward[i, :done], self._run.row_axes)
             raise
-        finally:
-            self._ended_steps += under_way.env_steps()
-            self._under_way = None
         return [
-            self._rollout(rows, actions, i, lane, assignment, version, session)
+            self._rollout(rows, actions, i, lane, finished[i], assignment, version, session)
             for i, (lane, assignment) in enumerate(zip(lanes, assignments, strict=True))
         ]
 
@@ -285,12 +290,13 @@ class Collector:
         actions: RolloutActions,
         i: int,
         lane: CollectedLane,
+        finished: tuple[Bools, tuple[Episode, ...]],
         assignment: Assignment,
         version: int,
         session: int,
     ) -> Rollout:
         """The rollout of lane `i`, made of views of the rows."""
-        valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.step_end_s)
+        valid, episodes = finished
         obs = tuple(array[i] for array in rows.obs)
         axes = self._run.row_axes
         check_observed(lane.number, self._stored, obs, axes)

@@ -12,23 +12,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats
-from millrace.protocol.bounds import LARGEST
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Episode
-from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, wrong_episode
+from millrace.protocol.rows.rollout_checks import LARGEST_REWARD
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import SeatColumns, StepResult
-from millrace.workers.copies.env_errors import environment_failed
-from millrace.workers.copies.episode_facts import Facts
 from millrace.workers.copies.value_checks import check_rewards
-from millrace.workers.opponents import Match, Opponent, OtherTeams, whole_episode
+from millrace.workers.lanes.running_episodes import RunningEpisodes
+from millrace.workers.opponents import Match, Opponent, OtherTeams
 
 
 class SeatRows:
     """What a lane of N copies with A seats each keeps from step to step, and the rows of the present rollout."""
 
-    def __init__(self, run: RunSpec, lane: int, incarnation: int) -> None:
+    def __init__(self, run: RunSpec, lane: int, incarnation: int, running: RunningEpisodes) -> None:
         self._run, self._seats = run, run.seats_of_copy
         self._lane, self._incarnation = lane, incarnation
         self.others: OtherTeams | None = None
@@ -41,15 +39,12 @@ class SeatRows:
         self._held: list[Array] = []  # what the policy wrote when each seat acted last
         self._held_state = zero_state(run.policy, columns)  # [N · A, S] before that
         self._resets = np.zeros(run.copies, bool)  # [N] the next step only resets the copy
-        self._return = np.zeros((run.copies, self._seats))  # of the running episodes, as is the next
-        self._length = np.zeros(run.copies, np.int64)
-        self._start_s = np.zeros(run.copies)
+        self._running = running
 
-    def start(self, first: SeatColumns, now_s: float) -> None:
+    def start(self, first: SeatColumns) -> None:
         """All copies were reset."""
         self.acts = first.acts
-        self._add(first.outside, 0)
-        self._start_s[:] = now_s
+        self._add_outside(first.outside, 0)
 
     def begin(self, state: Floats, opponent: Opponent | None) -> Floats:
         """A rollout begins, with the policy in this state [N · A, S]. Returns the state before the first rows.
@@ -85,32 +80,21 @@ class SeatRows:
         complete, self.acts, outside, over = row.columns
         self.valid[t] = complete
         self._waits &= ~complete
-        self._return += np.asarray(row.reward, np.float64).reshape(self._return.shape)
+        self._running.add(np.asarray(row.reward, np.float64).reshape(-1, self._seats), ~self._resets)
         if np.count_nonzero(outside):
-            self._add(outside, t)
-        self._length += ~self._resets
+            self._add_outside(outside, t)
         state[np.repeat(self._resets, self._seats)] = 0.0
         if self.others is not None and self._opponent is not None:
             self.others.begin(np.flatnonzero(self._resets).tolist(), self._opponent)
         self.resets[t + 1] = self._resets = over
         for n in np.flatnonzero(over).tolist():
-            self._episodes.append(self._ended(n, row.facts, now_s))
+            self._episodes.append(self._running.ended(n, now_s, row.facts.get(n), self.others).episode)
 
-    def _add(self, outside: Doubles, t: int) -> None:
+    def _add_outside(self, outside: Doubles, t: int) -> None:
         """Add rewards [N · A] of step t that are in no row to the returns. No later check sees them."""
         if not np.abs(outside).max() < LARGEST_REWARD:  # false for NaN too
             check_rewards(self._lane, outside[None], self._run.row_axes, t)
-        self._return += outside.reshape(self._return.shape)
-
-    def _ended(self, n: int, facts: Facts, now_s: float) -> Episode:
-        """The episode of copy n, which is over."""
-        of_seats: list[float] = self._return[n].tolist()
-        seconds = now_s - float(self._start_s[n])
-        episode = whole_episode(self._run, self.others, n, of_seats, int(self._length[n]), seconds, facts.get(n, ()))
-        if why := wrong_episode(episode, self._run, LARGEST):
-            raise environment_failed(self._lane, f"copy {n}, episode: {why}")
-        self._return[n], self._length[n], self._start_s[n] = 0.0, 0, now_s
-        return episode
+        self._running.returns += outside.reshape(-1, self._seats)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:

@@ -7,7 +7,6 @@ from the lanes of training. They are opened once, and reset with a seed before e
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -29,7 +28,6 @@ from millrace.protocol.policy.policy import Policy
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Episode
-from millrace.protocol.rows.rollout_checks import wrong_episode
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import acting_of
 from millrace.workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
@@ -39,7 +37,8 @@ from millrace.workers.copies.row_writers import ObservationWriter, write_numbers
 from millrace.workers.copies.seated_copies import SeatedCopies
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
 from millrace.workers.evaluate.episode_rows import RowSender, SendRows, as_frame
-from millrace.workers.opponents import KnownOpponents, Match, OtherTeams, whole_episode
+from millrace.workers.lanes.running_episodes import RunningEpisodes
+from millrace.workers.opponents import KnownOpponents, Match, OtherTeams
 
 
 class EvaluationCopies(EnvCopies, Protocol):
@@ -78,33 +77,6 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
         copies.close()
         raise UsageError(f"environment {run.env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")
     return copies
-
-
-class EpisodesSoFar:
-    """What the episodes of an order have come to so far."""
-
-    def __init__(self, run: RunSpec, order: Evaluate) -> None:
-        k = len(order.seeds)
-        self.returns = np.zeros((k, run.seats_of_copy))
-        self.cut = [False] * k  # whether they were cut at the most steps that the order allows
-        self._run, self._most_steps, self._began_s = run, order.most_steps, perf_counter()
-        self._lengths, self._seconds, self._facts = [0] * k, [0.0] * k, [(math.nan,) * len(run.info_keys)] * k
-
-    def add(self, running: Sequence[int], rewards: Array, over: Array, facts: Mapping[int, tuple[float, ...]]) -> list[int]:
-        """A step of these episodes; rewards [k, A], over [k]. Returns those of them that go on."""
-        self.returns[running] += rewards[running]
-        for n in running:
-            self._lengths[n] += 1
-            self.cut[n] = not over[n] and self._lengths[n] >= self._most_steps
-            if over[n] or self.cut[n]:
-                self._seconds[n] = perf_counter() - self._began_s
-                self._facts[n] = facts.get(n, self._facts[n])
-        return [n for n in running if not (over[n] or self.cut[n])]
-
-    def episodes(self, others: OtherTeams | None) -> tuple[Episode, ...]:
-        """All episodes, which have ended."""
-        figures = zip(self.returns.tolist(), self._lengths, self._seconds, self._facts, strict=True)
-        return tuple(whole_episode(self._run, others, n, *of_episode) for n, of_episode in enumerate(figures))
 
 
 class Evaluator:
@@ -160,7 +132,11 @@ class Evaluator:
         obs = tuple(np.empty((1, k * A, *leaf.shape), leaf.dtype) for leaf in self._stored)
         state, drawn = zero_state(policy, 1, k * A), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
         senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
-        played, running, t = EpisodesSoFar(self._run, order), list(range(k)), 0
+        played = RunningEpisodes(self._run, k, None, order.most_steps)
+        found: dict[int, Episode] = {}
+        cut = [False] * k
+        running, t = list(range(k)), 0
+        played.begin(perf_counter())
         self._write(obs, running, copies.reset(order.seeds, pulse), 0, "first reset")
         if isinstance(copies, SeatedCopies):
             outside = copies.columns.outside[: k * A]
@@ -186,18 +162,22 @@ class Evaluator:
             self._write(obs, running, step.leaves, t + 1, f"step {t}")
             if isinstance(copies, SeatedCopies) and t + 1 == order.most_steps:  # those that go on are cut
                 self._add_pending(rewards, copies, running, t)
-            going_on = played.add(running, rewards, terminated | truncated, step.facts)
+            is_playing = np.zeros(k, bool)
+            is_playing[running] = True
+            played.add(np.where(is_playing[:, None], rewards, 0.0), is_playing)
+            now_s, over = perf_counter(), terminated | truncated
+            for n in running:
+                cut[n] = not over[n] and int(played.lengths[n]) >= order.most_steps
+                if over[n] or cut[n]:
+                    found[n] = played.ended(n, now_s, step.facts.get(n), others).episode
+            going_on = [n for n in running if n not in found]
             for n in running if senders else ():
                 self._observe(senders[n], obs, n, copies)
                 acted = chosen.reshape(k, A, *chosen.shape[1:])[n] if self._run.seats else chosen[n]
-                senders[n].step(acted, float(rewards[n].sum()), bool(terminated[n]), bool(truncated[n]) or played.cut[n])
+                senders[n].step(acted, float(rewards[n].sum()), bool(terminated[n]), bool(truncated[n]) or cut[n])
             self.steps += len(running)
             running, t = going_on, t + 1
-        episodes = played.episodes(others)
-        for n, episode in enumerate(episodes):
-            if why := wrong_episode(episode, self._run, order.most_steps):
-                raise environment_failed(None, f"copy {n}, episode: {why}")
-        return Evaluated(order.session, order.ticket, episodes, tuple(played.cut))
+        return Evaluated(order.session, order.ticket, tuple(found[n] for n in range(k)), tuple(cut))
 
     def _step(
         self, copies: EvaluationCopies, actions: Array, running: Sequence[int], t: int, pulse: Pulse

@@ -1,0 +1,115 @@
+"""The episodes that env copies are playing: the one place where rewards are summed and steps are counted.
+
+Rule: the arrays of `RunningEpisodes` are all that is known of an episode before it ends. Returns are sums in float64, before
+any reward is rounded. What is returned as an episode is what a learner takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.bounds import LARGEST
+from millrace.protocol.rollout import Episode
+from millrace.protocol.rows.rollout_checks import wrong_episode
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_errors import environment_failed
+from millrace.workers.opponents import OtherTeams, whole_episode
+
+FactsOfRows = Mapping[tuple[int, int], tuple[float, ...]]
+"""By row and copy: the facts of the episode that ended there."""
+
+
+class EndedEpisode(NamedTuple):
+    """An episode, and the number of the copy that played it."""
+
+    copy: int
+    episode: Episode
+
+
+class RunningEpisodes:
+    """What the running episodes of N copies, with A seats each, have come to so far."""
+
+    def __init__(self, run: RunSpec, copies: int, lane: int | None, most_steps: int = LARGEST) -> None:
+        """`lane`: as errors name it, None for an evaluation. `most_steps`: an episode that reaches so many is cut."""
+        self.returns = np.zeros((copies, run.seats_of_copy))
+        """[N, A] float64: the sum of each seat's rewards"""
+        self.lengths = np.zeros(copies, np.int64)
+        """[N] steps"""
+        self.began_s = np.zeros(copies)
+        """[N] when the copy's last episode ended, or its first one began, by perf_counter"""
+        self.most_steps = most_steps
+        self._run = run
+        self._lane = lane
+        self._no_facts = (math.nan,) * len(run.info_keys)
+
+    def begin(self, now_s: float) -> None:
+        """All copies have been reset."""
+        self.began_s[:] = now_s
+
+    def add(self, rewards: Array, playing: Bools) -> None:
+        """One step of these copies [N], with rewards [N, A], which are 0 for seats that got none."""
+        self.returns += rewards
+        self.lengths += playing
+
+    def add_rows(self, reward: Array, resets: Bools, step_end_s: Sequence[float], facts: FactsOfRows) -> list[EndedEpisode]:
+        """T steps of copies with one agent each. Returns the episodes that ended, ordered by step, then by copy.
+
+        As `add` and `ended` for each row, but it sums the rewards of a copy's rows before it adds them to the return: that
+        is several times faster. `reward` [T, N] is 0 where a row only resets. `resets` [T+1, N]: whether row t only resets
+        the copy; the last row is of the next step. `step_end_s` [T] is when each step ended.
+        """
+        rewards = reward.T.tolist()  # by copy
+        returns = self.returns[:, 0].tolist()
+        lengths = self.lengths.tolist()
+        began_s = self.began_s.tolist()
+        # For each copy, the first row that is not yet added to its episode, and whether that row only resets the copy.
+        first = [0] * len(rewards)
+        only_resets = resets[0].tolist()
+        found = []
+
+        def add(n: int, end: int) -> None:
+            """Add the rows of copy n up to `end` to its episode."""
+            returns[n] += sum(rewards[n][first[n] : end])
+            lengths[n] += end - first[n] - only_resets[n]  # only the first of these rows can be a reset
+            first[n] = end
+            only_resets[n] = True
+
+        for t, n in np.argwhere(resets[1:]).tolist():
+            add(n, t + 1)
+            if not resets[t, n]:
+                seconds = step_end_s[t] - began_s[n]
+                of_info = facts.get((t, n), self._no_facts)
+                found.append(EndedEpisode(n, self._checked(n, Episode(returns[n], lengths[n], seconds, of_info))))
+            returns[n] = 0.0
+            lengths[n] = 0
+            began_s[n] = step_end_s[t]
+        for n in range(len(rewards)):
+            if first[n] < len(step_end_s):
+                add(n, len(step_end_s))
+        self.returns[:, 0] = returns
+        self.lengths[:] = lengths
+        self.began_s[:] = began_s
+        return found
+
+    def ended(
+        self, n: int, now_s: float, of_info: tuple[float, ...] | None, others: OtherTeams | None = None
+    ) -> EndedEpisode:
+        """The episode of copy n is over, or was cut. `of_info`: facts that the environment reports; None: it was cut."""
+        returns: list[float] = self.returns[n].tolist()
+        seconds = now_s - float(self.began_s[n])
+        facts = self._no_facts if of_info is None else of_info
+        episode = whole_episode(self._run, others, n, returns, int(self.lengths[n]), seconds, facts)
+        self.returns[n] = 0.0
+        self.lengths[n] = 0
+        self.began_s[n] = now_s
+        return EndedEpisode(n, self._checked(n, episode))
+
+    def _checked(self, n: int, episode: Episode) -> Episode:
+        if why := wrong_episode(episode, self._run, self.most_steps):
+            raise environment_failed(self._lane, f"copy {n}, episode: {why}")
+        return episode
