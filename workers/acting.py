@@ -34,24 +34,31 @@ class ActedRows(NamedTuple):
     """[T, N, *shape] each"""
 
 
-class RolloutActions(Protocol):
-    """The actions of one rollout of each of L lanes, step by step."""
+class StepActions(Protocol):
+    """The actions of L lanes, step by step."""
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
-        """Choose, and keep, the actions [L, N, *action] of step t in observations [L, N, *leaf]. Updates state [L, N, S]."""
+        """Choose the actions [L, N, *action] of step t in observations [L, N, *leaf]. Updates state [L, N, S].
+
+        The array is new: who gets it may change it.
+        """
         ...
+
+    def written(self, i: int) -> list[Array]:
+        """All arrays [T, N, …] of lane i in which `act` keeps what it chose, one row for each step."""
+        ...
+
+
+class RolloutActions(StepActions, Protocol):
+    """The actions of one rollout of each of L lanes, which are kept."""
 
     def columns(self, i: int) -> ActedRows:
         """After T steps: those of lane i."""
         ...
 
-    def written(self, i: int) -> list[Array]:
-        """All arrays [T, N, …] of lane i that `act` writes, one row for each step."""
-        ...
-
 
 class Acting(Protocol):
-    """A policy as the collector and the evaluator use it."""
+    """A policy as it acts in rollouts, in evaluations and for opponents."""
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Use these weights from now on."""

@@ -93,6 +93,20 @@ class EnvCopies(Protocol):
         ...
 
 
+class EvaluationCopies(EnvCopies, Protocol):
+    """Env copies of which those are stepped whose episodes run; no step resets a copy."""
+
+    count: int
+
+    def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
+        """Step these copies, with an action for each of them. The result has a row for every copy."""
+        ...
+
+    def render(self, copy: int) -> Any:
+        """What the environment renders. Raises `ValueError` if it cannot."""
+        ...
+
+
 def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
     """Raise `UsageError` unless the copies have the spaces of the run's policy, and its agents."""
     observation, action, policy = copies.observation_space, copies.action_space, run.policy

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+
 from millrace.protocol.envs.kinds_of_copies import CopiesKind
 from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.specs import RunSpec
@@ -12,7 +17,14 @@ from millrace.workers.copies.seated_copies import SeatedCopies
 
 def open_loop(run: RunSpec, first: EnvCopy, pulse: Pulse) -> LoopedCopies:
     """Make the copies of a lane."""
-    makes = [run.env.make] * run.copies
+    return loop_over(run, run.env.make, run.copies, first, pulse)
+
+
+def loop_over(
+    run: RunSpec, make: Callable[[], gymnasium.Env[Any, Any]], count: int, first: EnvCopy, pulse: Pulse
+) -> LoopedCopies:
+    """Make so many copies of a run."""
+    makes = [make] * count
     keys = run.policy.critic_keys
     if run.seats:
         return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Protocol, TypeVar
 
 
-class Lane(Protocol):
+class OpenLane(Protocol):
     """Env copies that are stepped together."""
 
     incarnation: int
@@ -21,7 +21,7 @@ class Lane(Protocol):
         ...
 
 
-L = TypeVar("L", bound=Lane)
+L = TypeVar("L", bound=OpenLane)
 
 
 class OpenLanes(dict[int, L]):

@@ -25,7 +25,10 @@ class RowSender:
 
     def __init__(self, order: Evaluate, episode: int, policy: PolicySpec, send: SendRows) -> None:
         """`episode` is the index of its seed."""
-        self._order, self._episode, self._policy, self._send = order, episode, policy, send
+        self.episode = episode
+        self._order = order
+        self._policy = policy
+        self._send = send
         self._first_step = 0
         self._obs: list[tuple[Array, ...]] = []
         self._frames: list[Array] = []
@@ -66,7 +69,7 @@ class RowSender:
             EpisodeRows(
                 session=order.session,
                 ticket=order.ticket,
-                episode=self._episode,
+                episode=self.episode,
                 first_step=self._first_step,
                 obs=tuple(np.stack(leaf) for leaf in zip(*self._obs, strict=True)),
                 action=np.stack(actions).astype(spec.action.stored_dtype, copy=False),

@@ -9,51 +9,34 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any, Protocol
 
 import numpy as np
 
-from millrace.protocol.arrays import Array
-from millrace.protocol.envs.env_actions import action_converter_of
-from millrace.protocol.envs.seats import columns_of
+from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.errors import UsageError
 from millrace.protocol.messages import Evaluate, Evaluated, Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.policy.policy import Policy
-from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.random_streams import Purpose, generator
-from millrace.protocol.rollout import Episode
 from millrace.protocol.specs import RunSpec
-from millrace.workers.acting import acting_of
-from millrace.workers.copies.env_copies import EnvCopies, Leaves, LoopedCopies, StepResult, check_spaces
+from millrace.workers.acting import Acting
+from millrace.workers.copies.env_copies import EvaluationCopies, check_spaces
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.row_writers import ObservationWriter, write_numbers
-from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.copies.looped_kind import loop_over
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
 from millrace.workers.evaluate.episode_rows import RowSender, SendRows, as_frame
-from millrace.workers.lanes.running_episodes import RunningEpisodes
+from millrace.workers.lanes.lane import Lane
+from millrace.workers.lanes.rows import EpisodesLost, Rows, RowsOfLane
+from millrace.workers.lanes.runner import LaneRunner
+from millrace.workers.lanes.running_episodes import EndedEpisode
 from millrace.workers.opponents import KnownOpponents, Match, OtherTeams
-
-
-class EvaluationCopies(EnvCopies, Protocol):
-    """Env copies of which those are stepped whose episodes run; no step resets a copy."""
-
-    count: int
-
-    def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """Step these copies, with an action for each of them. The result has a row for every copy."""
-        ...
-
-    def render(self, copy: int) -> Any:
-        """What the environment renders. Raises `ValueError` if it cannot."""
-        ...
-
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
 """Makes this number of copies, with this render mode."""
@@ -65,13 +48,7 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
     with warnings.catch_warnings():
         if render_mode is not None:
             warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
-        makes, first, keys = [make] * count, EnvCopy(evaluation=True), run.policy.critic_keys
-        if run.seats:
-            copies: LoopedCopies = SeatedCopies(
-                makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first
-            )
-        else:
-            copies = LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
+        copies = loop_over(run, make, count, EnvCopy(evaluation=True), pulse)
     modes = (copies.envs[0].metadata or {}).get("render_modes", [])  # None: as some environments of the old package gym
     if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
         copies.close()
@@ -90,12 +67,11 @@ class Evaluator:
         """number of env steps made"""
         self.seconds = 0.0
         """seconds spent in `play`"""
-        self._run, self._open_copies = run, open_copies
-        self._acting = acting_of(run, policy)
+        self._run = run
         self._stored = stored_leaves(run)
+        self._runner = LaneRunner(run, policy)
+        self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
-        self._writer = ObservationWriter(self._stored, 1, run.seats)
-        self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
     def play(
@@ -108,9 +84,9 @@ class Evaluator:
         """
         began_s = perf_counter()
         try:
-            while (answer := self._play(order, send, pulse, self._other_teams(order, held))) is None:
-                pass  # the episodes of lost copies are played again from their seeds
-            return answer
+            while True:
+                with suppress(EpisodesLost):  # they are played again from their seeds
+                    return self._play(order, send, pulse, self._other_teams(order, held))
         except CopyFailed as error:
             self.close()
             raise environment_failed(None, error) from error
@@ -125,92 +101,41 @@ class Evaluator:
         while self._copies:
             self._copies.popitem()[1].close()
 
-    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, others: OtherTeams | None) -> Evaluated | None:
-        """The answer; None if a worker was lost, and with it copies whose episodes had not ended."""
-        k, A, policy = len(order.seeds), self._run.seats_of_copy, self._run.policy
+    def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, others: OtherTeams | None) -> Evaluated:
+        """Raises `EpisodesLost`."""
+        run = self._run
+        k = len(order.seeds)
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
-        obs = tuple(np.empty((1, k * A, *leaf.shape), leaf.dtype) for leaf in self._stored)
-        state, drawn = zero_state(policy, 1, k * A), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
-        senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
-        played = RunningEpisodes(self._run, k, None, order.most_steps)
-        found: dict[int, Episode] = {}
-        cut = [False] * k
-        running, t = list(range(k)), 0
-        played.begin(perf_counter())
-        self._write(obs, running, copies.reset(order.seeds, pulse), 0, "first reset")
-        if isinstance(copies, SeatedCopies):
-            outside = copies.columns.outside[: k * A]
-            check_rewards(None, outside[None], self._run.row_axes)
-            played.returns += outside.reshape(k, A)
-        for n, sender in enumerate(senders):
-            self._observe(sender, obs, n, copies)
-        while running:
-            pulse()
-            acts = copies.columns.acts[: k * A] if isinstance(copies, SeatedCopies) else None
-            with np.errstate(all="ignore"):
-                before = state if acts is None else state.copy()
-                chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
-                taken = self._to_env_action(chosen).astype(policy.action.dtype, copy=others is not None)
-                if acts is not None:
-                    state[0][~acts] = before[0][~acts]
-                    if others is not None:
-                        others.act([leaf[0] for leaf in obs], acts, taken)
-            self._check_acted(chosen, running, obs, t)
-            if (made := self._step(copies, taken, running, t, pulse)) is None:
-                return None
-            step, rewards, terminated, truncated = made
-            self._write(obs, running, step.leaves, t + 1, f"step {t}")
-            if isinstance(copies, SeatedCopies) and t + 1 == order.most_steps:  # those that go on are cut
-                self._add_pending(rewards, copies, running, t)
-            is_playing = np.zeros(k, bool)
-            is_playing[running] = True
-            played.add(np.where(is_playing[:, None], rewards, 0.0), is_playing)
-            now_s, over = perf_counter(), terminated | truncated
-            for n in running:
-                cut[n] = not over[n] and int(played.lengths[n]) >= order.most_steps
-                if over[n] or cut[n]:
-                    found[n] = played.ended(n, now_s, step.facts.get(n), others).episode
-            going_on = [n for n in running if n not in found]
-            for n in running if senders else ():
-                self._observe(senders[n], obs, n, copies)
-                acted = chosen.reshape(k, A, *chosen.shape[1:])[n] if self._run.seats else chosen[n]
-                senders[n].step(acted, float(rewards[n].sum()), bool(terminated[n]), bool(truncated[n]) or cut[n])
-            self.steps += len(running)
-            running, t = going_on, t + 1
-        return Evaluated(order.session, order.ticket, tuple(found[n] for n in range(k)), tuple(cut))
-
-    def _step(
-        self, copies: EvaluationCopies, actions: Array, running: Sequence[int], t: int, pulse: Pulse
-    ) -> tuple[StepResult, Array, Array, Array] | None:
-        """Step the running copies: the result, rewards [k, A], terminated and truncated [k]. None if one of them was lost.
-
-        The environments may keep their actions, so `actions` must be a new array at each step.
-        """
-        rows, A = len(actions), self._run.seats_of_copy
-        numbers = np.zeros(rows), np.zeros(rows, bool), np.zeros(rows, bool)
-        try:
-            step = copies.step(actions[self._columns(running)], pulse, running)
-            if step.lost is not None and step.lost[running].any():
-                return None
-            write_numbers(numbers, slice(None), (step.reward[:rows], step.terminated[:rows], step.truncated[:rows]))
-        except CopyFailed as error:
-            raise environment_failed(None, error, f"step {t}") from error
-        if (columns := step.columns) is not None:
-            numbers[0][:] += columns.outside[:rows]
-        check_rewards(None, numbers[0][None], self._run.row_axes, t)
-        rewards, terminated, truncated = (array.reshape(-1, A) for array in numbers)
-        if columns is None:
-            return step, rewards, terminated[:, 0], truncated[:, 0]
-        over = columns.over[: rows // A]
-        return step, rewards, over, np.zeros_like(over)
-
-    def _add_pending(self, rewards: Array, copies: SeatedCopies, running: Sequence[int], t: int) -> None:
-        """Add what seats have got that wait for the move after step t to rewards [k, A]: no later step will return it."""
-        pending = np.zeros_like(rewards)
-        for n in running:
-            pending[n] = copies.pending(n)
-        check_rewards(None, pending.reshape(1, -1), self._run.row_axes, t)
-        rewards += pending
+        drawn = generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
+        lane = Lane(run, copies, order.seeds, drawn, number=None, most_steps=order.most_steps)
+        lane.others = others
+        lane.reset(pulse)
+        rows = Rows(run, [lane], 1)
+        (of_lane,) = rows.of_lanes
+        self._check_observed(of_lane, 0, 0)
+        senders = []
+        if order.send_rows or order.send_frames:
+            senders = [RowSender(order, n, run.policy, send) for n in range(k)]
+        for sender in senders:
+            self._observe(sender, of_lane, 0)
+        actions = _PlayedActions(run, self._runner.acting, rows, greedy=order.greedy)
+        found: dict[int, EndedEpisode] = {}
+        while lane.playing.any():
+            playing = np.flatnonzero(lane.playing).tolist()
+            self._runner.run(rows, actions, pulse)
+            self.steps += len(playing)
+            check_rewards(None, of_lane.reward, run.row_axes, rows.first_step)
+            self._check_observed(of_lane, 1, rows.first_step + 1)
+            found |= {each.copy: each for each in of_lane.ended}
+            if senders:
+                for n in playing:
+                    self._observe(senders[n], of_lane, 1)
+                    self._send_row(senders[n], of_lane, actions.chosen, cut=n in found and found[n].cut)
+            rows.begin_again()
+        ended = [found[n] for n in range(k)]
+        return Evaluated(
+            order.session, order.ticket, tuple(each.episode for each in ended), tuple(each.cut for each in ended)
+        )
 
     def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
         """The other teams, if the order says who plays them."""
@@ -229,30 +154,62 @@ class Evaluator:
         check_spaces(self._run, copies)
         return copies
 
-    def _columns(self, copies: Sequence[int]) -> Sequence[int]:
-        """The columns of the seats of these copies."""
-        return columns_of(copies, self._run.seats_of_copy)
+    def _check_observed(self, rows: RowsOfLane, row: int, step: int) -> None:
+        """Check the observations of this row, which are number `step` of their episodes."""
+        newest = [leaf[row : row + 1] for leaf in rows.obs]
+        check_observed(None, self._stored, newest, self._run.row_axes, step)
 
-    def _write(self, obs: tuple[Array, ...], copies: Sequence[int], leaves: Leaves, t: int, doing: str) -> None:
-        """Write the observations of these copies to their places in the batch: number `t` of their episodes."""
+    def _observe(self, sender: RowSender, rows: RowsOfLane, row: int) -> None:
+        """Add an observation of the sender's episode to what it sends."""
+        n = sender.episode
+        shown = [self._of_copy(n, leaf[row]) for leaf in rows.obs[: len(self._run.policy.observation)]]  # no mask, for one
+        copies: EvaluationCopies = rows.lane.copies  # type: ignore[assignment]
         try:
-            self._writer.write_some([array[0] for array in obs], self._columns(copies), leaves)
-        except CopyFailed as error:
-            raise environment_failed(None, error, doing) from error
-        check_observed(None, self._stored, obs, self._run.row_axes, t)
-
-    def _check_acted(self, chosen: Array, running: Sequence[int], obs: tuple[Array, ...], t: int) -> None:
-        """As in training. The action of a copy whose episode has ended does not count."""
-        if chosen.dtype.kind == "f":
-            acted, columns = np.zeros_like(chosen), self._columns(running)
-            acted[columns] = chosen[columns]
-            check_acted(None, "action", acted[None], obs, self._run.row_axes, t)
-
-    def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
-        shown = obs[: len(self._run.policy.observation)]  # without the mask, and what only the critic sees
-        A = self._run.seats_of_copy
-        leaves = [leaf[0, n * A : (n + 1) * A] if self._run.seats else leaf[0, n] for leaf in shown]
-        try:
-            sender.observe(leaves, as_frame(copies.render(n)) if sender.wants_frame else None)
+            sender.observe(shown, as_frame(copies.render(n)) if sender.wants_frame else None)
         except ValueError as error:
             raise environment_failed(None, f"copy {n}, {error}") from error
+
+    def _send_row(self, sender: RowSender, rows: RowsOfLane, chosen: Array, *, cut: bool) -> None:
+        """Add the row of the sender's episode to what it sends. `chosen` [k · A, *action]: the actions of all copies."""
+        n = sender.episode
+        if rows.columns is not None:
+            terminated, truncated = rows.columns.over[n], False
+        else:
+            terminated, truncated = rows.terminated[0, n], rows.truncated[0, n]
+        reward = rows.reward[0].reshape(-1, self._run.seats_of_copy)[n].sum()
+        sender.step(self._of_copy(n, chosen), float(reward), bool(terminated), bool(truncated) or cut)
+
+    def _of_copy(self, n: int, columns: Array) -> Array:
+        """What an array [k · A, …] has for copy n: an entry for each seat, or without seats the entry itself."""
+        A = self._run.seats_of_copy
+        return columns[n * A : (n + 1) * A] if self._run.seats else columns[n]
+
+
+class _PlayedActions:
+    """The actions of an evaluation. They are checked before an environment gets them, and only the newest are kept."""
+
+    def __init__(self, run: RunSpec, acting: Acting, rows: Rows, *, greedy: bool) -> None:
+        self.chosen: Array
+        """[k · A, *action] of the newest step"""
+        self._run = run
+        self._acting = acting
+        self._rows = rows
+        self._lane = rows.of_lanes[0].lane
+        self._greedy = greedy
+
+    def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
+        """Choose the actions [1, k · A, *action]. Raises `EnvironmentFailed` if they are not finite.
+
+        The action of a copy whose episode has ended does not count.
+        """
+        self.chosen = self._acting.choose(obs, state, self._lane.generator, greedy=self._greedy)
+        if self.chosen.dtype.kind == "f":
+            acted = np.zeros_like(self.chosen)
+            playing = np.repeat(self._lane.playing, self._run.seats_of_copy)
+            acted[playing] = self.chosen[playing]
+            check_acted(None, "action", acted[None], obs, self._run.row_axes, self._rows.first_step + t)
+        return self.chosen[None].copy()
+
+    def written(self, i: int) -> list[Array]:
+        """None: nobody learns from them."""
+        return []

@@ -25,10 +25,13 @@ FactsOfRows = Mapping[tuple[int, int], tuple[float, ...]]
 
 
 class EndedEpisode(NamedTuple):
-    """An episode, and the number of the copy that played it."""
+    """An episode, and how it came about."""
 
     copy: int
+    """number of the copy that played it"""
     episode: Episode
+    cut: bool = False
+    """whether it was ended here, at the most steps that it may have"""
 
 
 class RunningEpisodes:
@@ -97,9 +100,9 @@ class RunningEpisodes:
         return found
 
     def ended(
-        self, n: int, now_s: float, of_info: tuple[float, ...] | None, others: OtherTeams | None = None
+        self, n: int, now_s: float, of_info: tuple[float, ...] | None, others: OtherTeams | None, *, cut: bool = False
     ) -> EndedEpisode:
-        """The episode of copy n is over, or was cut. `of_info`: facts that the environment reports; None: it was cut."""
+        """The episode of copy n is over. `of_info`: facts that the environment reports, if it does. `others`: who played."""
         returns: list[float] = self.returns[n].tolist()
         seconds = now_s - float(self.began_s[n])
         facts = self._no_facts if of_info is None else of_info
@@ -107,7 +110,7 @@ class RunningEpisodes:
         self.returns[n] = 0.0
         self.lengths[n] = 0
         self.began_s[n] = now_s
-        return EndedEpisode(n, self._checked(n, episode))
+        return EndedEpisode(n, self._checked(n, episode), cut)
 
     def _checked(self, n: int, episode: Episode) -> Episode:
         if why := wrong_episode(episode, self._run, self.most_steps):

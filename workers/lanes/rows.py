@@ -1,0 +1,267 @@
+"""The rows of lanes that are stepped together, while they are written.
+
+Rule: a step fills one row of every lane. When all rows are filled, they keep the row format (`protocol/rollout.py`), and the
+running episodes of each lane have come as far as its rows. The part of a row that belongs to a copy which was not stepped
+shows what the copy showed before, and nothing that happened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.envs.seats import columns_of
+from millrace.protocol.policy.masks import stored_leaves
+from millrace.protocol.specs import RunSpec
+from millrace.workers.activity import ENV_CALLS, activity
+from millrace.workers.copies.env_copies import EvaluationCopies, SeatColumns, StepResult
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.row_writers import write_numbers
+from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.lanes.lane import Lane
+from millrace.workers.lanes.running_episodes import EndedEpisode
+
+
+class EpisodesLost(Exception):
+    """Copies were lost with their worker, and with them episodes of an evaluation."""
+
+
+class Rows:
+    """T rows of L lanes. N · A is the number of columns of each lane."""
+
+    def __init__(self, run: RunSpec, lanes: Sequence[Lane], steps: int) -> None:
+        """T is `steps`. The first observations and the states are those of the lanes."""
+        T, shape = steps, (len(lanes), steps, lanes[0].columns)
+        self.steps = steps
+        self.first_step = 0
+        """the number of the first row's step, as errors name it"""
+        self.obs = tuple(np.empty((shape[0], T + 1, shape[2], *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))
+        """[L, T+1, N · A, *leaf] each; in a masked run the last one is the mask"""
+        self.state: Floats = np.stack([lane.state for lane in lanes])
+        """[L, N · A, S] recurrent state of the policy, updated at each step"""
+        self.reward = np.empty(shape)
+        """[L, T, N · A] float64, so that returns are summed before they are rounded"""
+        self.terminated = np.empty(shape, bool)
+        self.truncated = np.empty(shape, bool)
+        """[L, T, N · A] each"""
+        self.resets = np.zeros((shape[0], T + 1, lanes[0].count), bool)
+        """[L, T+1, N] whether step t belongs to no episode: it only resets the copy, or leaves it as it is"""
+        self.step_end_s: list[float] = []
+        """[T] by perf_counter"""
+        self.of_lanes = [RowsOfLane(run, self, i, lane) for i, lane in enumerate(lanes)]
+        self._calls = activity().numbers
+        self._calls_before_row = 0
+
+    def begin_row(self) -> None:
+        """The row before is whole, and the next one begins."""
+        self._calls_before_row = self._calls[ENV_CALLS]
+
+    def begin_again(self) -> None:
+        """Where these rows end, the next ones begin, in the same arrays."""
+        self.first_step += self.steps
+        self.step_end_s.clear()
+        for array in self.obs:
+            array[:, 0] = array[:, -1]
+        for each in self.of_lanes:
+            each.begin()
+
+    def env_steps(self) -> int:
+        """Env steps made, also those of a row that is not whole.
+
+        The count never falls, and only calls of the environment that have returned are in it.
+        """
+        whole = len(self.step_end_s)
+        if whole == self.steps:
+            return self._of_rows(whole)
+        before, after = self._of_rows(whole), self._of_rows(whole + 1)
+        # Calls in this row that have returned. At worst the copies that it resets were called first.
+        calls = self._calls[ENV_CALLS] - self._calls_before_row
+        resets = sum(each.lane.count for each in self.of_lanes) - (after - before)
+        return min(after, before + max(0, calls - resets))
+
+    def _of_rows(self, rows: int) -> int:
+        """Of so many rows. It is known before a row is made which copies that row only resets."""
+        return sum(rows * each.lane.count - each.resets_in(rows) for each in self.of_lanes)
+
+
+class RowsOfLane:
+    """The part of the rows that belongs to one lane."""
+
+    def __init__(self, run: RunSpec, rows: Rows, i: int, lane: Lane) -> None:
+        """`i`: which of the lanes it is."""
+        self.lane = lane
+        self.obs = tuple(array[i] for array in rows.obs)
+        self.state = rows.state[i]
+        self.reward = rows.reward[i]
+        self.terminated = rows.terminated[i]
+        self.truncated = rows.truncated[i]
+        self.resets = rows.resets[i]
+        self.valid: Bools = np.zeros(self.reward.shape, bool)
+        """[T, N · A]"""
+        self.ended: list[EndedEpisode] = []
+        """ordered by step, then by copy"""
+        self.columns: SeatColumns | None = None
+        """of the newest step, with seats"""
+        self._rows = rows
+        self._seats = run.seats_of_copy
+        self._numbers = (self.reward, self.terminated, self.truncated)
+        self._joined = lane.writer.joined(self.obs)
+        self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended
+        for array, newest in zip(self.obs, lane.obs, strict=True):
+            array[0] = newest
+        self.begin()
+
+    def begin(self) -> None:
+        """No row is written yet."""
+        self.resets[0] = ~self.lane.playing
+        self.ended.clear()
+        self._facts.clear()
+
+    def pass_on(self) -> None:
+        """Leave to the lane what its next rows begin with."""
+        self.lane.obs = tuple(array[-1].copy() for array in self.obs)
+        self.lane.state = self.state.copy()
+
+    def resets_in(self, rows: int) -> int:
+        """How many of the steps of the copies, in so many rows, belong to no episode."""
+        if self.lane.seats is not None:
+            return int(np.count_nonzero(self.resets[:rows]))
+        if not rows:
+            return 0
+        ended = self.terminated[: rows - 1] | self.truncated[: rows - 1]  # [rows - 1, N]
+        return int(np.count_nonzero(self.resets[0]) + np.count_nonzero(ended))
+
+    # ------------------------------------------------------------------------------------------ one step
+
+    def acted(self, t: int, written: Sequence[Array], before: Floats, taken: Array) -> None:
+        """With seats: the policy has written its row t, and was in the state `before`. Those of other teams act too.
+
+        `taken`: the actions [N · A, *action] for the environment.
+        """
+        lane = self.lane
+        assert lane.seats is not None
+        if lane.others is not None:
+            lane.others.act([leaf[t] for leaf in self.obs], lane.seats.acts, taken)
+        lane.seats.acted(t, written, before, self.state)
+
+    def step(self, t: int, actions: Array, pulse: Pulse) -> None:
+        """Step the copies with actions [N · A, *action], and write what they return."""
+        lane = self.lane
+        try:
+            if lane.autoresets:
+                result = lane.copies.step(actions, pulse)
+                write_numbers(self._numbers, t, (result.reward, result.terminated, result.truncated))
+                lane.writer.write(self._joined, t + 1, result.leaves)
+                self.columns = result.columns
+            else:
+                result = self._step_playing(t, actions, pulse)
+        except CopyFailed as error:
+            raise environment_failed(lane.number, error, f"step {self._rows.first_step + t}") from error
+        if result.facts:
+            for n, of_copy in result.facts.items():
+                self._facts[t, n] = of_copy
+        if result.lost is not None:
+            self._lose(t, result.lost)
+
+    def _step_playing(self, t: int, actions: Array, pulse: Pulse) -> StepResult:
+        """Step the copies whose episodes go on, and write their part of the row. There may be more copies than the lane's.
+
+        Nobody learns from these rows, so rewards that are outside of any row of a seat are in them too.
+        """
+        lane = self.lane
+        copies: EvaluationCopies = lane.copies  # type: ignore[assignment]
+        playing = np.flatnonzero(lane.playing).tolist()
+        columns = columns_of(playing, self._seats)
+        result = copies.step(actions[columns], pulse, playing)
+        of_lane = slice(lane.columns)
+        write_numbers(self._numbers, t, (result.reward[of_lane], result.terminated[of_lane], result.truncated[of_lane]))
+        still = ~np.repeat(lane.playing, self._seats)
+        if (seats := result.columns) is not None:
+            self.reward[t] += seats.outside[of_lane]
+            self.columns = SeatColumns(
+                complete=seats.complete[of_lane] & ~still,
+                acts=seats.acts[of_lane],
+                outside=np.zeros(lane.columns),
+                over=seats.over[: lane.count] & lane.playing,
+            )
+        for array in self._numbers:
+            array[t, still] = 0
+        for array in self.obs:
+            array[t + 1] = array[t]
+        lane.writer.write_some([array[t + 1] for array in self.obs], columns, result.leaves)
+        return result
+
+    def _lose(self, t: int, lost: Bools) -> None:
+        """These copies [N] were lost in step `t`: their episodes are truncated at the last step that was made.
+
+        Rows `t` and `t + 1` are then not valid, because step `t` was not made. Raises `EpisodesLost` in an evaluation, whose
+        episodes must be whole.
+        """
+        if not self.lane.autoresets:
+            if (lost[: self.lane.count] & self.lane.playing).any():
+                raise EpisodesLost
+            return
+        self.truncated[t] |= lost
+        if t:
+            self.truncated[t - 1] |= lost & ~self.terminated[t - 1]
+        else:
+            self.resets[0] |= lost  # the last rollout is already delivered, so no rollout has the end of the episode
+
+    # ------------------------------------------------------------------------------------------ episodes
+
+    def count(self, t: int, now_s: float) -> None:
+        """With seats: add row t to the running episodes. Sets the policy's state to zeros where an episode begins."""
+        lane = self.lane
+        columns = self.columns
+        assert lane.seats is not None
+        assert columns is not None
+        self.valid[t] = columns.complete
+        lane.seats.stepped(columns)
+        lane.episodes.add(self.reward[t].reshape(-1, self._seats), lane.playing)
+        if np.count_nonzero(columns.outside):
+            lane.add_outside(columns.outside, self._rows.first_step + t)
+        if lane.autoresets:
+            begins = ~lane.playing
+            self.state[np.repeat(begins, self._seats)] = 0.0
+            if lane.others is not None and lane.opponent is not None:
+                lane.others.begin(np.flatnonzero(begins).tolist(), lane.opponent)
+        self._go_on(~columns.over)
+        self.resets[t + 1] = ~lane.playing
+        for n in np.flatnonzero(columns.over).tolist():
+            self.ended.append(lane.episodes.ended(n, now_s, self._facts.get((t, n)), lane.others))
+        if not lane.autoresets:
+            self._cut(t, now_s)
+
+    def count_all(self) -> None:
+        """With one agent: add all rows to the running episodes, which is faster than one after another."""
+        np.logical_or(self.terminated, self.truncated, out=self.resets[1:])
+        only_resets = self.resets[:-1]
+        self.reward[only_resets] = 0.0
+        self.valid = ~only_resets
+        self._go_on(~self.resets[-1])
+        step_end_s = self._rows.step_end_s
+        self.ended += self.lane.episodes.add_rows(self.reward, self.resets, step_end_s, self._facts)
+        if not self.lane.autoresets:
+            self._cut(len(step_end_s) - 1, step_end_s[-1])
+
+    def _go_on(self, goes_on: Bools) -> None:
+        """The episodes of these copies [N] go on, or begin with the next step but one."""
+        self.lane.playing = goes_on if self.lane.autoresets else self.lane.playing & goes_on
+
+    def _cut(self, t: int, now_s: float) -> None:
+        """End the episodes that have had the most steps, at row t.
+
+        What seats have got that wait for the move is added to the row: no later step will return it.
+        """
+        lane = self.lane
+        too_long = lane.playing & (lane.episodes.lengths >= lane.episodes.most_steps)
+        for n in np.flatnonzero(too_long).tolist():
+            if isinstance(lane.copies, SeatedCopies):
+                pending = lane.copies.pending(n)
+                self.reward[t, n * self._seats : (n + 1) * self._seats] += pending
+                lane.episodes.returns[n] += pending
+            self.ended.append(lane.episodes.ended(n, now_s, None, lane.others, cut=True))
+        lane.playing &= ~too_long

@@ -1,0 +1,48 @@
+"""What the seats of a lane's env copies keep from step to step: who acts, who waits, and what those did who wait.
+
+Rule: a seat's row is the one in which its outcome comes (`millrace.protocol.envs.seats`). Until then each row repeats what
+was written when the seat acted: action, log-probability, and the state of the policy before it. So the row is whole wherever
+rollouts are cut, and a rollout may hold an action that older weights chose, with its log-probability under those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.specs import PolicySpec
+from millrace.workers.copies.env_copies import SeatColumns
+
+
+class Seats:
+    """The seats of N copies, N · A columns."""
+
+    def __init__(self, policy: PolicySpec, columns: int) -> None:
+        self.acts: Bools = np.zeros(columns, bool)
+        """[N · A] whether the next step takes the seat's action"""
+        self._waits = np.zeros(columns, bool)  # [N · A] it has acted, and its row is not complete
+        self._held: list[Array] = []  # what the policy wrote when each seat acted last
+        self._held_state = zero_state(policy, columns)  # [N · A, S] before that
+
+    def state_before(self, state: Floats) -> Floats:
+        """The state before the first of the next rows, if the policy is in this state [N · A, S] now."""
+        return np.where(self._waits[:, None], self._held_state, state)
+
+    def acted(self, t: int, written: Sequence[Array], before: Floats, state: Floats) -> None:
+        """The policy has written its row t for all columns, and was in the state `before`. Only some seats act."""
+        if not self._held:
+            self._held = [np.zeros_like(array[0]) for array in written]
+        for array, held in zip(written, self._held, strict=True):
+            held[self.acts] = array[t][self.acts]
+            array[t] = held
+        self._held_state[self.acts] = before[self.acts]
+        state[~self.acts] = before[~self.acts]
+        self._waits |= self.acts
+
+    def stepped(self, columns: SeatColumns) -> None:
+        """A step has returned this."""
+        self._waits &= ~columns.complete
+        self.acts = columns.acts
