@@ -23,6 +23,7 @@ from millrace.workers.copies.row_writers import write_numbers
 from millrace.workers.copies.seated_copies import SeatedCopies
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.running_episodes import EndedEpisode
+from millrace.workers.lanes.seats import Seats
 
 
 class EpisodesLost(Exception):
@@ -108,6 +109,7 @@ class RowsOfLane:
         self._rows = rows
         self._seats = run.seats_of_copy
         self._numbers = (self.reward, self.terminated, self.truncated)
+        self._nothing_outside = np.zeros(lane.columns)
         self._joined = lane.writer.joined(self.obs)
         self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended
         for array, newest in zip(self.obs, lane.obs, strict=True):
@@ -178,21 +180,34 @@ class RowsOfLane:
         result = copies.step(actions[columns], pulse, playing)
         of_lane = slice(lane.columns)
         write_numbers(self._numbers, t, (result.reward[of_lane], result.terminated[of_lane], result.truncated[of_lane]))
-        still = ~np.repeat(lane.playing, self._seats)
         if (seats := result.columns) is not None:
             self.reward[t] += seats.outside[of_lane]
             self.columns = SeatColumns(
-                complete=seats.complete[of_lane] & ~still,
+                complete=seats.complete[of_lane],
                 acts=seats.acts[of_lane],
-                outside=np.zeros(lane.columns),
-                over=seats.over[: lane.count] & lane.playing,
+                outside=self._nothing_outside,
+                over=seats.over[: lane.count],
             )
-        for array in self._numbers:
-            array[t, still] = 0
+        if len(playing) == copies.count:
+            lane.writer.write(self._joined, t + 1, result.leaves)  # it is faster
+            return result
         for array in self.obs:
             array[t + 1] = array[t]
         lane.writer.write_some([array[t + 1] for array in self.obs], columns, result.leaves)
+        if len(playing) < lane.count:
+            self._clear_still(t)
         return result
+
+    def _clear_still(self, t: int) -> None:
+        """Nothing has happened in row t to copies that are not playing: what it shows of them is their last step."""
+        lane = self.lane
+        still = ~lane.playing
+        if self.columns is not None:
+            self.columns = self.columns._replace(over=self.columns.over & lane.playing)
+            still = np.repeat(still, self._seats)
+            self.columns.complete[still] = False
+        for array in self._numbers:
+            array[t, still] = 0
 
     def _lose(self, t: int, lost: Bools) -> None:
         """These copies [N] were lost in step `t`: their episodes are truncated at the last step that was made.
@@ -213,14 +228,30 @@ class RowsOfLane:
     # ------------------------------------------------------------------------------------------ episodes
 
     def count(self, t: int, now_s: float) -> None:
-        """With seats: add row t to the running episodes. Sets the policy's state to zeros where an episode begins."""
+        """Add row t to the running episodes."""
         lane = self.lane
-        columns = self.columns
-        assert lane.seats is not None
+        if lane.seats is None:
+            self.valid[t] = lane.playing
+            over = self.terminated[t] | self.truncated[t]
+        else:
+            over = self._count_seats(t, lane.seats)
+        lane.episodes.add(self.reward[t].reshape(-1, self._seats), lane.playing)
+        lane.playing = ~over if lane.autoresets else lane.playing & ~over
+        self.resets[t + 1] = ~lane.playing
+        for n in np.flatnonzero(over).tolist():
+            self.ended.append(lane.episodes.ended(n, now_s, self._facts.get((t, n)), lane.others))
+        if not lane.autoresets:
+            self._cut(t, now_s)
+
+    def _count_seats(self, t: int, seats: Seats) -> Bools:
+        """What row t means for seats: whether the episode of each copy [N] is over.
+
+        Where an episode begins, the policy's state is set to zeros, and another opponent may come.
+        """
+        lane, columns = self.lane, self.columns
         assert columns is not None
         self.valid[t] = columns.complete
-        lane.seats.stepped(columns)
-        lane.episodes.add(self.reward[t].reshape(-1, self._seats), lane.playing)
+        seats.stepped(columns)
         if np.count_nonzero(columns.outside):
             lane.add_outside(columns.outside, self._rows.first_step + t)
         if lane.autoresets:
@@ -228,28 +259,16 @@ class RowsOfLane:
             self.state[np.repeat(begins, self._seats)] = 0.0
             if lane.others is not None and lane.opponent is not None:
                 lane.others.begin(np.flatnonzero(begins).tolist(), lane.opponent)
-        self._go_on(~columns.over)
-        self.resets[t + 1] = ~lane.playing
-        for n in np.flatnonzero(columns.over).tolist():
-            self.ended.append(lane.episodes.ended(n, now_s, self._facts.get((t, n)), lane.others))
-        if not lane.autoresets:
-            self._cut(t, now_s)
+        return columns.over
 
     def count_all(self) -> None:
-        """With one agent: add all rows to the running episodes, which is faster than one after another."""
+        """As `count` for each row, but faster. Only for copies with one agent, which steps reset."""
         np.logical_or(self.terminated, self.truncated, out=self.resets[1:])
         only_resets = self.resets[:-1]
         self.reward[only_resets] = 0.0
         self.valid = ~only_resets
-        self._go_on(~self.resets[-1])
-        step_end_s = self._rows.step_end_s
-        self.ended += self.lane.episodes.add_rows(self.reward, self.resets, step_end_s, self._facts)
-        if not self.lane.autoresets:
-            self._cut(len(step_end_s) - 1, step_end_s[-1])
-
-    def _go_on(self, goes_on: Bools) -> None:
-        """The episodes of these copies [N] go on, or begin with the next step but one."""
-        self.lane.playing = goes_on if self.lane.autoresets else self.lane.playing & goes_on
+        self.lane.playing = ~self.resets[-1]
+        self.ended += self.lane.episodes.add_rows(self.reward, self.resets, self._rows.step_end_s, self._facts)
 
     def _cut(self, t: int, now_s: float) -> None:
         """End the episodes that have had the most steps, at row t.

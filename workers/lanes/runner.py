@@ -70,7 +70,8 @@ class LaneRunner:
         to_env_action = self._to_env_action
         numbers = [each.lane.number for each in lanes if each.lane.number is not None]
         with_seats = bool(self._run.seats)
-        forgets = rows.state.size > 0 and not with_seats and lanes[0].lane.autoresets
+        counts_rows = with_seats or not lanes[0].lane.autoresets
+        forgets = rows.state.size > 0 and not counts_rows
         resets = rows.resets[:, 0].copy()  # [L, N] whether row t only resets
         for t in range(rows.steps):
             rows.begin_row()
@@ -89,7 +90,7 @@ class LaneRunner:
                 each.step(t, taken[i], pulse)
             ended = perf_counter()
             rows.step_end_s.append(ended)
-            if with_seats:
+            if counts_rows:
                 for each in lanes:
                     each.count(t, ended)
             elif forgets:
@@ -97,6 +98,6 @@ class LaneRunner:
                 resets = rows.terminated[:, t] | rows.truncated[:, t]
             stages["act"] += acted - began
             stages["step"] += ended - acted
-        if not with_seats:
+        if not counts_rows:
             for each in lanes:
                 each.count_all()

@@ -1,7 +1,7 @@
 """The episodes that env copies are playing: the one place where rewards are summed and steps are counted.
 
 Rule: the arrays of `RunningEpisodes` are all that is known of an episode before it ends. Returns are sums in float64, before
-any reward is rounded. What is returned as an episode is what a learner takes.
+any reward is rounded.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class RunningEpisodes:
 
         As `add` and `ended` for each row, but it sums the rewards of a copy's rows before it adds them to the return: that
         is several times faster. `reward` [T, N] is 0 where a row only resets. `resets` [T+1, N]: whether row t only resets
-        the copy; the last row is of the next step. `step_end_s` [T] is when each step ended.
+        the copy; the last row is of the next step. `step_end_s` [T] is when each step ended. Episodes are not checked: if
+        all these rewards are finite, a learner takes them.
         """
         rewards = reward.T.tolist()  # by copy
         returns = self.returns[:, 0].tolist()
@@ -87,7 +88,7 @@ class RunningEpisodes:
             if not resets[t, n]:
                 seconds = step_end_s[t] - began_s[n]
                 of_info = facts.get((t, n), self._no_facts)
-                found.append(EndedEpisode(n, self._checked(n, Episode(returns[n], lengths[n], seconds, of_info))))
+                found.append(EndedEpisode(n, Episode(returns[n], lengths[n], seconds, of_info)))
             returns[n] = 0.0
             lengths[n] = 0
             began_s[n] = step_end_s[t]
@@ -102,17 +103,17 @@ class RunningEpisodes:
     def ended(
         self, n: int, now_s: float, of_info: tuple[float, ...] | None, others: OtherTeams | None, *, cut: bool = False
     ) -> EndedEpisode:
-        """The episode of copy n is over. `of_info`: facts that the environment reports, if it does. `others`: who played."""
+        """The episode of copy n is over. `of_info`: facts that the environment reports, if it does. `others`: who played.
+
+        Raises `EnvironmentFailed` if no learner would take it: its return has rewards that are in no row.
+        """
         returns: list[float] = self.returns[n].tolist()
         seconds = now_s - float(self.began_s[n])
         facts = self._no_facts if of_info is None else of_info
         episode = whole_episode(self._run, others, n, returns, int(self.lengths[n]), seconds, facts)
+        if why := wrong_episode(episode, self._run, self.most_steps):
+            raise environment_failed(self._lane, f"copy {n}, episode: {why}")
         self.returns[n] = 0.0
         self.lengths[n] = 0
         self.began_s[n] = now_s
-        return EndedEpisode(n, self._checked(n, episode), cut)
-
-    def _checked(self, n: int, episode: Episode) -> Episode:
-        if why := wrong_episode(episode, self._run, self.most_steps):
-            raise environment_failed(self._lane, f"copy {n}, episode: {why}")
-        return episode
+        return EndedEpisode(n, episode, cut)
