@@ -72,6 +72,7 @@ NO_PROCESS = (
     "tests/workers/conversation/",
     "tests/workers/copies/",
     "tests/workers/evaluate/",
+    "tests/workers/lanes/",
     "tests/workers/supervise/test_supervisor.py",
 )
 """Folders and files whose tests start no process and take little time."""

@@ -117,7 +117,7 @@ class Evaluator:
         if order.send_rows or order.send_frames:
             senders = [RowSender(order, n, run.policy, send) for n in range(k)]
         for sender in senders:
-            self._observe(sender, of_lane, 0)
+            self._observe(sender, of_lane, 0, copies)
         actions = _PlayedActions(run, self._runner.acting, rows, greedy=order.greedy)
         found: dict[int, EndedEpisode] = {}
         while lane.playing.any():
@@ -129,7 +129,7 @@ class Evaluator:
             found |= {each.copy: each for each in of_lane.ended}
             if senders:
                 for n in playing:
-                    self._observe(senders[n], of_lane, 1)
+                    self._observe(senders[n], of_lane, 1, copies)
                     self._send_row(senders[n], of_lane, actions.chosen, cut=n in found and found[n].cut)
             rows.begin_again()
         ended = [found[n] for n in range(k)]
@@ -159,11 +159,10 @@ class Evaluator:
         newest = [leaf[row : row + 1] for leaf in rows.obs]
         check_observed(None, self._stored, newest, self._run.row_axes, step)
 
-    def _observe(self, sender: RowSender, rows: RowsOfLane, row: int) -> None:
+    def _observe(self, sender: RowSender, rows: RowsOfLane, row: int, copies: EvaluationCopies) -> None:
         """Add an observation of the sender's episode to what it sends."""
         n = sender.episode
         shown = [self._of_copy(n, leaf[row]) for leaf in rows.obs[: len(self._run.policy.observation)]]  # no mask, for one
-        copies: EvaluationCopies = rows.lane.copies  # type: ignore[assignment]
         try:
             sender.observe(shown, as_frame(copies.render(n)) if sender.wants_frame else None)
         except ValueError as error:

@@ -136,8 +136,6 @@ class RowsOfLane:
         ended = self.terminated[: rows - 1] | self.truncated[: rows - 1]  # [rows - 1, N]
         return int(np.count_nonzero(self.resets[0]) + np.count_nonzero(ended))
 
-    # ------------------------------------------------------------------------------------------ one step
-
     def acted(self, t: int, written: Sequence[Array], before: Floats, taken: Array) -> None:
         """With seats: the policy has written its row t, and was in the state `before`. Those of other teams act too.
 
@@ -224,8 +222,6 @@ class RowsOfLane:
             self.truncated[t - 1] |= lost & ~self.terminated[t - 1]
         else:
             self.resets[0] |= lost  # the last rollout is already delivered, so no rollout has the end of the episode
-
-    # ------------------------------------------------------------------------------------------ episodes
 
     def count(self, t: int, now_s: float) -> None:
         """Add row t to the running episodes."""
