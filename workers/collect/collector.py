@@ -154,7 +154,8 @@ class Collector:
         """The episodes that begin in the next rollout are played against this opponent; None: the policy plays all seats."""
         lane.opponent = opponent
         if opponent is not None and lane.others is None:
-            run, number = self._run, lane.number
+            run = self._run
+            number = lane.number
             assert number is not None
             matches = [Match(run.team_of(number, n), opponent) for n in range(run.copies)]
             lane.others = OtherTeams(run, matches, generator(run.seed, Purpose.OPPONENTS, number, lane.incarnation))
@@ -163,7 +164,9 @@ class Collector:
         self, rows: RowsOfLane, state: Floats, acted: ActedRows, assignment: Assignment, version: int, session: int
     ) -> Rollout:
         """The rollout of a lane, made of views of its rows. `state`: that of the policy before them."""
-        lane, masked, axes = rows.lane, self._run.masked, self._run.row_axes
+        lane = rows.lane
+        masked = self._run.masked
+        axes = self._run.row_axes
         check_observed(lane.number, stored_leaves(self._run), rows.obs, axes)
         reward = check_rewards(lane.number, rows.reward, axes)
         check_acted(lane.number, "action", acted.action, rows.obs, axes)

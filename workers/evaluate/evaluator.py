@@ -1,8 +1,9 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
-Rule: an order has k seeds, so k env copies are stepped together, and the policy always sees a batch [1, k · A, ...], where A
-is the number of seats of a copy. A copy whose episode has ended stays in the batch and is not stepped. The copies are apart
-from the lanes of training. They are opened once, and reset with a seed before each episode.
+Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where A
+is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are checked and
+sent one by one. The copies are apart from the lanes of training. They are opened once, and reset with a seed before each
+episode.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Evaluator:
             self._copies.popitem()[1].close()
 
     def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, others: OtherTeams | None) -> Evaluated:
-        """Raises `EpisodesLost`."""
+        """Play an order. Raises `EpisodesLost`."""
         run = self._run
         k = len(order.seeds)
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)

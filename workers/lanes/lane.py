@@ -61,9 +61,9 @@ class Lane:
         """N · A"""
         leaves = stored_leaves(run)
         self.obs = tuple(np.empty((self.columns, *leaf.shape), leaf.dtype) for leaf in leaves)
-        """[N · A, *leaf] each, the newest"""
+        """[N · A, *leaf] each, with which the next rows begin"""
         self.state = zero_state(run.policy, self.columns)
-        """[N · A, S] recurrent state of the policy"""
+        """[N · A, S] recurrent state of the policy, with which the next rows begin"""
         self.playing = np.ones(self.count, bool)
         """[N] whether the copy's episode goes on: if not, the next step only resets the copy, or leaves it as it is"""
         self.episodes = RunningEpisodes(run, self.count, number, most_steps)

@@ -35,11 +35,14 @@ class Rows:
 
     def __init__(self, run: RunSpec, lanes: Sequence[Lane], steps: int) -> None:
         """T is `steps`. The first observations and the states are those of the lanes."""
-        T, shape = steps, (len(lanes), steps, lanes[0].columns)
+        L = len(lanes)
+        T = steps
+        columns = lanes[0].columns
+        shape = (L, T, columns)
         self.steps = steps
         self.first_step = 0
         """the number of the first row's step, as errors name it"""
-        self.obs = tuple(np.empty((shape[0], T + 1, shape[2], *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))
+        self.obs = tuple(np.empty((L, T + 1, columns, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))
         """[L, T+1, N · A, *leaf] each; in a masked run the last one is the mask"""
         self.state: Floats = np.stack([lane.state for lane in lanes])
         """[L, N · A, S] recurrent state of the policy, updated at each step"""
@@ -48,7 +51,7 @@ class Rows:
         self.terminated = np.empty(shape, bool)
         self.truncated = np.empty(shape, bool)
         """[L, T, N · A] each"""
-        self.resets = np.zeros((shape[0], T + 1, lanes[0].count), bool)
+        self.resets = np.zeros((L, T + 1, lanes[0].count), bool)
         """[L, T+1, N] whether step t belongs to no episode: it only resets the copy, or leaves it as it is"""
         self.step_end_s: list[float] = []
         """[T] by perf_counter"""
@@ -244,7 +247,8 @@ class RowsOfLane:
 
         Where an episode begins, the policy's state is set to zeros, and another opponent may come.
         """
-        lane, columns = self.lane, self.columns
+        lane = self.lane
+        columns = self.columns
         assert columns is not None
         self.valid[t] = columns.complete
         seats.stepped(columns)

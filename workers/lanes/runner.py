@@ -57,10 +57,11 @@ class LaneRunner:
         except (EnvironmentFailed, PolicyFailed, IndexError):
             # An invalid observation or reward may have caused the error. Then these checks raise the clearer one.
             whole = len(rows.step_end_s)
+            axes = self._run.row_axes
             for each in rows.of_lanes:
-                lane, axes = each.lane.number, self._run.row_axes
-                check_observed(lane, self._stored, [leaf[: whole + 1] for leaf in each.obs], axes, rows.first_step)
-                check_rewards(lane, each.reward[:whole], axes, rows.first_step)
+                number = each.lane.number
+                check_observed(number, self._stored, [leaf[: whole + 1] for leaf in each.obs], axes, rows.first_step)
+                check_rewards(number, each.reward[:whole], axes, rows.first_step)
             raise
 
     def _fill(self, rows: Rows, actions: StepActions, pulse: Pulse) -> None:
