@@ -1,9 +1,9 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
-Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where A
-is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are checked and
-sent one by one. The copies are apart from the lanes of training. They are opened once, and reset with a seed before each
-episode.
+Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where
+A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are checked
+and sent one by one. The copies are apart from the lanes of training. They are opened once, and reset with a seed before
+each episode.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The episodes that env copies are playing: the one place where rewards are summed and steps are counted.
 
-Rule: the arrays of `RunningEpisodes` are all that is known of an episode before it ends. Returns are sums in float64, before
+Rule: the fields of `RunningEpisodes` are all that is known of an episode before it ends. Returns are sums in float64, before
 any reward is rounded.
 """
 
@@ -43,7 +43,7 @@ class RunningEpisodes:
         """[N, A] float64: the sum of each seat's rewards"""
         self.lengths = np.zeros(copies, np.int64)
         """[N] steps"""
-        self.began_s = np.zeros(copies)
+        self.began_s = [0.0] * copies
         """[N] when the copy's last episode ended, or its first one began, by perf_counter"""
         self.most_steps = most_steps
         self._run = run
@@ -52,7 +52,7 @@ class RunningEpisodes:
 
     def begin(self, now_s: float) -> None:
         """All copies have been reset."""
-        self.began_s[:] = now_s
+        self.began_s = [now_s] * len(self.began_s)
 
     def add(self, rewards: Array, playing: Bools) -> None:
         """One step of these copies [N], with rewards [N, A], which are 0 for seats that got none."""
@@ -70,7 +70,7 @@ class RunningEpisodes:
         rewards = reward.T.tolist()  # by copy
         returns = self.returns[:, 0].tolist()
         lengths = self.lengths.tolist()
-        began_s = self.began_s.tolist()
+        began_s = self.began_s
         # For each copy, the first row that is not yet added to its episode, and whether that row only resets the copy.
         first = [0] * len(rewards)
         only_resets = resets[0].tolist()
@@ -97,7 +97,6 @@ class RunningEpisodes:
                 add(n, len(step_end_s))
         self.returns[:, 0] = returns
         self.lengths[:] = lengths
-        self.began_s[:] = began_s
         return found
 
     def ended(
@@ -108,7 +107,7 @@ class RunningEpisodes:
         Raises `EnvironmentFailed` if no learner would take it: its return has rewards that are in no row.
         """
         returns: list[float] = self.returns[n].tolist()
-        seconds = now_s - float(self.began_s[n])
+        seconds = now_s - self.began_s[n]
         facts = self._no_facts if of_info is None else of_info
         episode = whole_episode(self._run, others, n, returns, int(self.lengths[n]), seconds, facts)
         if why := wrong_episode(episode, self._run, self.most_steps):
