@@ -93,12 +93,12 @@ class Lane:
 
     def reset(self, pulse: Pulse) -> None:
         """Start the first episodes. Raises `EnvironmentFailed`."""
+        self.episodes.begin(perf_counter())
         try:
             leaves = self.copies.reset(self._seeds, pulse)
             self.writer.write_some(self.obs, range(self.columns), leaves)
         except CopyFailed as error:
             raise environment_failed(self.number, error, "first reset" if self.autoresets else "reset") from error
-        self.episodes.begin(perf_counter())
         if self.seats is not None:
             assert isinstance(self.copies, SeatedCopies)
             first = self.copies.columns

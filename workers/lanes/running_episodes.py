@@ -44,14 +44,14 @@ class RunningEpisodes:
         self.lengths = np.zeros(copies, np.int64)
         """[N] steps"""
         self.began_s = [0.0] * copies
-        """[N] when the copy's last episode ended, or its first one began, by perf_counter"""
+        """[N] when the copy's last episode ended, or its first reset began, by perf_counter"""
         self.most_steps = most_steps
         self._run = run
         self._lane = lane
         self._no_facts = (math.nan,) * len(run.info_keys)
 
     def begin(self, now_s: float) -> None:
-        """All copies have been reset."""
+        """The first episodes of all copies begin with a reset."""
         self.began_s = [now_s] * len(self.began_s)
 
     def add(self, rewards: Array, playing: Bools) -> None:
