@@ -189,7 +189,7 @@ def test_a_block_that_is_redrawn_is_not_slowed_by_a_long_wait() -> None:
 
 def test_an_empty_progress_is_shown_too() -> None:
     assert block_rows(Progress(), Sparkline()) == {
-        "env steps": "0 of 0   0 a second   update 0", "return": "none yet", "workers": "0",
+        "env steps": "0   0 a second   update 0", "return": "none yet", "workers": "0",
     }  # fmt: skip
     assert drawn(Progress())[0].endswith(" 0%  0:00")
 

@@ -204,7 +204,7 @@ def test_status_names_the_lane_and_the_call_of_a_worker_that_hangs_and_for_how_l
     assert worker["doing"] == "resetting"
     assert 2.0 < worker["doing_s"] < 60.0
     assert re.fullmatch(
-        r"waiting \d+ s for lanes 0, 1 \(worker w0 on .*: in reset for \d+ s\)(; so far.*)?", told["waiting"]
+        r"waiting \d+ s for lanes 0, 1 \(worker w0 on .*: in reset for \d+ s\)(; so far.*)?", told["progress"]["waiting"]
     )
     table = status().splitlines()
     assert re.match(r"The learner has been waiting \d+ s for lanes 0, 1 \(worker w0 on .*: in reset for \d+ s\)", table[1])

@@ -558,7 +558,7 @@ def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: 
     with training(tmp_path) as (learner, folder, status):
         answer = json.loads(status("--json").stdout)
         assert answer["env"] == "CartPole-v1"
-        assert answer["env_steps"] > 0
+        assert answer["progress"]["env_steps"] > 0
         assert not check_format(folder).workers_elsewhere
         assert {worker["worker"] for worker in answer["workers"]} == {"w0", "w1"}
         assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in preloaded.workers_of(learner.pid)}
