@@ -29,10 +29,11 @@ from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.run_spec import run_spec
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import read_description
+from millrace.protocol.messages import Describe
 from millrace.protocol.policy.layout import buffer_size, parameter_layout, total_size
-from millrace.protocol.specs import DescribeSpec
 from millrace.protocol.wire.learner_link import LearnerLink
-from millrace.workers.described_copy import describing
+from millrace.workers.copy_slots import close_described
+from millrace.workers.described_copy import describe
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 CASES = {
@@ -46,8 +47,8 @@ SUPERVISOR = "supervisor of the MLP's worker"
 
 def start_one(env: EnvSpec, *, supervised: bool = False) -> tuple[float, float]:
     """Seconds from exec to the first rollout, and megabytes after it: of the worker, resident; of a supervisor, PSS."""
-    with describing(DescribeSpec(env)) as description:
-        spaces = EnvSpaces.of_description(read_description(description))
+    spaces = EnvSpaces.of_description(read_description(describe(Describe(1, 1, env))))
+    close_described()
     run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env, spaces)
     acting, _ = parameter_layout(run.policy)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,19 +1,17 @@
-"""The two conversations that a learner has with its workers, made from its settings: rollouts, and the description.
+"""What a learner says to its workers, made from its settings: before the run, and in it.
 
-A run's specification is what `Welcome` carries in the first, for our training and for a user's own loop.
+A run's specification is what `Welcome` brings, for our training and for a user's own loop.
 Who starts worker processes is not known here: the launchers in `millrace` pass them in as `ProcessCallbacks`. Imports no
 torch.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.env_spaces import EnvSpaces
-from millrace.learner.members.describe import DescribeSettings
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.rollouts.hub import Hub, HubObserver, HubSettings
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
@@ -22,16 +20,10 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.kinds_of_copies import has_masks
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.specs import SCORE, DescribeSpec, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats, seat_returns
+from millrace.protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, WaitSpec, facts_of_all_seats, seat_returns
 from millrace.protocol.wire.codec import check_can_be_sent
 from millrace.protocol.wire.compression import has_zstd
-from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
-
-
-def describe_spec(config: RolloutConfig, env: EnvSpec, vector: str = "loop", render_mode: str | None = None) -> DescribeSpec:
-    """What `Welcome` carries while the learner does not know its environment."""
-    return DescribeSpec(env, vector, render_mode, config.call_timeouts(), config.heartbeat_s())
 
 
 def rollout_spec(
@@ -99,16 +91,15 @@ def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: RolloutConf
 def open_hub(
     config: RolloutConfig,
     run: RunSpec,
-    link: LearnerLink,
-    processes: ProcessCallbacks,
+    lobby: Lobby,
     check_interrupt: Callable[[], None],
     observer: HubObserver = lambda hub: None,
     past: tuple[Ledger, Sequence[int]] | None = None,
     opponents: OpponentPool | None = None,
 ) -> Hub:
-    """The hub of a run for the workers that connect to this link. An update takes one rollout for each lane.
+    """The hub of a run, for the workers in this lobby, and for those that join later. It takes the lobby's place.
 
-    `processes`: the worker processes that this program started. `check_interrupt` is called while the hub waits: what it
+    An update takes one rollout for each lane. `check_interrupt` is called while the hub waits: what it
     raises ends the wait. `observer` is called each time the hub has listened. `past`: the ledger, and the next
     incarnation of each lane, of a run that goes on. `opponents`: those of a run with teams.
     """
@@ -117,12 +108,12 @@ def open_hub(
         run,
         max_lag=config.max_lag,
         worker_timeout_s=config.worker_timeout_s,
-        first_session=int.from_bytes(os.urandom(6), "little"),
+        first_session=lobby.first_session,
         ledger=ledger,
         incarnations=incarnations,
         opponents=opponents,
     )
-    limits = [most for most in (config.max_env_copies, processes.most_copies) if most]
+    limits = [most for most in (config.max_env_copies, lobby.processes.most_copies) if most]
     if limits:
         coordinator.evaluation.most_copies = min(limits) - run.lanes * run.copies
     settings = HubSettings(
@@ -131,12 +122,15 @@ def open_hub(
         config.max_env_failures,
         config.acting_dtype,
     )
-    return Hub(link, coordinator, settings, processes, check_interrupt, observer)
+    hub = Hub(lobby.link, coordinator, settings, lobby.processes, check_interrupt, observer)
+    hub.take_over(lobby.hand_over())
+    return hub
 
 
-def describe_settings(config: RolloutConfig, steps: int = 0) -> DescribeSettings:
-    """The settings of the conversation in which a worker describes the environment. `steps`: env steps of the run."""
-    return DescribeSettings(
+def lobby_settings(config: RolloutConfig, steps: int = 0) -> LobbySettings:
+    """The settings that matter before the run. `steps`: its env steps."""
+    return LobbySettings(
+        wait=WaitSpec(config.call_timeouts(), config.heartbeat_s()),
         worker_timeout_s=config.worker_timeout_s,
         no_workers_timeout_s=config.no_workers_timeout_s,
         stall_timeout_s=config.stall_timeout_s(),

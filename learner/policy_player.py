@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import describe_settings, describe_spec, open_hub
-from millrace.learner.members.describe import described_by_workers
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.conversations import open_hub
+from millrace.learner.members.describe_coordinator import Unknown
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
@@ -30,7 +30,6 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError
 from millrace.protocol.own_module import refuse_modules_in
 from millrace.protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
-from millrace.protocol.wire.learner_link import LearnerLink
 
 RIVAL, POLICY = 0, 1
 """The versions of the weights."""
@@ -71,13 +70,12 @@ def saved_policy(
 
 
 class PolicyPlayer:
-    """Plays episodes of a saved policy with the workers that join at a link."""
+    """Plays episodes of a saved policy with the workers that join in a lobby."""
 
     def __init__(
         self,
         policy: SavedPolicy,
-        link: LearnerLink,
-        processes: ProcessCallbacks,
+        lobby: Lobby,
         check_interrupt: Callable[[], None],
         watch: Callable[[str], None],
         settings: RolloutConfig,
@@ -91,7 +89,7 @@ class PolicyPlayer:
         self.policy = policy
         if policy.against is not None:
             _check_rival(policy, policy.against)
-        self._link, self._processes = link, processes
+        self._lobby = lobby
         self._check_interrupt, self._watch, self._settings, self._described = check_interrupt, watch, settings, described
         self._hub: Hub | None = None
 
@@ -115,9 +113,8 @@ class PolicyPlayer:
         """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""
         if self._described is not None:
             return self._described
-        spec = describe_spec(self._settings, self.policy.env.for_evaluation(), render_mode=render_mode)
-        settings = describe_settings(self._settings)
-        return described_by_workers(self._link, spec, settings, self._processes, self._check_interrupt)
+        unknown = Unknown(self.policy.env.for_evaluation(), render_mode=render_mode)
+        return self._lobby.describe(unknown, self._check_interrupt)
 
     def play(
         self,
@@ -148,7 +145,8 @@ class PolicyPlayer:
 
     def _published(self) -> Hub:
         policy = self.policy
-        lanes = max(1, self._processes.expected)  # one for each worker of this program: only then do its failures count
+        # One for each worker of this program: only then do its failures count.
+        lanes = max(1, self._lobby.processes.expected)
         settings = msgspec.structs.replace(self._settings, lanes=lanes)
         run = RunSpec(
             policy.env,
@@ -165,12 +163,12 @@ class PolicyPlayer:
             heartbeat_s=settings.heartbeat_s(),
         )
         if (against := policy.against) is None:
-            hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt)
+            hub = open_hub(settings, run, self._lobby, self._check_interrupt)
         else:
             keys = tuple(key for key in run.info_keys if key != SCORE)[: MAX_FACTS - 1]
             run = msgspec.structs.replace(run, teams=self.teams, facts=(*keys, SCORE), opponent=against.card.policy)
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
-            hub = open_hub(settings, run, self._link, self._processes, self._check_interrupt, opponents=pool)
+            hub = open_hub(settings, run, self._lobby, self._check_interrupt, opponents=pool)
             hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)
         hub.publish(POLICY, policy.parameters, policy.buffers, deal=False)
         return hub

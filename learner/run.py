@@ -27,6 +27,7 @@ from millrace.learner.config.costs import large_observations, minibatch_rows
 from millrace.learner.config.validation import unused_setting
 from millrace.learner.conversations import open_hub
 from millrace.learner.extras import started_by
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
@@ -47,7 +48,6 @@ from millrace.protocol.machine.waiting_threads import SPIN, VARIABLE
 from millrace.protocol.policy.flattened_images import flattened_images
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec, RunSpec
-from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
@@ -139,14 +139,11 @@ class OpenRun:
             raise Interrupted(self.setup.folder.shown)
 
 
-def open_run(
-    setup: RunSetup, link: LearnerLink, processes: ProcessCallbacks, watch: Watch, observer: HubObserver
-) -> OpenRun:
-    """The run of this setup, whose folder is ready. Raises `MillraceError`.
+def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver) -> OpenRun:
+    """The run of this setup, whose folder is ready, for the workers in the lobby. Raises `MillraceError`.
 
     `watch`: the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
-    listened. `processes` are the worker processes that this program started. Nothing of a resumed run is written before
-    everything fits.
+    listened. Nothing of a resumed run is written before everything fits.
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
     if setup.config.tensorboard:
@@ -158,7 +155,7 @@ def open_run(
         log.warning("%s", line)
     if torch_device(setup.config) == "cpu" and (line := large_observations(setup.config, spec.policy)):
         log_notice(log, line)
-    setup = _use_threads(setup, spec.policy, processes)
+    setup = _use_threads(setup, spec.policy, lobby.processes)
     config, folder = setup.config, setup.folder
     algorithm, prior = _new_algorithm(setup, spec)
     state = restore(folder, algorithm) if setup.resumed else RunState()
@@ -173,7 +170,7 @@ def open_run(
         if folder.lock is None or not folder.lock.taken_over:
             progress_file.write(listened.progress, time.time())
 
-    hub = open_hub(config, spec, link, processes, setup.check_running, watch_hub, past, pool)
+    hub = open_hub(config, spec, lobby, setup.check_running, watch_hub, past, pool)
     if state.opponent_policies is not None and pool is not None:
         hub.keep_opponents(*state.opponent_policies)
     state.opponent_policies = None
@@ -182,7 +179,7 @@ def open_run(
         callbacks.add(started_by("record")(config.record, setup.known.described, spec, about))
     setup.check_interrupt()
     folder.remove_temporary()
-    folder.write_config(config, workers_elsewhere=not processes.expected)
+    folder.write_config(config, workers_elsewhere=not lobby.processes.expected)
     folder.remove_summary()
     tally = Tally(config, spec, state, lambda: callbacks.stop_reason, pool)
     parts = RunParts(config, spec, folder, algorithm, hub, tally)
@@ -192,7 +189,7 @@ def open_run(
     if setup.resumed:
         log_notice(log, between.files.continues())
     folder.keep()
-    run.announce(link.address, config.advertise, link.keyring)
+    run.announce(lobby.link.address, config.advertise, lobby.link.keyring)
     return run
 
 

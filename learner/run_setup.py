@@ -1,28 +1,26 @@
 """What exists of a run before PyTorch is imported: its folder, what a worker says of the environment, and its interrupts.
 
-The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let a worker describe the
-environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/run.py`); train. This file
-does not know who the workers are, and the learner runs no code of the environment.
+The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let one of them describe
+the environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/run.py`), which takes
+over the workers; train. This file does not know who the workers are, and the learner runs no code of the environment.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 from millrace.learner.config.config import Config
 from millrace.learner.config.costs import endless_evaluations
-from millrace.learner.conversations import describe_settings, describe_spec
 from millrace.learner.env_spaces import EnvSpaces
 from millrace.learner.extras import started_by
 from millrace.learner.imports_ahead import ImportsAhead
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.describe import described_by_workers
-from millrace.learner.members.describe_coordinator import Accept
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.describe_coordinator import Unknown
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.resume_checks import Resumption, check_spaces
 from millrace.learner.rollouts.hub import HubObserver
 from millrace.learner.run_folder.json_log import kept_log
@@ -33,8 +31,6 @@ from millrace.protocol.envs.advice.atari_ids import preprocessed
 from millrace.protocol.envs.description import DescribedEnv, agents_in_words
 from millrace.protocol.errors import UsageError
 from millrace.protocol.logs.notices import log_notice
-from millrace.protocol.specs import DescribeSpec
-from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
@@ -127,17 +123,13 @@ def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: 
         raise UsageError(f"eval_env_kwargs: expected the agents of training, {agents[0]}; got {agents[1]}")
 
 
-Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
-"""Has a worker describe the environment. What the second argument raises ends the wait; the third accepts a description."""
-
-
 def named_environment(config: Config) -> EnvSpec:
     """The environment that the settings name."""
     return EnvSpec.of(config.env, config.env_kwargs, config.all_wrappers(), config.eval_env_kwargs)
 
 
-def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, describe: Describe) -> KnownEnvironment:
-    """The environment, as `describe` learns it. Meanwhile another thread imports PyTorch.
+def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, lobby: Lobby) -> KnownEnvironment:
+    """The environment, as a worker in the lobby describes it. Meanwhile another thread imports PyTorch.
 
     Of a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
     is no such environment, or no policy for it; `RunError` if no worker describes it in time; and `KeyboardInterrupt` if
@@ -156,13 +148,18 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
             if resume is not None and saved is not None:
                 check_spaces(resume.run, EnvSpaces.of_policy(saved.policy, saved.seats), _spaces(config, found))
 
-        described = describe(describe_spec(config, env, config.vector), check_interrupt, accept)
-        evaluation = described
-        if env.eval_kwargs:
-            spec = describe_spec(config, env.for_evaluation())
-            evaluation = describe(spec, check_interrupt, lambda found: None)
+        def answer_workers() -> None:
+            check_interrupt()
+            lobby.listen()
+
+        evaluation = lobby.describe(Unknown(env.for_evaluation()), check_interrupt) if env.eval_kwargs else None
+        # The training's comes last, because its copy is kept for the first lane.
+        described = lobby.describe(Unknown(env, config.vector, accept=accept), check_interrupt)
+        if evaluation is None:
+            evaluation = described
+        else:
             check_evaluation_spaces(config, described, evaluation)
-        imports.wait(check_interrupt)
+        imports.wait(answer_workers)
     spaces = _spaces(config, described)
     if spaces.masked:
         log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
@@ -171,14 +168,6 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
     if line := endless_evaluations(config, evaluation):
         log_notice(log, line)
     return KnownEnvironment(env, spaces, described, evaluation.max_episode_steps)
-
-
-def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
-    """Has one of the workers at the link of the run describe the environment."""
-    settings = describe_settings(config, config.steps)
-    return lambda spec, check_interrupt, accept: described_by_workers(
-        link, spec, settings, processes, check_interrupt, accept=accept
-    )
 
 
 def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:

@@ -29,11 +29,12 @@ from millrace.protocol.bounds import (
     Whole,
 )
 from millrace.protocol.call_timeouts import Doing
+from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.message_base import Message
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.space_spec import EnvDescription
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 PROTOCOL_VERSION = 11
 TOLD_TO_STOP = "told to stop"
@@ -64,12 +65,15 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
 
 
 class Welcome(Message, frozen=True):
-    """You may join. It says what to do: describe the environment, collect rollouts, or step env copies on order."""
+    """You may join. It says what to do: collect rollouts, step env copies on order, or wait until that is known.
+
+    A worker that waits is welcomed a second time, in the same session, by the run.
+    """
 
     session: Natural
     attempt: Natural
     """`attempt` of the Hello that this answers"""
-    run: DescribeSpec | RunSpec | StepSpec
+    run: WaitSpec | RunSpec | StepSpec
 
 
 class Refuse(Message, frozen=True, array_like=False):  # a map, as Hello is
@@ -184,6 +188,8 @@ class Heartbeat(Message, frozen=True):
     """how often since the worker started a program that owns its loop took an action of its own, because none had come"""
     note: Line = ""
     """what whoever trains should know of the environment, if the worker has seen something; the learner says it once"""
+    waits: bool = False
+    """true: the worker knows of no run, because its `Welcome` brought a `WaitSpec`, and no second one has come"""
 
 
 class HeartbeatReply(Message, frozen=True):
@@ -220,10 +226,24 @@ class Failure(Message, frozen=True):
     """true: a policy that the user wrote raised, or returned what no rollout can hold; no environment is to blame"""
 
 
-class Described(Message, frozen=True):
-    """The environment of a `DescribeSpec`."""
+class Describe(Message, frozen=True):
+    """Make one copy of this environment, and say what it is. Answered by `Described`. Sent before there is a run."""
 
     session: Natural
+    ticket: Natural
+    env: EnvSpec
+    vector: str = "loop"
+    """the kind of env copies that must have the same spaces as a single copy, which the worker checks"""
+    render_mode: str | None = None
+    """passed to the copy"""
+
+
+class Described(Message, frozen=True):
+    """The environment of a `Describe`."""
+
+    session: Natural
+    ticket: Natural
+    """of the order"""
     description: EnvDescription
 
 
@@ -437,14 +457,28 @@ class Status(Message, frozen=True):
 ToLearner = (
     Hello | Alive | Described | Rollout | Heartbeat | Goodbye | Failure | EpisodeRows | Evaluated | Stepped | Returned
 )
-ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | Evaluate | HeartbeatReply | Drain | Reset | Step | Call
+ToWorker = (
+    Welcome
+    | Refuse
+    | Rejoin
+    | Describe
+    | Weights
+    | Collect
+    | Release
+    | Evaluate
+    | HeartbeatReply
+    | Drain
+    | Reset
+    | Step
+    | Call
+)
 Order = Reset | Step | Call
 Answer = Stepped | Returned
 ToObserver = Status
 
 __all__ = [
-    "PROTOCOL_VERSION", "TOLD_TO_STOP", "Alive", "Answer", "Array", "Call", "Collect", "Described", "Doing", "Drain",
-    "EpisodeRows", "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire",
+    "PROTOCOL_VERSION", "TOLD_TO_STOP", "Alive", "Answer", "Array", "Call", "Collect", "Describe", "Described", "Doing",
+    "Drain", "EpisodeRows", "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire",
     "LaneIncarnation", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset", "Returned",
     "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
     "WorkerActivity", "WorkerExit", "WorkerStatus", "versions_of",

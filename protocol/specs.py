@@ -187,23 +187,18 @@ class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
     dtype: str
 
 
-class DescribeSpec(msgspec.Struct, frozen=True, tag=True):
-    """A learner that does not know its environment yet. The worker makes one copy, describes it and closes it."""
+class WaitSpec(msgspec.Struct, frozen=True, tag=True):
+    """A learner whose run has not begun, because it does not know the environment yet. The worker waits in its session for
+    orders to describe one, and for a second `Welcome`, which brings the run.
+    """
 
-    env: EnvSpec
-    vector: str = "loop"
-    """the kind of env copies that must have the same spaces as a single copy, which the worker checks"""
-    render_mode: str | None = None
-    """passed to the copy"""
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = 1.0
-    learner_timeout_s: float = 30.0
-    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
-
-    def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot take part; empty if it can."""
-        return self.env.rejection_reason(code)
+    learner_timeout_s: float = 600.0
+    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The learner may read
+    a checkpoint or a dataset for long before the run begins, without reading messages
+    """
 
 
 class RunSpec(msgspec.Struct, frozen=True, tag=True):

@@ -61,8 +61,8 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "opponents": {"acting", "activity"},
     "lanes": {"acting", "activity", "copies", "opponents"},
     "collect": {"activity", "acting", "conversation", "copies", "copy_slots", "lanes", "opponents"},
-    "evaluate": {"acting", "activity", "copies", "lanes", "opponents"},
-    "vector_env": {"activity", "copies"},
+    "evaluate": {"acting", "activity", "copies", "copy_slots", "lanes", "opponents"},
+    "vector_env": {"activity", "copies", "copy_slots"},
 }
 MILLRACE = {  # the same for each folder of the public package
     "cli": {"flags", "launch", "play_flags", "playing", "terminal"},
@@ -345,7 +345,7 @@ def test_nothing_is_pickled_but_in_the_one_guarded_place() -> None:
 
 
 def test_the_learner_runs_no_code_of_the_environment() -> None:
-    """Workers describe it (`DescribeSpec`), evaluate and record: the learner's machine need not have it."""
+    """Workers describe it (`Describe`), evaluate and record: the learner's machine need not have it."""
     for source in sources("learner"):
         assert not [where for name in ENVIRONMENT_CODE for where in every_call(source, name)], source
 

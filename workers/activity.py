@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import NamedTuple, get_args
 
-from millrace.protocol.call_timeouts import OF_POLICY, CallTimeouts, Doing
+from millrace.protocol.call_timeouts import OF_POLICY, OUR_CODE, CallTimeouts, Doing
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000
@@ -61,12 +61,15 @@ class Activity:
 
     @contextmanager
     def during(self, doing: int) -> Iterator[None]:
-        """Within it, the worker makes one call of the environment, or of a policy."""
+        """Within it, the worker makes one call of the environment, or of a policy; perhaps within another one."""
+        before = self.numbers[DOING]
         self.begin(doing)
         try:
             yield
         finally:
             self.end(calls=0 if DOINGS[doing] in OF_POLICY else 1)
+            if DOINGS[before] not in OUR_CODE:
+                self.begin(before)
 
     def limit(self, timeouts: CallTimeouts) -> None:
         """From now on, a call of the user's code may take so long. Before, it may take any time."""

@@ -2,38 +2,124 @@
 
 Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same one. If
 its constructor raises, it may have started something: then the slot is free when the process and its children have ended.
+
+Rule: a copy that was described, and has done nothing else, is the next one that its thread makes, if that would be the same.
+If not, it is closed first. So a worker never has a copy more than it needs.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeVar
 
-from millrace.protocol.envs.which_copy import EnvCopy, being_made
+import gymnasium
+
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, making
 from millrace.protocol.errors import UsageError
 from millrace.workers.activity import CLOSING, activity
 from millrace.workers.machine_slots import slots
 
 _slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
 Made = TypeVar("Made")
+Dress = Callable[[Made, EnvCopy], Made]
+"""Takes a copy that was made, and which one it is. Returns what to use in its place, or raises."""
 
 
-def make_copy(which: EnvCopy, make: Callable[[], Made]) -> Made:
-    """What `make` returns: this copy, made with a slot of its own. `give_back` frees the slot when the copy was closed."""
-    which = replace(which, slot=slots().take())
-    _slots[id(which)] = which.slot
-    token = being_made.set(which)
+@dataclass(frozen=True)
+class EnvMaker:
+    """Makes copies of an environment. Equal makers make equal copies, unless one asks which copy it is."""
+
+    env: EnvSpec
+    render_mode: str | None = None
+
+    def __call__(self) -> gymnasium.Env[Any, Any]:
+        """Make one copy. Raises `UsageError`."""
+        return self.env.make(self.render_mode)
+
+
+@dataclass(frozen=True)
+class DescribedCopy:
+    """A copy that was described, and not reset or stepped."""
+
+    copy: gymnasium.Env[Any, Any]
+    maker: EnvMaker
+    asked: bool
+    """Whether it asked which copy it is: it was told that it is the first."""
+
+    def is_as_new(self, which: EnvCopy, make: Callable[[], Any]) -> bool:
+        """Whether this copy, if it were made now, would be the same."""
+        return make == self.maker and (which == FIRST_COPY or not self.asked)
+
+
+class _OfThread(threading.local):
+    described: DescribedCopy | None = None  # not used yet
+
+
+_of_thread = _OfThread()
+
+
+def make_to_describe(make: EnvMaker) -> DescribedCopy:
+    """Make a copy to be described. Then call `keep_described`, or `close_copy` if it cannot be described."""
+    close_described()
+    copy, asked = _made(FIRST_COPY, make)
+    return DescribedCopy(copy, make, asked)
+
+
+def keep_described(described: DescribedCopy) -> None:
+    """Keep this copy for the next `make_copy` of this thread, or until `close_described`."""
+    _of_thread.described = described
+
+
+def close_described() -> None:
+    """Close the copy that this thread has described, unless it was used."""
+    described, _of_thread.described = _of_thread.described, None
+    if described is not None:
+        close_copy(described.copy)
+
+
+def as_made(copy: Made, which: EnvCopy) -> Made:
+    """The copy as it was made: a `Dress`."""
+    return copy
+
+
+def make_copy(which: EnvCopy, make: Callable[[], Made], dress: Dress[Made] = as_made) -> Made:
+    """The copy, dressed, with a slot of its own: what `make` returns, or in its place the one that was described.
+
+    If `dress` raises, the copy is closed. `give_back` frees the slot when the copy was closed.
+    """
+    described = _of_thread.described
+    if described is not None and described.is_as_new(which, make):
+        _of_thread.described = None
+        made: Any = described.copy
+    else:
+        close_described()
+        made, _ = _made(which, make)
     try:
-        made = make()
-        _slots[id(made)] = _slots.pop(id(which))
-        return made
-    finally:
-        being_made.reset(token)
-        _slots.pop(id(which), None)  # if it could not be made, its slot stays taken
+        dressed = dress(made, which)
+    except BaseException:
+        close_copy(made)
+        raise
+    _slots[id(dressed)] = _slots.pop(id(made))
+    return dressed
+
+
+def _made(which: EnvCopy, make: Callable[[], Made]) -> tuple[Made, bool]:
+    """What `make` returns, registered with its slot; and whether it asked which copy it is."""
+    slot = slots().take()
+    with making(replace(which, slot=slot)) as under_way:
+        _slots[id(under_way)] = slot
+        try:
+            made = make()
+            _slots[id(made)] = _slots.pop(id(under_way))
+            return made, under_way.asked
+        finally:
+            _slots.pop(id(under_way), None)  # if it could not be made, its slot stays taken
 
 
 def give_back(copy: object) -> None:
@@ -59,7 +145,7 @@ def env_copy() -> EnvCopy:
     >>> millrace.env_copy().number
     0
     """
-    if (copy := being_made.get()) is not None:
+    if (copy := being_made()) is not None:
         return copy
     if _slots:
         raise UsageError(

@@ -1,7 +1,7 @@
-"""Answers a learner that does not know its environment yet: makes one env copy, describes it and closes it.
+"""Makes an env copy for a learner that does not know the environment yet, and describes it.
 
-Rule: the environment's code runs here and not in the learner. The description is sent before the copy is closed, so that a
-copy whose `close` raises or hangs cannot take the description with it.
+Rule: the environment's code runs here and not in the learner. The copy is only made, and what it says of itself is read;
+then it waits to be used (`copy_slots.py`).
 """
 
 from __future__ import annotations
@@ -18,32 +18,30 @@ from millrace.protocol.envs.description import describe_env
 from millrace.protocol.envs.kinds_of_copies import copies_kind
 from millrace.protocol.envs.seats import SeatedEnv
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
-from millrace.protocol.envs.which_copy import FIRST_COPY
 from millrace.protocol.errors import EnvironmentFailed, UsageError, first_line
+from millrace.protocol.messages import Describe
 from millrace.protocol.space_spec import EnvDescription
-from millrace.protocol.specs import DescribeSpec
 from millrace.workers.activity import DESCRIBING, activity
-from millrace.workers.copy_slots import close_copy, make_copy
+from millrace.workers.copy_slots import EnvMaker, close_copy, keep_described, make_to_describe
 
 
-@contextmanager
-def describing(spec: DescribeSpec) -> Iterator[EnvDescription]:
-    """The description of the environment; its copy is closed afterwards, whatever `close` raises.
+def describe(order: Describe) -> EnvDescription:
+    """The description of the environment. Its copy is kept for the next one that this thread makes.
 
     Raises `UsageError`, with advice, if the environment cannot be what the learner asks for: its id is unknown, a package
     is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and for an
     exit of the process that its code asks for.
     """
-    page = activity()
-    with _failures_of(spec.env), page.during(DESCRIBING):
-        env = make_copy(FIRST_COPY, lambda: spec.env.make(spec.render_mode))
-    try:
-        with _failures_of(spec.env), page.during(DESCRIBING):
-            _check_kind(spec, env)
-            description = describe_env(env)
-        yield description
-    finally:
-        close_copy(env)
+    with _failures_of(order.env), activity().during(DESCRIBING):
+        made = make_to_describe(EnvMaker(order.env, order.render_mode))
+        try:
+            _check_kind(order, made.copy)
+            description = describe_env(made.copy)
+        except BaseException:
+            close_copy(made.copy)
+            raise
+    keep_described(made)
+    return description
 
 
 @contextmanager
@@ -59,17 +57,17 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
         raise EnvironmentFailed(line, traceback.format_exc()) from error
 
 
-def _check_kind(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
+def _check_kind(order: Describe, env: gymnasium.Env[object, object]) -> None:
     """Raise `UsageError` unless the env copies that the learner asks for have the spaces of this single copy."""
     if isinstance(env, SeatedEnv):
         return  # the learner refuses all but a loop
-    spaces_of = copies_kind(spec.vector).spaces
+    spaces_of = copies_kind(order.vector).spaces
     if spaces_of is None:
         return
-    observed, acted = spaces_of(spec.env)
+    observed, acted = spaces_of(order.env)
     expected = observation_leaves(env.observation_space), action_spec(env.action_space)
     if (observation_leaves(observed), action_spec(acted)) != expected:
         raise UsageError(
-            f"environment {spec.env.id}: vector {spec.vector}: its copies have other spaces than itself, {observed} and "
-            f"{acted}; {instead_of_vector(spec.env.id)}"
+            f"environment {order.env.id}: vector {order.vector}: its copies have other spaces than itself, {observed} and "
+            f"{acted}; {instead_of_vector(order.env.id)}"
         )

@@ -15,18 +15,19 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypeGuard
 
 from millrace.protocol.bounds import Stages
 from millrace.protocol.env_spec import AllowedCode
 from millrace.protocol.errors import BadMessage, EnvironmentFailed, PolicyFailed, UsageError, UserFacingError, first_line
-from millrace.protocol.messages import Answer, Evaluated, Rollout, Stepped, ToLearner, Weights
+from millrace.protocol.messages import Describe, Described, Stepped, ToLearner, Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.policy import make_policy
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker, encode
 from millrace.protocol.wire.shared_memory import InheritedDescriptors
 from millrace.protocol.wire.weight_dtypes import to_float32
@@ -35,6 +36,7 @@ from millrace.workers.activity import PREPARING, WAITING, activity
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.heartbeat_thread import HeartbeatThread
 from millrace.workers.conversation.session import (
+    BeginRun,
     CloseLanes,
     EvaluationTask,
     Leave,
@@ -45,11 +47,13 @@ from millrace.workers.conversation.session import (
     StartSession,
     Statistics,
     Work,
+    WorkAnswer,
     WorkerEffect,
     WorkerIdentity,
 )
 from millrace.workers.conversation.worker_states import WorkerState
-from millrace.workers.described_copy import describing
+from millrace.workers.copy_slots import close_described
+from millrace.workers.described_copy import describe
 from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import NoSlot, slots
@@ -163,19 +167,24 @@ class Worker:
         except _Abandoned:
             answers = []
         except Exception as error:
-            self._fail(error)
+            if self._cannot_take_part(error, work):
+                self._decline(error)
+            else:
+                self._fail(error)
             return True
         self._update_statistics()
         self._do(self._session.work_ended(answers))
         return True
 
-    def _do_work(self, work: Work) -> Sequence[Rollout | Evaluated | Answer]:
-        """Collect, evaluate, or execute an order. Raises `_Abandoned` once the work is no longer wanted."""
+    def _do_work(self, work: Work) -> Sequence[WorkAnswer]:
+        """Describe, collect, evaluate, or execute an order. Raises `_Abandoned` once the work is no longer wanted."""
 
         def pulse() -> None:
             self._pulse(work)
 
         match work:
+            case Describe():
+                return [self._describe(work)]
             case RolloutTask(session, weights, assignments, held):
                 return self._loaded_collector(weights).collect(assignments, weights.version, session, pulse, held)
             case EvaluationTask(weights, order, held):
@@ -294,6 +303,12 @@ class Worker:
         log.error("%s\n%s", error, detail)
         self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
 
+    def _cannot_take_part(self, error: Exception, work: Work) -> TypeGuard[UsageError]:
+        """Whether this worker lacks the environment, or has another one. If its own code raised, it has it."""
+        if not isinstance(error, UsageError) or error.detail:
+            return False
+        return isinstance(work, Describe) or (isinstance(work, RolloutTask) and not self._statistics.steps)
+
     def _decline(self, error: UsageError) -> None:
         """Leave the run. Without a slot, this process ends when there is room for a lane: then it is started again."""
         self._close_all()
@@ -306,17 +321,18 @@ class Worker:
         self._do([leave])
 
     def _update_statistics(self) -> None:
-        if (source := self._collector or self._stepper) is not None:
-            earlier = self._earlier.stages
-            stages: Stages = {stage: earlier.get(stage, 0.0) + seconds for stage, seconds in source.stages.items()}
-            steps = self._earlier.steps + source.steps
-            if self._evaluator is not None and self._evaluator.steps:
-                stages["evaluate"] = earlier.get("evaluate", 0.0) + self._evaluator.seconds
-                steps += self._evaluator.steps
-            stages = {**earlier, **stages, "wait": self._waited_s}
-            note = "" if self._collector is None else self._collector.note
-            self._statistics = Statistics(steps, stages, self._resident_bytes, note)
-            self._session.update_statistics(self._statistics)
+        earlier, source = self._earlier.stages, self._collector or self._stepper
+        stages: Stages = {**earlier, "wait": self._waited_s}
+        steps = self._earlier.steps
+        if source is not None:
+            stages |= {stage: earlier.get(stage, 0.0) + seconds for stage, seconds in source.stages.items()}
+            steps += source.steps
+        if self._evaluator is not None and self._evaluator.steps:
+            stages["evaluate"] = earlier.get("evaluate", 0.0) + self._evaluator.seconds
+            steps += self._evaluator.steps
+        note = "" if self._collector is None else self._collector.note
+        self._statistics = Statistics(steps, stages, self._resident_bytes, note)
+        self._session.update_statistics(self._statistics)
 
     def _do(self, effects: list[WorkerEffect]) -> None:
         for effect in effects:
@@ -324,7 +340,10 @@ class Worker:
                 case SendMessage(message):
                     self._send(message)
                 case StartSession(run):
-                    self._start_session(run)
+                    self._close_all()
+                    self._begin(run)
+                case BeginRun(run):
+                    self._begin(run)
                 case CloseLanes(lanes):
                     if (owner := self._collector or self._stepper) is not None:
                         owner.lanes.close([lane.lane for lane in lanes])
@@ -340,15 +359,17 @@ class Worker:
         else:
             self._link.send(frames)
 
-    def _start_session(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
-        """Make a new collector or stepper; nothing of the old one is kept."""
+    def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
+        """Make a new collector or stepper, unless the run has yet to begin. Those of the last session were closed."""
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)
         self._options.feed_watchdog(self._clock())
-        self._close_all()
         self._update_statistics()
         self._earlier = self._statistics
         self._collector = self._evaluator = self._stepper = None
+        self._loaded = None
+        if isinstance(run, WaitSpec):
+            return
         why = run.rejection_reason(self._options.code)
         if self._session.identity.evaluates and isinstance(run, StepSpec):
             why = "the workers of this learner only step, and play no evaluations; start this worker without --evaluate"
@@ -368,30 +389,23 @@ class Worker:
                         allow_private_names=self._options.code is not AllowedCode.REGISTERED,
                     )
                     self._heartbeats.start()
-                case DescribeSpec():
-                    self._describe(run)
-            self._loaded = None
         except Exception as error:  # torch and the system raise many types
             self._fail(error)
 
-    def _describe(self, spec: DescribeSpec) -> None:
-        """Describe the environment. A second thread sends the heartbeats while its code runs."""
+    def _describe(self, order: Describe) -> Described:
+        """Describe an environment. A second thread sends the heartbeats while its code runs. Raises as `describe` does."""
+        if why := order.env.rejection_reason(self._options.code):
+            raise UsageError(why)
         heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
+        heartbeats.start()
         try:
-            with ExitStack() as copy:
-                heartbeats.start()
-                try:
-                    with heartbeats.lock_released():
-                        description = copy.enter_context(describing(spec))
-                finally:
-                    heartbeats.stop()
-                self._do(self._session.described(description))
-        except UsageError as error:
-            self._decline(error)
-        except Exception as error:
-            self._fail(error)
+            with heartbeats.lock_released():
+                return Described(order.session, order.ticket, describe(order))
+        finally:
+            heartbeats.stop()
 
     def _close_all(self) -> None:
+        close_described()
         if (owner := self._collector or self._stepper) is not None:
             owner.lanes.close_all()
         if self._evaluator is not None:

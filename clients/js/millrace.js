@@ -14,7 +14,8 @@ export { box, discrete, UsageError };
 
 const PROTOCOL_VERSION = 11;
 const FIELDS = { // how many fields each message of the learner has
-  Welcome: 3, Rejoin: 1, Weights: 4, Collect: 4, Release: 2, Evaluate: 10, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
+  Welcome: 3, Rejoin: 1, Describe: 5, Weights: 4, Collect: 4, Release: 2, Evaluate: 10, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5,
+  Call: 8,
 };
 const OF_ANY_SESSION = ["Welcome", "Refuse", "Drain", "Weights"];
 const OBEYED = { // the table of the wire document: what is not ignored in each state
@@ -164,8 +165,9 @@ class Worker {
     this.#due = at + this.#run.heartbeat_s;
     const { began, steps, stepSeconds, doing, since, calls } = this.#activity;
     const stages = { step: stepSeconds, wait: Math.max(0, at - began - stepSeconds) };
-    this.#send(["Heartbeat", this.#session, this.#replies, [], this.#lanes.tickets, steps, stages, process.memoryUsage.rss()]);
-    if (this.#run.type === "DescribeSpec") return this.#describe(); // it may have been lost
+    const held = [this.#replies, [], this.#lanes.tickets];
+    const lateActions = 0, note = "", waits = this.#run.type === "WaitSpec";
+    this.#send(["Heartbeat", this.#session, ...held, steps, stages, process.memoryUsage.rss(), lateActions, note, waits]);
     this.#send(["Alive", [[this.name, this.#nonce, doing, Math.max(0, at - since), calls]], []]);
   }
 
@@ -180,50 +182,62 @@ class Worker {
       case "Rejoin": return this.#rejoin("the learner asks for it");
       case "Release": return fields[1].forEach(([lane, incarnation]) => this.#lanes.close(lane, incarnation));
       case "HeartbeatReply": return this.#replied(...fields.slice(1));
+      case "Describe": return this.#describe(...fields.slice(1));
       case "Reset": case "Step": case "Call": if (this.#run.type === "StepSpec") this.#lanes.order(type, fields, frames);
     }
   }
 
   #welcome(session, attempt, run) {
-    if (attempt !== this.#attempt || (this.#state === "ready" && session === this.#session)) return;
+    if (attempt !== this.#attempt) return;
+    const again = this.#state === "ready" && session === this.#session; // the run begins for which this session waits, or a late copy
+    if (again && (this.#run.type !== "WaitSpec" || run?.type === "WaitSpec")) return;
     if (!Number.isSafeInteger(session) || typeof run !== "object") throw new Error("Welcome: expected a session and a run");
     this.#lanes?.keep([]);
     this.#state = "ready";
     this.#session = session;
-    this.#run = { heartbeat_s: 1, learner_timeout_s: run.type === "StepSpec" ? 600 : 30, autoreset: "NextStep", ...run };
+    this.#run = { heartbeat_s: 1, learner_timeout_s: run.type === "RunSpec" ? 30 : 600, autoreset: "NextStep", ...run };
     this.#lanes = new Lanes(session, this.#run, this.description, this.#activity, {
       send: (head, frames) => this.#send(head, frames),
       failed: (error, lane) => this.#failed(error, lane),
       idle: () => this.#state === "draining" && this.#goodbye(0, this.#reason),
     });
-    this.#replies = 0;
+    if (!again) this.#replies = 0;
     this.#due = now() + this.#run.heartbeat_s;
     this.joinTimeoutS = this.rejoinTimeoutS;
     const why = this.#unable();
     if (why) return this.#goodbye(2, why);
-    this.log("joined");
-    if (run.type === "DescribeSpec") this.#describe();
+    if (!again) this.log("joined");
   }
 
   /** Why this client cannot take part in the run, or nothing. */
   #unable() {
     const run = this.#run;
+    if (run.type === "WaitSpec") return;
     if (run.seats?.length) return `this client has no environment of several agents, the learner asks for ${run.seats.join(", ")}`;
     if (run.type === "RunSpec") return "this client does not act: it needs --inference learner, or millrace.make_vec";
-    for (const env of run.type === "StepSpec" ? run.envs : [run.env]) {
-      if (env.id !== this.description.id) return `this client has the environment ${this.description.id}, the learner asks for ${env.id}`;
-      if (env.factory || env.wrappers?.length || Object.keys({ ...env.kwargs, ...env.eval_kwargs }).length)
-        return "this client takes no factory, wrappers or arguments of an environment";
+    for (const env of run.envs) {
+      const why = this.#cannotBe(env);
+      if (why) return why;
     }
     if (run.autoreset === "SameStep") return "this client resets a copy in the next step, the learner asks for autoreset SameStep";
   }
 
-  #describe() {
+  /** Why this client's environment is not the one that the learner asks for, or nothing. */
+  #cannotBe(env) {
+    if (env.id !== this.description.id) return `this client has the environment ${this.description.id}, the learner asks for ${env.id}`;
+    if (env.factory || env.wrappers?.length || Object.keys({ ...env.kwargs, ...env.eval_kwargs }).length)
+      return "this client takes no factory, wrappers or arguments of an environment";
+  }
+
+  #describe(ticket, env) {
+    if (this.#run.type !== "WaitSpec") return;
+    const why = this.#cannotBe(env);
+    if (why) return this.#goodbye(2, why);
     const frames = new Frames();
     const { observation, action, longestEpisode = 0 } = this.description;
     const spaces = [frames.space(observation), frames.space(action)];
     const metadata = frames.add("|u1", [1], new Uint8Array([0x80])); // an empty dict
-    this.#send(["Described", this.#session, [...spaces, metadata, "", longestEpisode, ""]], frames.list);
+    this.#send(["Described", this.#session, ticket, [...spaces, metadata, "", longestEpisode, ""]], frames.list);
   }
 
   #replied(number, received) {

@@ -1,9 +1,9 @@
 """The learner's half of every conversation, as far as all are alike. Pure: messages and `now` in, messages out.
 
-Rule: what a member sends in its session goes to the part that knows what it means; what belongs to an ended session is
-answered by Rejoin. A membership ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with
-its key. Then what the member held is taken back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the
-way is sent again, before the reply.
+Rule: who waits for the run when it begins is a member from then on, in the same session. What a member sends in its session
+goes to the part that knows what it means; what belongs to an ended session is answered by Rejoin. A membership ends by
+Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with its key. Then what the member held is
+taken back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the way is sent again, before the reply.
 
 A subclass says what differs: what an answer means, what is dealt, what a loss means, and what becomes of a wrong answer.
 """
@@ -16,7 +16,7 @@ from typing import Generic
 
 from millrace.learner.members.events import EnvironmentRaised, Event, Failed, WorkerNotStarted
 from millrace.learner.members.member_states import MemberState, SentUnusable
-from millrace.learner.members.membership import M, Membership, Outgoing
+from millrace.learner.members.membership import M, Member, Membership, Outgoing
 from millrace.protocol.alive import StartFailed
 from millrace.protocol.bounds import one_line
 from millrace.protocol.messages import (
@@ -78,6 +78,10 @@ class Coordinator(ABC, Generic[M]):
                 self._failed(failed)
                 return self._deal()
         return self._answer(member, message)
+
+    def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
+        """The run begins for the workers that wait for it. Call it first."""
+        return self.membership.take_over(waiting, now) + self._joined()
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Answer a message that could not be read."""
@@ -158,6 +162,7 @@ class Coordinator(ABC, Generic[M]):
         lost = member.record_heartbeat(heartbeat)
         if member.state is MemberState.DRAINING:
             return [(member.peer, Drain(one_line(self.membership.draining or "")))]
-        out = self._again(member, heartbeat, lost)
+        out = self.membership.welcome_again(member, heartbeat)
+        out += self._again(member, heartbeat, lost)
         member.replies += 1
         return [*out, (member.peer, HeartbeatReply(member.session, member.replies, self._received(member))), *self._deal()]

@@ -1,30 +1,30 @@
-"""The conversation before a run: workers describe the environment. Pure: messages and `now` in, messages out.
+"""The conversation before a run: workers wait for it, and describe environments. Pure: messages and `now` in, messages out.
+
+Rule: one worker describes, the first that joined; the others wait. Each time that a worker is lost that was asked, or that
+no answer has come for long, twice as many are asked at once: one bad machine delays the start by one try, and an
+environment that fails everywhere is found out as fast as all workers together can.
 
 Rule: the first description that can be read and is accepted is that of the run; other workers are compared with it when they
-open their lanes. A worker that declines, or describes what is not accepted, is refused, and the learner waits for another;
-once `decliners_to_end` different workers have been, the start ends with the reason. A worker whose environment fails may
-come back.
+open their lanes. A worker that declines, or describes what is not accepted, is refused; once `decliners_to_end` different
+workers have been, the start ends with the reason. A worker whose environment fails may come back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.learner.members.membership import MAX_MEMBERS, Member, Membership, Outgoing
 from millrace.protocol.alive import NO_SLOT
+from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, UsageError
-from millrace.protocol.messages import (
-    TOLD_TO_STOP,
-    Described,
-    Goodbye,
-    Rejoin,
-    Status,
-    ToLearner,
-)
+from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodbye, Heartbeat, Status, ToLearner
 from millrace.protocol.progress import RunProgress
-from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.specs import WaitSpec
+
+FIRST_TICKET = 1 << 51  # of descriptions: far from those of a run, which may begin while a worker still describes
 
 Accept = Callable[[DescribedEnv], None]
 """Raises `UsageError` if the run cannot be made with this environment."""
@@ -34,44 +34,85 @@ def accept_any(env: DescribedEnv) -> None:
     """Accept every environment."""
 
 
-class DescribeCoordinator(Coordinator[Member]):
-    """Members that describe the environment, until one has done so."""
+@dataclass(frozen=True)
+class Unknown:
+    """An environment that a worker is to describe."""
 
-    def __init__(
-        self,
-        spec: DescribeSpec,
-        first_session: int,
-        *,
-        worker_timeout_s: float,
-        decliners_to_end: int,
-        accept: Accept = accept_any,
-    ) -> None:
+    env: EnvSpec
+    vector: str = "loop"
+    """The kind of env copies that must have the same spaces as a single copy."""
+    render_mode: str | None = None
+    accept: Accept = accept_any
+
+
+class DescribeCoordinator(Coordinator[Member]):
+    """Members that wait for the run."""
+
+    def __init__(self, wait: WaitSpec, first_session: int, *, worker_timeout_s: float, decliners_to_end: int) -> None:
         """`decliners_to_end`: how many different workers must be unable to describe it until the start ends; 0: never."""
-        super().__init__(Membership(spec, Member, lambda member, why: None, first_session), worker_timeout_s)
-        self.spec = spec
+        super().__init__(Membership(wait, Member, self._removed, first_session), worker_timeout_s)
         self.described: DescribedEnv | None = None
-        """What the first usable description says."""
+        """What the first usable description of the newest environment says."""
         self.unsuitable: UsageError | None = None
         """Why the start cannot go on: too many workers declined."""
-        self._decliners_to_end, self._accept = decliners_to_end, accept
+        self._unknown: Unknown | None = None
+        self._at_once = 1  # how many workers may be describing
+        self._tickets = FIRST_TICKET
+        self._decliners_to_end = decliners_to_end
         self._decliners: set[str] = set()
 
-    def finish(self) -> list[Outgoing]:
-        """The next conversation begins: every member says Hello again."""
-        return [(peer, Rejoin(member.session)) for peer, member in self.membership.members.items()]
+    def ask(self, unknown: Unknown) -> list[Outgoing]:
+        """Have a worker describe this environment. `described` is what it says, until the next call."""
+        self.described, self._unknown, self._at_once = None, unknown, 1
+        self._tickets += 1
+        for member in self.members.values():
+            member.tickets.clear()
+        return self._deal()
+
+    def ask_more(self) -> list[Outgoing]:
+        """No description has come for long: other workers describe the environment as well, if there are any."""
+        self._double()
+        return self._deal()
 
     def status(self, total_steps: int, now: float) -> Status:
         """The answer to `millrace status`. There are no weights yet, and no ledger."""
-        return Status(self.spec.env.id, RunProgress(total_steps=total_steps), self.membership.status(now))
+        env = "" if self._unknown is None else self._unknown.env.id
+        return Status(env, RunProgress(total_steps=total_steps), self.membership.status(now))
 
     # ---------------------------------------------------------------- inside
 
+    def _removed(self, member: Member, why: str) -> None:
+        if member.tickets:
+            self._double()
+
+    def _double(self) -> None:
+        self._at_once = min(2 * self._at_once, MAX_MEMBERS)
+
+    def _deal(self) -> list[Outgoing]:
+        if self._unknown is None or self.described is not None:
+            return []
+        active = sorted(self.membership.active(), key=_may_have_lanes_first)
+        asked = sum(bool(member.tickets) for member in active)
+        free = [member for member in active if not member.tickets]
+        return [self._order(member) for member in free[: max(0, self._at_once - asked)]]
+
+    def _order(self, member: Member) -> Outgoing:
+        unknown = self._unknown
+        assert unknown is not None
+        member.tickets[self._tickets] = member.replies
+        return member.peer, Describe(member.session, self._tickets, unknown.env, unknown.vector, unknown.render_mode)
+
+    def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
+        return [self._order(member)] if lost else []
+
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
-        if not isinstance(message, Described) or self.described is not None:
+        if not isinstance(message, Described) or member.tickets.pop(message.ticket, None) is None:
+            return []  # of an earlier environment, or it has come before
+        if self.described is not None or self._unknown is None:
             return []
         try:
             described = read_description(message.description)
-            self._accept(described)
+            self._unknown.accept(described)
         except BadMessage as error:
             return self._unsuitable(member, Described, f"its description of the environment: {error}")
         except UsageError as error:
@@ -92,4 +133,9 @@ class DescribeCoordinator(Coordinator[Member]):
             if len(self._decliners) >= self._decliners_to_end:
                 self.membership.take_events()  # the reason is the error's text, and need not be logged too
                 self.unsuitable = UsageError(reason)
-        return refusal
+        return refusal + self._deal()
+
+
+def _may_have_lanes_first(member: Member) -> tuple[bool, int]:
+    """Sort key: the copy that is described is of use to a worker that gets the first lane."""
+    return member.hello.evaluates, member.join_number

@@ -3,6 +3,8 @@
 Rule: what is kept of a worker ends with its session, beside totals and a limited number of refusals. The number of
 members is limited.
 
+Rule: the workers that have joined before there is a run keep their sessions when it begins (`take_over`).
+
 Rule: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
 or of another process under the same name, ends the session before it. A process that lost its name in this way may join
 again; of processes that take a name from each other, the one that loses it the third time is refused. A process that was
@@ -52,7 +54,7 @@ from millrace.protocol.messages import (
     WorkerExit,
     WorkerStatus,
 )
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by: several may be read at once
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
@@ -128,6 +130,8 @@ class Member:
     """Tickets that the worker holds; for each, the value of `replies` when the ticket was last sent."""
     replies: int = 0
     """Number of heartbeat replies that were sent."""
+    welcomed: int = 0
+    """`replies` when the run was sent to it."""
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
@@ -159,6 +163,11 @@ class Member:
         return "evaluating" if self.hello.evaluates else "active" if self.lanes else "spare"
 
     @property
+    def has_counted(self) -> bool:
+        """Whether what its process counts began before its part in this run, as of the next heartbeat."""
+        return not self.hello.is_first_attempt if self.heartbeat is None else self.heartbeat.waits
+
+    @property
     def alive_s(self) -> float:
         """Time at which the worker was last known to be alive and well."""
         return max(self.heard_s, self.in_env_code_s)
@@ -188,7 +197,7 @@ class Member:
 
         A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
         """
-        if self.heartbeat is None and not self.hello.is_first_attempt:
+        if self.has_counted:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
         if heartbeat.steps:
@@ -258,7 +267,7 @@ class Membership(Generic[M]):
 
     def __init__(
         self,
-        run: DescribeSpec | RunSpec | StepSpec,
+        run: WaitSpec | RunSpec | StepSpec,
         member_class: type[M],
         on_removed: Callable[[M, str], None],
         first_session: int,
@@ -356,7 +365,7 @@ class Membership(Generic[M]):
             same_process = member.hello.process_nonce == hello.process_nonce
             if same_process and hello.attempt == member.hello.attempt:
                 member.heard_s = now
-                return [(peer, Welcome(member.session, hello.attempt, self._run))], None
+                return [self._welcome(member)], None
             if same_process and hello.attempt < member.hello.attempt:
                 return [], None
             takeovers = member.takeovers + (not same_process)
@@ -371,7 +380,25 @@ class Membership(Generic[M]):
         self._of_process[hello.worker, hello.process_nonce] = member
         self._removed_for_silence.pop(hello.worker, None)
         self.events.append(WorkerJoined(hello.worker, hello.host, hello.pid))
-        return [(peer, Welcome(member.session, hello.attempt, self._run))], member
+        return [self._welcome(member)], member
+
+    def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
+        """The run begins for the workers that wait for it: their sessions go on, and another Welcome brings the run."""
+        self._first_session, self._next_session, self._joins = waiting._first_session, waiting._next_session, waiting._joins
+        self._refused, self._removed_for_silence = waiting._refused, waiting._removed_for_silence
+        for peer, waited in waiting.members.items():
+            member = self._member_class(**vars(waited))
+            member.heard_s = member.joined_s = now
+            member.tickets = {}
+            self.members[peer] = member
+            self._of_process[member.hello.worker, member.hello.process_nonce] = member
+            self.events.append(WorkerJoined(member.hello.worker, member.hello.host, member.hello.pid))
+        return [self._welcome(member) for member in self.members.values()]
+
+    def welcome_again(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
+        """The Welcome that brings the run, if this heartbeat shows that it was lost on the way."""
+        lost = heartbeat.waits and not isinstance(self._run, WaitSpec) and heartbeat.replies > member.welcomed
+        return [self._welcome(member)] if lost else []
 
     def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
         """Remove a member; its process must not come back."""
@@ -462,6 +489,10 @@ class Membership(Generic[M]):
             member.state = TABLE[member.state][Drain]
             out.append((member.peer, Drain(one_line(reason))))
         return out
+
+    def _welcome(self, member: M) -> Outgoing:
+        member.welcomed = member.replies
+        return member.peer, Welcome(member.session, member.hello.attempt, self._run)
 
     def _refuse_and_remove(self, member: M, event: type, why: str, refusal: str) -> list[Outgoing]:
         self.remove(member, event, why, refusal)

@@ -28,8 +28,7 @@ class CollectingMember(Member):
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
         """Keep the heartbeat. Returns the tickets that were lost on the way."""
-        is_first_of_session = self.heartbeat is None and not self.hello.is_first_attempt
-        if is_first_of_session or not heartbeat.tickets:  # it works on nothing that was asked for in this session
+        if self.has_counted or not heartbeat.tickets:  # it works on nothing that was asked for in this session
             self.ended_steps = heartbeat.steps
         return super().record_heartbeat(heartbeat)
 

@@ -18,7 +18,7 @@ from millrace.learner.members.events import Event
 from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.held_up import LONG_S
 from millrace.learner.members.member_server import MemberServer, ServerCallbacks
-from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.membership import Member, Membership, Outgoing
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
@@ -133,6 +133,10 @@ class Hub:
         callbacks = ServerCallbacks(self._answer, self.status, self._count_failure)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)
+
+    def take_over(self, waiting: Membership[Member]) -> None:
+        """The run begins for the workers that wait for it."""
+        self._server.send(self.coordinator.take_over(waiting, self._clock()))
 
     # ---------------------------------------------------------------- what the loop calls
 

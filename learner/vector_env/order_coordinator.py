@@ -21,6 +21,7 @@ from millrace.protocol.errors import BadMessage, EnvironmentFailed
 from millrace.protocol.messages import (
     Answer,
     Call,
+    Described,
     Heartbeat,
     LaneIncarnation,
     Order,
@@ -133,6 +134,8 @@ class OrderCoordinator(Coordinator[Member]):
     # ---------------------------------------------------------------- inside
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
+        if isinstance(message, Described):
+            return []  # it was asked before the vector environment began
         if not isinstance(message, Stepped | Returned):
             return self._unusable(member, f"it sent {type(message).__name__}, which a vector environment does not ask for")
         if message.ticket < 0:

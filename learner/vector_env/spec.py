@@ -16,13 +16,14 @@ from gymnasium.spaces.utils import is_space_dtype_shape_equiv
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_differing_spaces, batch_space
 
+from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
 from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import EnvSpec, PickledCallable
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.spaces import leaves_with_own_dtype
 from millrace.protocol.errors import EnvironmentFailed, UsageError, safe_repr
-from millrace.protocol.specs import DescribeSpec, Leaf, StepSpec
+from millrace.protocol.specs import Leaf, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import check_can_be_sent
 
 
@@ -57,14 +58,14 @@ class RequestedCopies:
     """so many of the last copies play evaluations"""
 
     @property
-    def to_describe(self) -> DescribeSpec:
+    def to_describe(self) -> Unknown:
         """The environment that a worker describes: that of the first copy. All copies must have the same spaces."""
-        return DescribeSpec(
-            self.envs[0],
-            render_mode=self.render_mode,
-            call_timeouts=self.call_timeouts,
-            learner_timeout_s=self.learner_timeout_s,
-        )
+        return Unknown(self.envs[0], render_mode=self.render_mode)
+
+    @property
+    def wait(self) -> WaitSpec:
+        """What the workers are welcomed by, before their spaces are known."""
+        return WaitSpec(self.call_timeouts, learner_timeout_s=self.learner_timeout_s)
 
     def description(self, env: DescribedEnv) -> VectorEnvDescription:
         """The vector environment of these copies. Raises `UsageError` for spaces that are not supported."""

@@ -15,6 +15,7 @@ from typing import Protocol
 
 from millrace.learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
 from millrace.learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from millrace.learner.members.membership import Member, Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from millrace.learner.vector_env.shared_steps import SharedSteps
@@ -99,6 +100,10 @@ class StepHub:
             (lambda peer: None) if shared is None else shared.wake_for_message,
         )
         self._server = MemberServer(link, self.coordinator, callbacks, processes or ProcessCallbacks(), settings, clock)
+
+    def take_over(self, waiting: Membership[Member]) -> None:
+        """The vector environment begins for the workers that wait for it."""
+        self._server.send(self.coordinator.take_over(waiting, self.now()))
 
     @property
     def address(self) -> str:

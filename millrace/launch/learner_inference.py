@@ -9,7 +9,6 @@ Rule: whatever happens, no worker, thread, socket file or folder of ours is left
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -20,17 +19,15 @@ from millrace.launch.vector import listen
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
 from millrace.learner.config.validation import workers_to_wait_for
-from millrace.learner.conversations import describe_settings
+from millrace.learner.conversations import lobby_settings
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.describe_coordinator import Accept
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.resume_checks import Resumption
 from millrace.learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
 from millrace.learner.torch_setup import one_thread, torch_device
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.description import DescribedEnv
-from millrace.protocol.specs import DescribeSpec
 from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 
@@ -50,16 +47,11 @@ def train(
     workers = workers_to_wait_for(config, None if elsewhere else min(config.workers, config.envs))
     with ExitStack() as stack:
         endpoint = open_endpoint(BindSettings(), "inproc", stack)
-        link = endpoint.link
         listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
         folder = stack.enter_context(run_folder(config, resume))
-        started = listening.start(worker_flags(config, folder.path))
-
-        def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:
-            return started.describe(describe_settings(config, config.steps), check_interrupt, accept, spec.env)
-
-        known = known_environment(config, env_spec, resume, describe)
+        started = listening.start(worker_flags(config, folder.path), lobby_settings(config, config.steps))
+        known = known_environment(config, env_spec, resume, started.lobby)
         env = started.vector_env(known.described)
         stack.callback(env.close)
         masked, timeout_s = known.spaces.masked, config.no_workers_timeout_s
@@ -73,7 +65,8 @@ def train(
 
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
-            run = open_run(setup, link, processes, watch, observer)
+            lobby = Lobby(endpoint.link, processes, lobby_settings(config, config.steps))
+            run = open_run(setup, lobby, watch, observer)
             # The learner's own endpoint is inproc: `millrace status` asks where the workers join.
             env.hub.status_of_run = run.hub.status
             run.announce(env.address, config.advertise, listening.endpoint.keyring)

@@ -17,8 +17,9 @@ from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import FlagsOfWorker
 from millrace.launch.vector import listen
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import describe_settings
+from millrace.learner.conversations import lobby_settings
 from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy
 from millrace.learner.torch_setup import one_thread
@@ -79,7 +80,8 @@ def _player(
     endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
     started = endpoint.workers(which.workers, _own_logs(which, stack), 2.0)
     _, processes = stack.enter_context(started)
-    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
+    lobby = Lobby(endpoint.link, processes, lobby_settings(which.settings))
+    return PolicyPlayer(policy, lobby, check_interrupt, watch, which.settings)
 
 
 def _acting_player(
@@ -105,15 +107,16 @@ def _acting_player(
         copy=False,
         evaluates=True,
     )
-    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(which, stack))
-    described = started.describe(describe_settings(settings), check_interrupt)
+    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(which, stack), lobby_settings(settings))
+    described = started.describe(check_interrupt)
     env = started.vector_env(described)
     stack.callback(env.close)
     lanes = lanes_of(env, 0, policy.facts, workers or 1, settings.no_workers_timeout_s, masked=policy.masked)
     thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(which.copies), lambda: "cpu")
     stack.callback(thread.stop, 2.0)
     processes = acting_processes(thread, lanes, env, workers or 0)
-    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, settings, described)
+    lobby = Lobby(endpoint.link, processes, lobby_settings(settings))
+    return PolicyPlayer(policy, lobby, check_interrupt, watch, settings, described)
 
 
 def _own_logs(which: PlayingWorkers, stack: ExitStack) -> FlagsOfWorker:

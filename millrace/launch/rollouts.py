@@ -12,9 +12,10 @@ from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import stopped_on_error, worker_cores
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import workers_to_wait_for
-from millrace.learner.conversations import describe_settings, describe_spec, open_hub, rollout_spec
+from millrace.learner.conversations import lobby_settings, open_hub, rollout_spec
 from millrace.learner.env_spaces import EnvSpaces
-from millrace.learner.members.describe import described_by_workers
+from millrace.learner.members.describe_coordinator import Unknown
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.ledger import Ledger
@@ -45,7 +46,6 @@ def start(
     code = env.called_code or ("a policy's factory" if isinstance(policy, OwnPolicy) else "")
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
-    link = endpoint.link
     cores = [] if listens else worker_cores(config)
 
     def flags(name: str) -> tuple[list[str], None]:
@@ -53,11 +53,11 @@ def start(
 
     supervisor, processes = resources.enter_context(endpoint.workers(config.workers, flags))
     with stopped_on_error(supervisor):
-        spec = describe_spec(config, env, config.vector)
-        described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
+        lobby = Lobby(endpoint.link, processes, lobby_settings(config))
+        described = lobby.describe(Unknown(env, config.vector), check_interrupt)
         spaces = EnvSpaces.of_description(described, config.action_masks)
         policy_spec = policy.spec(spaces.observation, spaces.action)
         run = rollout_spec(config, env, policy_spec, rollout_steps, policy.extra_arrays, spaces=spaces)
-        hub = open_hub(config, run, link, processes, check_interrupt, past=past)
+        hub = open_hub(config, run, lobby, check_interrupt, past=past)
         hub.wait_for(workers)
     return hub, run, described

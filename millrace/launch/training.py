@@ -14,13 +14,14 @@ from millrace.launch.local_worker_options import FlagsOfWorker, no_flags, stoppe
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
 from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
+from millrace.learner.conversations import lobby_settings
 from millrace.learner.extras import check_packages
 from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.resume_checks import Resumption, unless_finished
 from millrace.learner.run_setup import (
     RunSetup,
-    describe_over,
     known_environment,
     named_environment,
     prometheus_observer,
@@ -73,11 +74,12 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         with stopped_on_error(supervisor):
-            known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
+            lobby = Lobby(endpoint.link, processes, lobby_settings(config, config.steps))
+            known = known_environment(config, env, resume, lobby)
         folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
         from millrace.learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
 
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
-            open_run(setup, endpoint.link, processes, watch, observer).train(workers)
+            open_run(setup, lobby, watch, observer).train(workers)
         return folder.shown

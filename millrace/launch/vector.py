@@ -11,19 +11,17 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-import msgspec
 from gymnasium.vector import AutoresetMode
 
 from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker, no_flags
-from millrace.learner.members.describe import DescribeSettings, described_by_workers
-from millrace.learner.members.describe_coordinator import Accept, accept_any
 from millrace.learner.members.events import Failed
 from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
@@ -32,11 +30,12 @@ from millrace.learner.vector_env.spec import RequestedCopies, observation_spaces
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.address import advertised_address, check_address
 from millrace.protocol.call_timeouts import CallTimeouts
-from millrace.protocol.env_spec import EnvLike, EnvSpec
+from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError
 from millrace.protocol.machine.cpu_cores import usable_cores
+from millrace.protocol.specs import WaitSpec
 from millrace.protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from millrace.protocol.wire.wake_up import SPIN_S, WakePipe
 
@@ -151,7 +150,8 @@ def make_vec(
 
     local_workers = settings.local_workers
     join_timeout_s = JOIN_TIMEOUT_S if local_workers else settings.timeout_s
-    describe = DescribeSettings(
+    before = LobbySettings(
+        wait=WaitSpec(),
         worker_timeout_s=math.inf if local_workers else settings.worker_timeout_s,
         no_workers_timeout_s=join_timeout_s,
         stall_timeout_s=max(join_timeout_s, settings.timeout_s),
@@ -159,8 +159,8 @@ def make_vec(
     )
     resources = ExitStack()
     try:
-        started = listen(settings, resources).start(no_flags)
-        made = started.vector_env(started.describe(describe))
+        started = listen(settings, resources).start(no_flags, before)
+        made = started.vector_env(started.describe())
         made.hub.on_death = died
         made.hub.while_waiting = deaths.check
         made.hub.wait_for(local_workers or settings.lane_count, join_timeout_s)
@@ -201,11 +201,13 @@ class ListeningVectorEnv:
     """For local workers only."""
     resources: ExitStack
 
-    def start(self, flags: FlagsOfWorker) -> StartedVectorEnv:
-        """Start the local workers with these flags. Call it once."""
+    def start(self, flags: FlagsOfWorker, before: LobbySettings) -> StartedVectorEnv:
+        """Start the local workers with these flags. `before`: settings until they are all there. Call it once."""
         # They are stopped at once if there will be no hub to close.
         started = self.endpoint.workers(self.settings.local_workers, flags, LEAVE_AT_ONCE_S, self._handed)
-        return StartedVectorEnv(self, self.resources.enter_context(started))
+        workers = self.resources.enter_context(started)
+        lobby = Lobby(self.endpoint.link, workers.processes, replace(before, wait=self.requested.wait))
+        return StartedVectorEnv(self, workers, lobby)
 
     def _handed(self, worker: str) -> InheritedDescriptors | None:
         """The file descriptors that this worker inherits."""
@@ -221,21 +223,11 @@ class StartedVectorEnv:
 
     listening: ListeningVectorEnv
     workers: StartedWorkers
+    lobby: Lobby
 
-    def describe(
-        self,
-        settings: DescribeSettings,
-        check_interrupt: Callable[[], None] = lambda: None,
-        accept: Accept = accept_any,
-        env: EnvSpec | None = None,
-    ) -> DescribedEnv:
-        """Have a worker describe the environment, or `env`; `accept` takes the description, or not.
-
-        Raises `UserFacingError`, and what `check_interrupt` raises.
-        """
-        spec, link = self.listening.requested.to_describe, self.listening.endpoint.link
-        spec = spec if env is None else msgspec.structs.replace(spec, env=env)
-        return described_by_workers(link, spec, settings, self.workers.processes, check_interrupt, accept=accept)
+    def describe(self, check_interrupt: Callable[[], None] = lambda: None) -> DescribedEnv:
+        """Have a worker describe the environment. Raises `UserFacingError`, and what `check_interrupt` raises."""
+        return self.lobby.describe(self.listening.requested.to_describe, check_interrupt)
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
         """The vector environment. Call it once; it does not wait until workers have joined."""
@@ -249,13 +241,14 @@ class StartedVectorEnv:
         hub = StepHub(
             listening.endpoint.link,
             description.step,
-            first_session=int.from_bytes(os.urandom(6), "little"),
+            first_session=self.lobby.first_session,
             local_workers=self.workers.supervisor,
             processes=self.workers.processes,
             shared=shared,
             worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
         )
         listening.resources.callback(hub.close, CLOSE_TIMEOUT_S)
+        hub.take_over(self.lobby.hand_over())
         return ZmqVectorEnv(
             description,
             hub,

@@ -78,7 +78,7 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
     Raises `UsageError` if that is no environment, or it asks for an unknown id.
     """
     parameter = takes_copy(factory, kwargs)
-    copy = [being_made.get() or FIRST_COPY] if parameter else []
+    copy = [being_made() or FIRST_COPY] if parameter else []
     try:
         made = factory(*copy, **kwargs)
     except (TypeError, AttributeError) as error:

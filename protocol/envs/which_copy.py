@@ -9,7 +9,8 @@ import ast
 import inspect
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -53,8 +54,38 @@ class EnvCopy:
 
 FIRST_COPY = EnvCopy()
 """The first copy of a run, and the one that is described. Its slot is not taken."""
-being_made: ContextVar[EnvCopy | None] = ContextVar("being_made", default=None)
-"""The copy that this thread makes now, if it does."""
+
+
+@dataclass
+class Making:
+    """A copy that is being made."""
+
+    copy: EnvCopy
+    asked: bool = False
+    """Whether its environment has asked which copy it is. If not, any other copy would be the same."""
+
+
+_making: ContextVar[Making | None] = ContextVar("making", default=None)
+
+
+@contextmanager
+def making(copy: EnvCopy) -> Iterator[Making]:
+    """Within it, this thread makes this copy."""
+    under_way = Making(copy)
+    token = _making.set(under_way)
+    try:
+        yield under_way
+    finally:
+        _making.reset(token)
+
+
+def being_made() -> EnvCopy | None:
+    """The copy that this thread makes now, if it does: its environment asks."""
+    under_way = _making.get()
+    if under_way is None:
+        return None
+    under_way.asked = True
+    return under_way.copy
 
 
 def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
@@ -63,15 +94,18 @@ def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
     A text that is one expression becomes an integer. Braces around anything but integers, `+ - * // %` and at least one of
     the names stay as they are. `env` names the environment in the `UsageError` for a division by zero.
     """
-    copy = being_made.get() or FIRST_COPY
-    names = {"number": copy.number, "lane": copy.lane, "copy": copy.copy, "slot": copy.slot}
 
     def in_braces(match: re.Match[str]) -> str:
         try:
             tree = ast.parse(match[1].strip(), mode="eval").body
-            named = any(isinstance(node, ast.Name) for node in ast.walk(tree))
-            return str(_value(tree, names)) if named else match[0]
-        except (SyntaxError, LookupError):
+        except SyntaxError:
+            return match[0]
+        if not any(isinstance(node, ast.Name) for node in ast.walk(tree)):
+            return match[0]
+        copy = being_made() or FIRST_COPY
+        try:
+            return str(_value(tree, {"number": copy.number, "lane": copy.lane, "copy": copy.copy, "slot": copy.slot}))
+        except LookupError:
             return match[0]
         except ZeroDivisionError as error:
             raise UsageError(f"environment {env}: argument {match[0]}: it divides by zero for {copy}") from error

@@ -11,6 +11,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
     Call,
     Collect,
+    Describe,
     Drain,
     Evaluate,
     HeartbeatReply,
@@ -27,7 +28,7 @@ from millrace.protocol.messages import (
     Welcome,
 )
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.specs import ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec, StepSpec
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
@@ -45,7 +46,8 @@ def messages(lanes: int) -> list[ToWorker]:
     """Every type of message, in an order in which a client obeys them. With one lane of a run, that has one copy."""
     weights = np.linspace(-1, 1, acting_size(POLICY), dtype=np.float32)
     return [
-        Welcome(SESSION, 1, DescribeSpec(CARTPOLE)),
+        Welcome(SESSION, 1, WaitSpec()),
+        Describe(SESSION, 20, CARTPOLE),
         Welcome(SESSION, 1, STEP),
         Reset(SESSION, 1, 0, 0, (0, 1), (5, None), OPTIONS),
         Step(SESSION, 2, 0, 0, (np.array([0, 1]),)),

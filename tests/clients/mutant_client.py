@@ -170,6 +170,12 @@ class Mutant(WorkerLink):
             case "described once", Described():
                 was_said, self.described = self.described, True
                 return [] if was_said else [message]
+            case "describes another order", Described():
+                return [replace(message, ticket=message.ticket - 1)]
+            case "does not say that it waits", Heartbeat():
+                return [replace(message, waits=False)]
+            case "counts replies anew when the run begins", Heartbeat() if not message.waits:
+                return [replace(message, replies=0)]
             case "no new Hello in silence", Hello():
                 was_said, self.said_hello = self.said_hello, True
                 return [] if was_said else [message]
@@ -218,6 +224,8 @@ class Mutant(WorkerLink):
                 obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in run.observation)
                 flags = np.zeros(N, bool)
                 self.say(Stepped(session, 1, 0, 0, obs, np.zeros(N), flags, flags, FLAT))
+            case "never begins", Welcome() if message.session == self.session:
+                return []
             case "begins again at a repeated Welcome", Welcome() if message.session == self.session:
                 self.begins_again = True
                 return []

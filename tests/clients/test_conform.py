@@ -22,12 +22,14 @@ WORKER = (sys.executable, "-m", "millrace", "worker", "{address}")
 SHORT = {
     "environment": (
         "says Hello first, under its own name",
-        "describes its environment, with every Heartbeat",
+        "describes its environment on order",
+        "begins a vector environment in the session in which it waited",
         "ends episodes, and resets a copy in the step after",
         "ignores what it cannot read: extra field, missing frame, unknown type",
         "drains while it steps",
     ),
     "collector": (
+        "begins a run in the session in which it waited",
         "keeps the row format where episodes end",
         "sends a lost rollout again, the same",
         "closes a lane that is released while a ticket waits",
@@ -47,11 +49,11 @@ SKIPPED = {  # by clients in other languages
 
 
 @pytest.mark.parametrize("profile", SHORT)
-def test_the_python_worker_passes_five_checks(profile: str) -> None:
+def test_the_python_worker_passes_some_checks(profile: str) -> None:
     checks = [check for check in PROFILES[profile] if check.name in SHORT[profile]]
     results = conform(ClientCommand(WORKER), checks, Settings(EnvSpec("CartPole-v1")), 60.0, lambda result: None)
     assert [result.name for result in results] == list(SHORT[profile])
-    assert [result.outcome for result in results] == ["passed"] * 5, [explanation(result) for result in results]
+    assert [result.outcome for result in results] == ["passed"] * len(checks), [explanation(result) for result in results]
 
 
 def test_a_client_that_has_just_ended_is_told_to_stop_without_an_error() -> None:

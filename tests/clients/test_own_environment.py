@@ -135,7 +135,7 @@ def test_a_client_joins_a_learner_that_is_killed_and_resumed_twice(stage: Stage,
         runs.trains(2)
         runs.kill()
         runs = resumed(stage, runs, address)
-        client.hears("joining again", START_S, times=1 + kill)  # once after it has described the environment
+        client.hears("joining again", START_S, times=kill)
     runs.trains(2)
     runs.signal(signal.SIGINT)
     assert runs.ends(60) == 130

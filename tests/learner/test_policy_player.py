@@ -11,6 +11,8 @@ import pytest
 
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.conversations import lobby_settings
+from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
@@ -61,6 +63,10 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     assert saved_policy(folder.path).facts == ("of_card",)
 
 
+def lobby(link: FakeLink, processes: ProcessCallbacks) -> Lobby:
+    return Lobby(cast(LearnerLink, link), processes, lobby_settings(RolloutConfig()))
+
+
 class FourWorkers(FakeLink):
     """Four workers that answer each ticket at once. One of them is killed by its first."""
 
@@ -87,7 +93,7 @@ class FourWorkers(FakeLink):
         run = run_spec()
         policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
         processes, settings = ProcessCallbacks(self.ended, expected=4), RolloutConfig(max_env_failures=max_env_failures)
-        return PolicyPlayer(policy, cast(LearnerLink, self), processes, lambda: None, lambda text: None, settings)
+        return PolicyPlayer(policy, lobby(self, processes), lambda: None, lambda text: None, settings)
 
 
 @pytest.mark.parametrize("killed", [b"w0", b"w3"])
@@ -121,7 +127,7 @@ def test_an_episode_that_does_not_end_is_shown_with_its_env_steps_and_their_boun
             raise KeyboardInterrupt
 
     policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
-    player = PolicyPlayer(policy, cast(LearnerLink, Endless()), ProcessCallbacks(), stop, shown.append, RolloutConfig())
+    player = PolicyPlayer(policy, lobby(Endless(), ProcessCallbacks()), stop, shown.append, RolloutConfig())
     with pytest.raises(KeyboardInterrupt):
         player.play(EvaluationPlan.of(2, seed=5, copies=2, max_steps=100_000), bound="--max-steps:", before=(3, 500))
     assert shown[-1] == "3 of 5 episodes, 31,500 env steps (--max-steps: 50,000 each)"

@@ -42,7 +42,7 @@ SAVED: dict[type, set[str]] = {
     SentWeights: {"kept"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "versions"}
-    | {"strikes", "takeovers"},
+    | {"strikes", "takeovers", "welcomed"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order"},
     Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent"},

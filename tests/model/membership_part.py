@@ -42,6 +42,7 @@ def _member(member: Member, now: float) -> Content:
         tuple(sorted(member.lanes)),
         tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items() if number < FIRST_TICKET),
         replies(member.replies),
+        replies(member.welcomed),
         member.takeovers,
         (
             (tuple((version, replies(sent_at)) for version, sent_at in sorted(member.versions.items())), member.strikes)
@@ -55,12 +56,13 @@ def load(membership: Membership[M], content: Content, kind: type[M]) -> None:
     """Give a new membership this content."""
     members, _, none_silent, refused = content
     for join_number, fields in enumerate(members):
-        worker, nonce, attempt, evaluates, number, heard, lanes, tickets, replies, takeovers, collecting = fields
+        worker, nonce, attempt, evaluates, number, heard, lanes, tickets, *more = fields
+        replies, welcomed, takeovers, collecting = more
         said = hello(worker.value, nonce.value, attempt.value, evaluates=evaluates)
         member = kind(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
-        member.replies, member.takeovers = replies.value, takeovers
+        member.replies, member.welcomed, member.takeovers = replies.value, welcomed.value, takeovers
         if isinstance(member, CollectingMember):
             member.versions, member.strikes = {version: sent_at.value for version, sent_at in collecting[0]}, collecting[1]
         membership.members[member.peer] = member

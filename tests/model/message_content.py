@@ -8,10 +8,14 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
+import numpy as np
+
+from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
+    Describe,
+    Described,
     EpisodeRows,
     Evaluate,
     Evaluated,
@@ -31,11 +35,19 @@ from millrace.protocol.messages import (
     Welcome,
 )
 from millrace.protocol.rollout import Episode
-from millrace.protocol.specs import RunSpec, StepSpec
+from millrace.protocol.space_spec import DiscreteSpace, EnvDescription
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
+from millrace.protocol.wire.plain_values import pack
 from tests.model.conversation import Content
-from tests.model.names import Kind, Name, name
+from tests.model.names import FIRST_OF, Kind, Name, name
+from tests.model.settings import TICK_S, TIMEOUT_S
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
 
+ENV = EnvSpec("Fake-v0")
+WAIT = WaitSpec(heartbeat_s=TICK_S, learner_timeout_s=TIMEOUT_S)
+"""What workers are welcomed by before the run."""
+TWO = DiscreteSpace(2, 0, "int64")
+DESCRIPTION = EnvDescription(TWO, TWO, np.frombuffer(pack({}), np.uint8), "", 0, "")
 EPISODE_STEPS = 2  # of each episode of an evaluation, as `tests.support.conversation.fake_ends` plays them
 
 
@@ -52,10 +64,9 @@ def session(number: int) -> Name:
 
 
 def ticket(number: int) -> Name:
-    """The name of a ticket for a rollout, or for a part of an evaluation."""
-    if number >= FIRST_TICKET:
-        return name(Kind.EVALUATION, number - FIRST_TICKET)
-    return name(Kind.TICKET, number)
+    """The name of a ticket for a rollout, for a part of an evaluation, or for a description."""
+    kind = next((kind for kind, first in FIRST_OF.items() if number >= first), Kind.TICKET)
+    return name(kind, number - FIRST_OF.get(kind, 0))
 
 
 def incarnation(lane: int, number: int) -> Name:
@@ -93,11 +104,15 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
             return "Hello", name(Kind.NONCE, message.process_nonce, worker), attempt, message.evaluates
         case Heartbeat(number, replies, versions, tickets):
             held = tuple(ticket(each) for each in sorted(tickets))
-            return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), versions, held
+            return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), versions, held, message.waits
         case Rollout():
             return "Rollout", *rollout_content(message)
-        case Welcome(number, attempt):
-            return "Welcome", session(number), name(Kind.ATTEMPT, attempt, worker)
+        case Welcome(number, attempt, run):
+            return "Welcome", session(number), name(Kind.ATTEMPT, attempt, worker), isinstance(run, WaitSpec)
+        case Describe(number, each):
+            return "Describe", session(number), ticket(each)
+        case Described(number, each):
+            return "Described", session(number), ticket(each)
         case Refuse():
             return ("Refuse",)
         case Rejoin(number):
@@ -123,18 +138,22 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
             raise AssertionError(f"the model has no {type(message).__name__}")
 
 
-def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
+def message_of(content: Content, worker: int, run: WaitSpec | RunSpec | StepSpec) -> Any:
     """The message of this content, from or to this worker."""
     match content:
         case "Hello", nonce, attempt, evaluates:
             return hello(worker, nonce.value, attempt.value, evaluates=evaluates)
-        case "Heartbeat", number, replies, versions, tickets:
+        case "Heartbeat", number, replies, versions, tickets, waits:
             held = tuple(each.value for each in tickets)
-            return Heartbeat(number.value, replies.value, versions, held, 0, {}, 0)
+            return Heartbeat(number.value, replies.value, versions, held, 0, {}, 0, waits=waits)
         case "Rollout", *fields:
             return rollout_of(tuple(fields))
-        case "Welcome", number, attempt:
-            return Welcome(number.value, attempt.value, run)
+        case "Welcome", number, attempt, waits:
+            return Welcome(number.value, attempt.value, WAIT if waits else run)
+        case "Describe", number, each:
+            return Describe(number.value, each.value, ENV)
+        case "Described", number, each:
+            return described(number.value, each.value)
         case ("Refuse",):
             return Refuse("refused")
         case "Rejoin", number:
@@ -155,6 +174,11 @@ def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
         case "Evaluated", number, each, returns:
             return evaluated(number.value, each.value, returns)
     raise AssertionError(content)
+
+
+def described(number: int, of_ticket: int) -> Described:
+    """The answer to an order to describe the environment."""
+    return Described(number, of_ticket, DESCRIPTION)
 
 
 def evaluated(number: int, of_ticket: int, returns: tuple[float, ...]) -> Evaluated:

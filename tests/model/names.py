@@ -13,7 +13,8 @@ from collections.abc import Iterable
 from enum import IntEnum
 from typing import Any
 
-from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
+from millrace.learner.members.describe_coordinator import FIRST_TICKET as DESCRIPTIONS
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET as EVALUATIONS
 
 BITS = 20
 MASK = (1 << BITS) - 1
@@ -39,11 +40,15 @@ class Kind(IntEnum):
     OLD_SESSION = 8
     OLD_TICKET = 9
     EVALUATION = 10
-    """ticket of an evaluation, counted from `FIRST_TICKET`; keeps its value, which says what it is a ticket for"""
+    """ticket of an evaluation, counted from the first one; keeps its value, which says what it is a ticket for"""
+    DESCRIPTION = 11
+    """ticket of a description, counted from the first one; keeps its value, too"""
 
 
 SCOPED = {Kind.REPLIES: Kind.SESSION, Kind.ATTEMPT: Kind.WORKER, Kind.NONCE: Kind.WORKER}
 OF_WORKER = {kind for kind, scope in SCOPED.items() if scope is Kind.WORKER}
+FIRST_OF = {Kind.EVALUATION: EVALUATIONS, Kind.DESCRIPTION: DESCRIPTIONS}
+"""The first ticket of a kind whose tickets do not begin with 0."""
 OLD = {Kind.OLD_SESSION: Kind.SESSION, Kind.OLD_TICKET: Kind.TICKET}
 
 
@@ -60,7 +65,7 @@ class Name(int):
 
     @property
     def value(self) -> int:
-        return self & MASK if self >> 2 * BITS != Kind.EVALUATION else FIRST_TICKET + (self & MASK)
+        return FIRST_OF.get(self.kind, 0) + (self & MASK)
 
     def __repr__(self) -> str:
         scope = f"{self.scope}:" if self.kind in SCOPED or self.kind is Kind.INCARNATION else ""
@@ -108,7 +113,7 @@ def renaming(names: Iterable[int], workers: dict[int, int]) -> dict[Name, Name |
             base = kind << 2 * BITS | scope << BITS
         if kind is Kind.WORKER:
             to = base | workers[old & MASK]
-        elif kind is Kind.EVALUATION:
+        elif kind in FIRST_OF:
             to = base | old & MASK
         elif kind is Kind.ATTEMPT:
             attempt = (old & MASK) % ATTEMPTS

@@ -2,9 +2,10 @@
 
 Rule: the program itself is explored, not a description of it. In training every rule of tickets, lanes and weights holds,
 those of opponents among them, and the run reaches its target; each evaluation is of one version, its episodes count once,
-and no ticket for a rollout is dealt meanwhile, unless workers that have no lanes play it; each order of a vector environment
-is executed once, a lost lane is reported once and reset before it steps, and every call returns, or is made again. Mistakes
-that are made on purpose are found.
+and no ticket for a rollout is dealt meanwhile, unless workers that have no lanes play it; each order of a vector
+environment is executed once, a lost lane is reported once and reset before it steps, and every call returns, or is made
+again. One worker of those that join before there is a run describes the environment, and all take part in the run in the
+same sessions. Mistakes that are made on purpose are found.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import pytest
 
 from tests.model import mutations
 from tests.model.conversation import Conversation
+from tests.model.describing import mutations as of_describing
+from tests.model.describing.describing import Describing
 from tests.model.evaluation import mutations as of_evaluation
 from tests.model.evaluation.evaluating import Evaluating
 from tests.model.mutations import check_that_they_fit, find
@@ -23,10 +26,11 @@ from tests.model.training import Training
 from tests.model.vector_env import mutations as of_vector_env
 from tests.model.vector_env.stepping import Stepping
 
-LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_evaluation, of_vector_env)}
+LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_describing, of_evaluation, of_vector_env)}
 SMALL: list[Conversation] = [
     Training(workers=2, lanes=2, updates=5, faults=0, opponents=3),
     Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
+    Describing(workers=2, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1), evaluators=0),
@@ -47,6 +51,9 @@ LARGE: list[Conversation] = [
     Training(workers=1, lanes=1, updates=3, faults=2, opponents=3),
     Training(workers=2, lanes=1, updates=3, faults=1, max_lag=1, opponents=2),
     Training(workers=1, lanes=2, updates=4, faults=1, max_lag=1, opponents=2),
+    Describing(workers=1, lanes=1, updates=1, faults=2),
+    Describing(workers=2, lanes=2, updates=1, faults=1),
+    Describing(workers=2, lanes=1, updates=1, faults=2),
     Evaluating(workers=2, lanes=1, updates=1, faults=1),
     Evaluating(workers=2, lanes=1, updates=1, faults=1, evaluated=(1,)),
     Evaluating(workers=2, lanes=1, updates=1, faults=1, episodes=1, rows=True),
@@ -92,6 +99,7 @@ def test_a_mistake_is_found_and_told_as_a_story() -> None:
 @pytest.mark.parametrize(
     ("module", "name", "rule"),
     [
+        (of_describing.__name__, "all workers describe", "2 workers are asked to describe, instead of 1"),
         (of_evaluation.__name__, "a ticket that was put back is lost", "a ticket of an evaluation is not in one place"),
         (of_vector_env.__name__, "a lost order is not sent again", "a worker that is heard does not answer"),
     ],

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from millrace.learner.members.describe_coordinator import DescribeCoordinator
 from millrace.learner.members.lane_placement import LanePlacement
 from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.collecting_member import CollectingMember
@@ -21,16 +22,25 @@ from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
-from millrace.workers.conversation.held import HeldEvaluations, HeldOrders, HeldRollouts, OrderLane, RolloutLane
+from millrace.workers.conversation.held import (
+    HeldDescriptions,
+    HeldEvaluations,
+    HeldOrders,
+    HeldRollouts,
+    OrderLane,
+    RolloutLane,
+)
 from millrace.workers.conversation.session import Session, WorkerIdentity, _SessionState
 from tests.model import learner_part, worker_part
 from tests.model.conversation import Content
+from tests.model.describing import learner_half as of_describing
+from tests.model.describing import worker_half as describing_worker
 from tests.model.evaluation import learner_half as of_evaluation
 from tests.model.evaluation import worker_half as evaluating_worker
-from tests.model.message_content import hello
+from tests.model.message_content import WAIT, hello
 from tests.model.names import names_in, renamed, renaming
 from tests.model.search import Search
-from tests.model.settings import Settings
+from tests.model.settings import TIMEOUT_S, Settings
 from tests.model.training import Training
 from tests.model.vector_env import learner_half as of_vector_env
 from tests.model.vector_env import worker_half as stepping_worker
@@ -115,6 +125,9 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, TicketedLane, Ticket, LanePlacement
     assert [type(each) for each in objects] == [*types, Rounds, Session, _SessionState, HeldRollouts, RolloutLane]
     assert {type(each): set(vars(each)) for each in objects} == known
+    wait = DescribeCoordinator(WAIT, 0, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
+    assert set(vars(wait)) == of_describing.SAVED | of_describing.NOT_SAVED
+    assert set(vars(HeldDescriptions())) == describing_worker.SAVED
     assert set(vars(EvaluationDealer(settings.run))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
     assert set(vars(HeldEvaluations())) == evaluating_worker.SAVED
     stepping = of_vector_env.Learner(Stepping(workers=1, lanes=1, calls=(), faults=0), 0, 0.0).coordinator

@@ -6,10 +6,11 @@ is due. To finish work is an event.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from millrace.protocol.messages import Collect, Evaluate, HeartbeatReply, ToLearner, ToWorker
+from millrace.protocol.messages import Collect, Describe, Evaluate, HeartbeatReply, ToLearner, ToWorker
 from millrace.workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
 from millrace.workers.conversation.session import (
     EvaluationTask,
@@ -17,12 +18,13 @@ from millrace.workers.conversation.session import (
     RolloutTask,
     SendMessage,
     Session,
+    WorkAnswer,
     WorkerEffect,
     _SessionState,
 )
 from tests.model import process_part
 from tests.model.conversation import Content
-from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
+from tests.model.message_content import described, incarnation, rollout_content, rollout_of, session, ticket, weights
 from tests.model.process_part import Process
 from tests.model.settings import Settings
 from tests.support.conversation.fake_ends import fake_evaluated, fake_rollouts, held_count
@@ -35,7 +37,7 @@ SAVED: dict[type, set[str]] = {
 }
 NOT_SAVED: dict[type, set[str]] = {
     Session: {"_statistics", "_join_timeout_s", "_rejoin_timeout_s", "_joining_s", "_backoff_s", "_reason"},
-    _SessionState: {"evaluations", "orders", "described"},
+    _SessionState: {"evaluations", "orders", "descriptions"},
     HeldRollouts: set(),
     RolloutLane: set(),
 }
@@ -46,7 +48,7 @@ class Worker(Process):
     """One state of a worker, which an event changes."""
 
     settings: Settings
-    task: RolloutTask | EvaluationTask | None = None
+    task: RolloutTask | EvaluationTask | Describe | None = None
 
     def end(self) -> None:
         super().end()
@@ -69,14 +71,14 @@ class Worker(Process):
         assert self.session is not None
         assert self.task is not None
         task, self.task = self.task, None
-        answers = fake_rollouts(task) if isinstance(task, RolloutTask) else [fake_evaluated(task)]
+        answers = _answers(task)
         held = self.session._current
         before = set(held.weights)
         effects = self.session.work_ended(answers)
         assert set(held.weights) == before, "a worker drops weights when a ticket ends"
         return self.turn(effects, now)
 
-    def _begin(self, work: RolloutTask | EvaluationTask) -> list[ToLearner]:
+    def _begin(self, work: RolloutTask | EvaluationTask | Describe) -> list[ToLearner]:
         """What the worker says when this work begins."""
         self.task = work
         if isinstance(work, RolloutTask):
@@ -108,7 +110,7 @@ class Worker(Process):
         work = current.next_work()
         if work is not None:
             assert self.task is None, "a worker does two pieces of work at the same time"
-            assert isinstance(work, RolloutTask | EvaluationTask)
+            assert isinstance(work, RolloutTask | EvaluationTask | Describe)
             effects = effects + [SendMessage(said) for said in self._begin(work)]
         effects = effects + current.tick(now)
         rounds = 1 + self.settings.max_lag
@@ -129,6 +131,16 @@ class Worker(Process):
             if isinstance(effect, Leave):
                 self.end()
         return sent
+
+
+def _answers(task: RolloutTask | EvaluationTask | Describe) -> Sequence[WorkAnswer]:
+    """What this work leads to."""
+    match task:
+        case RolloutTask():
+            return fake_rollouts(task)
+        case EvaluationTask():
+            return [fake_evaluated(task)]
+    return [described(task.session, task.ticket)]
 
 
 # -------------------------------------------------------------------- to tuples and back

@@ -55,7 +55,7 @@ RECORDS: tuple[type, ...] = (
     rollout.Episode,
     space_spec.EnvDescription,
     *typing.get_args(space_spec.SpaceSpec),
-    specs.DescribeSpec,
+    specs.WaitSpec,
     specs.RunSpec,
     specs.StepSpec,
     call_timeouts.CallTimeouts,
@@ -127,6 +127,7 @@ PROSE: Mapping[type, tuple[str, ...]] = {
     Hello: ("Transport", OF_WORKER),
     messages.Alive: ("What a worker does in a session", SHARED),
     messages.Described: ("Describe",),
+    messages.Describe: ("Describe", REPAIRS),
     Rollout: (COLLECTS, "Packed arrays"),
     messages.Heartbeat: (OF_WORKER, REPAIRS),
     messages.Goodbye: (OF_WORKER,),
@@ -135,7 +136,7 @@ PROSE: Mapping[type, tuple[str, ...]] = {
     messages.Evaluated: (COLLECTS,),
     messages.Stepped: (STEPS,),
     messages.Returned: (STEPS,),
-    messages.Welcome: ("What a worker does in a session", OF_LEARNER),
+    messages.Welcome: ("What a worker does in a session", "Describe", OF_LEARNER),
     messages.Refuse: (OF_WORKER,),
     messages.Rejoin: (OF_WORKER, OF_LEARNER),
     Weights: (COLLECTS, "The ticket law", SHARED),
@@ -493,8 +494,8 @@ def test_an_example_is_within_its_bounds(message: Hello | Collect | Weights) -> 
 
 def test_a_factory_stands_in_the_head_as_the_document_says() -> None:
     env = env_spec.EnvSpec("mine", factory=env_spec.PickledCallable(b"abc"))
-    head, frame = codec.encode(messages.Welcome(1, 78, specs.DescribeSpec(env)))
-    assert msgspec.msgpack.decode(head)[3]["env"]["factory"] == ["|u1", [3], 1]
+    head, frame = codec.encode(messages.Describe(1, 78, env))
+    assert msgspec.msgpack.decode(head)[3]["factory"] == ["|u1", [3], 1]
     assert (bytes(frame), '`["|u1", [bytes], frame]`' in DOCUMENT.read_text(encoding="utf-8")) == (b"abc", True)
 
 

@@ -7,7 +7,7 @@ import select
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import msgspec
 import numpy as np
@@ -16,11 +16,14 @@ import pytest
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.arrays import Array
 from millrace.protocol.call_timeouts import OUR_CODE, CallTimeouts
+from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
     Collect,
+    Describe,
     Drain,
     Failure,
     Goodbye,
+    Hello,
     Inquire,
     Permit,
     Received,
@@ -33,7 +36,7 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.rollout import rollout_bytes
-from millrace.protocol.specs import RunSpec
+from millrace.protocol.specs import RunSpec, WaitSpec
 from millrace.protocol.wire import codec
 from millrace.protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
 from millrace.protocol.wire.compression import Packing
@@ -44,12 +47,17 @@ from millrace.workers.activity import ActivityReader, activity
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.session import Leave, Session
 from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import Slots
 from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
 from millrace.workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
+
+
+NO_SUCH = EnvSpec("tests.no_such_module:Env-v0")
+SAYS = "environment tests.no_such_module:Env-v0: no module named tests.no_such_module; is it installed, or its folder on"
 
 
 class FakeLink:
@@ -309,3 +317,44 @@ def test_only_the_time_in_which_a_joining_worker_listens_is_time_without_an_answ
     session = Session(replace(identity("w0"), process_nonce=0), 0.0, rejoin_timeout_s=150.0)
     Worker(cast(WorkerLink, link), session, WorkerOptions(make_actors=slow_to_close), clock=lambda: link.now).run()
     assert [(at - closed_at[0]) // CONNECT_AGAIN_S for at in link.made_at] == [1, 2]
+
+
+# ---------------------------------------------------------------------------------------- without the environment
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        [Welcome(1, 1, WaitSpec()), Describe(1, 7, NO_SUCH)],
+        said_to_a_worker(msgspec.structs.replace(RUN, env=NO_SUCH)),
+    ],
+    ids=["asked to describe it", "asked to collect"],
+)
+def test_a_worker_that_lacks_the_environment_declines_and_is_not_started_again(said: list[ToWorker]) -> None:
+    """It was not asked to describe it, if another worker had joined earlier."""
+    link = FakeLink(said)
+    left = work(link)
+    assert left.exit_code == EXIT_UNSUITABLE
+    assert left.reason.startswith(SAYS)
+    assert [type(message) for message in link.heard()] == [Hello, Goodbye]
+
+
+def test_the_copy_that_a_worker_has_described_is_the_first_of_its_lane(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[object] = []
+    make = EnvSpec.make
+
+    def counted(self: EnvSpec, render_mode: str | None = None) -> Any:
+        made.append(self)
+        return make(self, render_mode)
+
+    welcome, *said = said_to_a_worker(RUN)
+    alone = FakeLink([welcome, *said])
+    work(alone)
+    monkeypatch.setattr(EnvSpec, "make", counted)
+    link = FakeLink([Welcome(1, 1, WaitSpec()), Describe(1, 7, RUN.env), welcome, *said])
+    assert work(link).exit_code == 0
+    assert len(made) == RUN.copies
+    expected, found = (
+        [message for message in each.heard(rollout_bytes(RUN)) if isinstance(message, Rollout)] for each in (alone, link)
+    )
+    assert [bits(rollout) for rollout in found] == [bits(rollout) for rollout in expected]

@@ -7,6 +7,7 @@ the answer was lost. How long it is kept bounds the memory of a worker:
 - the result of an evaluation: until there are `KEPT_RESULTS` later ones. If its rows were sent too, it is not kept: rows are
   large, and the evaluation can be executed again, with the same episodes.
 - the answer to an order (Reset, Step, Call) of a vector environment: until the next order of its lane.
+- a description of an environment: until the next one is asked for, or the run begins.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from millrace.protocol.messages import (
     Answer,
+    Describe,
+    Described,
     Evaluate,
     Evaluated,
     LaneIncarnation,
@@ -30,7 +33,7 @@ from millrace.protocol.messages import (
 KEPT_RESULTS = 8  # a learner gives a worker at most two evaluations at a time, so only the last two results can be missing
 
 AskedT = TypeVar("AskedT")
-AnsweredT = TypeVar("AnsweredT", bound=Rollout | Evaluated | Answer)
+AnsweredT = TypeVar("AnsweredT", bound=Rollout | Evaluated | Described | Answer)
 
 
 @dataclass
@@ -82,6 +85,24 @@ class HeldEvaluations(Held[Evaluate, Evaluated]):
         if len(self.answered) > KEPT_RESULTS:
             del self.answered[next(iter(self.answered))]
         return kept
+
+
+class HeldDescriptions(Held[Describe, Described]):
+    """Orders to describe an environment. Only the newest counts: tickets rise with every order."""
+
+    def take(self, ticket: int, asked: Describe) -> Described | None:
+        """Take an order. Returns the answer to send again, if any."""
+        newest = max((*self.asked, *self.answered), default=-1)
+        if ticket < newest:
+            return None
+        if ticket > newest:
+            self.asked.clear()
+            self.answered.clear()
+        return super().take(ticket, asked)
+
+    def next(self) -> Describe | None:
+        """The order that is not yet executed."""
+        return next(iter(self.asked.values()), None)
 
 
 @dataclass

@@ -1,9 +1,10 @@
 """The worker's half of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
 Rule: a rollout and an evaluation start only under the weights that they name. A message that is lost does no harm, because
-the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends again what is missing. What a
-worker holds is in `held.py`. Each order lists the weights to keep: those that it does not list and no ticket names are
-dropped.
+the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends again what is missing. What
+a worker holds is in `held.py`. A worker that was welcomed before there is a run waits in its session: it describes
+environments on order, and a second Welcome brings the run. Each order lists the weights to keep: those that it does not
+list and no ticket names are dropped.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from millrace.protocol.messages import (
     Answer,
     Call,
     Collect,
+    Describe,
     Described,
     Drain,
     Evaluate,
@@ -42,10 +44,9 @@ from millrace.protocol.messages import (
     Weights,
     Welcome,
 )
-from millrace.protocol.space_spec import EnvDescription
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.workers.conversation.connection_rules import REJOIN_TIMEOUT_S
-from millrace.workers.conversation.held import Assignment, HeldEvaluations, HeldOrders, HeldRollouts
+from millrace.workers.conversation.held import Assignment, HeldDescriptions, HeldEvaluations, HeldOrders, HeldRollouts
 from millrace.workers.conversation.worker_states import (
     TABLE,
     LearnerSilent,
@@ -71,7 +72,14 @@ class SendMessage:
 class StartSession:
     """Effect: a new session starts; close every env copy of the last one."""
 
-    run: DescribeSpec | RunSpec | StepSpec
+    run: WaitSpec | RunSpec | StepSpec
+
+
+@dataclass(frozen=True)
+class BeginRun:
+    """Effect: the run that this session has waited for begins."""
+
+    run: RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Leave:
     reason: str
 
 
-WorkerEffect = SendMessage | StartSession | CloseLanes | Leave
+WorkerEffect = SendMessage | StartSession | BeginRun | CloseLanes | Leave
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,8 @@ class SharedOrders:
     session: int
 
 
-Work = RolloutTask | EvaluationTask | Order
+Work = Describe | RolloutTask | EvaluationTask | Order
+WorkAnswer = Rollout | Evaluated | Described | Answer
 
 
 @dataclass(frozen=True)
@@ -173,24 +182,26 @@ class Statistics:
 class _SessionState:
     """All that belongs to one session. A new session starts with a new one."""
 
+    descriptions: HeldDescriptions = field(default_factory=HeldDescriptions)
     rollouts: HeldRollouts = field(default_factory=HeldRollouts)
     evaluations: HeldEvaluations = field(default_factory=HeldEvaluations)
     orders: HeldOrders = field(default_factory=HeldOrders)
-    described: Described | None = None  # sent with every Heartbeat, because one may be lost
     weights: dict[int, Weights] = field(default_factory=dict)  # by version
     in_progress: bool = False  # whether a piece of work is
     replies: int = 0  # number of the last HeartbeatReply
 
     def unfinished(self) -> tuple[int, ...]:
         """Tickets that are not yet collected or executed."""
-        return (*self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())
+        return (*self.descriptions.asked, *self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
         return (*self.rollouts.lanes(), *self.orders.lanes())
 
     def next_work(self, session: int) -> Work | None:
-        """The next piece of work: an evaluation, else rollouts to collect together, else an order."""
+        """The next piece of work: a description, else an evaluation, else rollouts to collect together, else an order."""
+        if (description := self.descriptions.next()) is not None:
+            return description
         if (evaluation := self.evaluations.next(self.weights)) is not None:
             return EvaluationTask(self.weights[evaluation.version], evaluation, self.weights)
         version, assignments = self.rollouts.startable(self.weights)
@@ -211,13 +222,15 @@ class _SessionState:
         kept = self.asked_versions().union(listed)
         self.weights = {version: weights for version, weights in self.weights.items() if version in kept}
 
-    def keep(self, answer: Rollout | Evaluated | Answer) -> bool:
+    def keep(self, answer: WorkAnswer) -> bool:
         """Keep what work has led to; False if it is no longer wanted, for example because its lane was released."""
         match answer:
             case Rollout():
                 return self.rollouts.keep(answer)
             case Evaluated():
                 return self.evaluations.keep(answer)
+            case Described():
+                return self.descriptions.keep(answer)
         return self.orders.keep(answer)
 
     def release(self, lanes: Sequence[LaneIncarnation]) -> list[WorkerEffect]:
@@ -247,7 +260,7 @@ class Session:
     ) -> None:
         self.identity = identity
         self.state = WorkerState.JOINING
-        self.run: DescribeSpec | RunSpec | StepSpec | None = None
+        self.run: WaitSpec | RunSpec | StepSpec | None = None
         self.session = 0
         self._statistics = Statistics()
         self._join_timeout_s = join_timeout_s
@@ -281,8 +294,10 @@ class Session:
                 return self._rejoin(message, "the learner does not know this session", now)
         self._unanswered_s = math.inf
         current = self._current
-        again: list[Rollout | Evaluated | Answer | None] = []
+        again: list[WorkAnswer | None] = []
         match message:
+            case Describe() if isinstance(self.run, WaitSpec):
+                again = [current.descriptions.take(message.ticket, message)]
             case Weights(version):
                 current.weights.setdefault(version, message)
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
@@ -336,8 +351,9 @@ class Session:
             stages=dict(statistics.stages),
             resident_bytes=statistics.resident_bytes,
             note=statistics.note,
+            waits=isinstance(self.run, WaitSpec),
         )
-        return [SendMessage(each) for each in (heartbeat, current.described) if each is not None]
+        return [SendMessage(heartbeat)]
 
     def update_statistics(self, statistics: Statistics) -> None:
         """The next Heartbeat reports these."""
@@ -363,15 +379,6 @@ class Session:
         """Leave, because the learner, or its endpoint, rejects this worker for good."""
         return self._leave(Refuse(reason), 2, reason)
 
-    # ---------------------------------------------------------------- describing
-
-    def described(self, description: EnvDescription) -> list[WorkerEffect]:
-        """The environment of the `DescribeSpec` is described."""
-        if self.state not in (WorkerState.READY, WorkerState.DRAINING):
-            return []
-        self._current.described = Described(self.session, description)
-        return [SendMessage(self._current.described)]
-
     # ---------------------------------------------------------------- working
 
     def next_work(self) -> Work | None:
@@ -386,7 +393,7 @@ class Session:
         """Versions of the weights that this worker is asked to act under, and does not hold."""
         return self._current.missing_versions()
 
-    def work_ended(self, answers: Sequence[Rollout | Evaluated | Answer]) -> list[WorkerEffect]:
+    def work_ended(self, answers: Sequence[WorkAnswer]) -> list[WorkerEffect]:
         """The work in progress has ended with these answers; with none, it was abandoned. A worker that drains leaves."""
         current = self._current
         # The session may have ended, or the lane may have been released, in the meantime.
@@ -409,8 +416,10 @@ class Session:
         self._current = _SessionState()
 
     def _welcome(self, message: Welcome, now: float) -> list[WorkerEffect]:
-        if message.attempt != self._attempt or (self.state is WorkerState.READY and message.session == self.session):
-            return []  # the answer to an earlier Hello, or a repeat
+        if message.attempt != self._attempt:
+            return []  # the answer to an earlier Hello
+        if self.state is WorkerState.READY and message.session == self.session:
+            return self._welcome_again(message.run, now)
         self.state = TABLE[self.state][type(message)]
         self._current = _SessionState()
         self.run, self.session = message.run, message.session
@@ -418,6 +427,16 @@ class Session:
         self.due_s = now + message.run.heartbeat_s
         self._join_timeout_s = self._rejoin_timeout_s
         return [StartSession(message.run)]
+
+    def _welcome_again(self, run: WaitSpec | RunSpec | StepSpec, now: float) -> list[WorkerEffect]:
+        """The session goes on. The run may have begun, for which this worker waits; else it is a repeat."""
+        if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):
+            return []
+        self.run = run
+        self._unanswered_s = math.inf
+        self.due_s = min(self.due_s, now + run.heartbeat_s)
+        self._current.descriptions = HeldDescriptions()  # those that are still asked for are not wanted any more
+        return [BeginRun(run)]
 
     def _rejoin(self, event: object, reason: str, now: float) -> list[WorkerEffect]:
         self.state = TABLE[self.state][type(event)]

@@ -7,6 +7,7 @@ from enum import Enum
 from millrace.protocol.messages import (
     Call,
     Collect,
+    Describe,
     Drain,
     Evaluate,
     HeartbeatReply,
@@ -56,6 +57,7 @@ TABLE: dict[WorkerState, dict[type, WorkerState]] = {
         WorkerFailed: WorkerState.LEFT,
     },
     WorkerState.READY: {
+        Describe: WorkerState.READY,
         Weights: WorkerState.READY,
         Collect: WorkerState.READY,
         Evaluate: WorkerState.READY,

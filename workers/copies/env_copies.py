@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -147,10 +146,10 @@ class LoopedCopies:
         `first`: which copy the first one is. In an evaluation, no step resets a copy.
         """
         self._facts, self._activity = facts, activity()
-        makes = (partial(made_without_order_check, make) for make in makes)
         evaluates = first.evaluation
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
-        self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=EVALUATING if evaluates else STEPPING)
+        stepping = EVALUATING if evaluates else STEPPING
+        self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=stepping, dress=without_order_check)
         self.envs, self.count = self._loop.envs, len(self._loop.envs)
         with self._activity.during(MAKING):  # to read an attribute of the environment may run code of its own
             self.observation_space, self.action_space = self.envs[0].observation_space, self.envs[0].action_space
@@ -215,12 +214,7 @@ class LoopedCopies:
         self._loop.close()
 
 
-def made_without_order_check(make: Callable[[], gymnasium.Env[Any, Any]]) -> gymnasium.Env[Any, Any]:
-    """Make an environment without `OrderEnforcing`."""
-    return _without_order_check(make())
-
-
-def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COPY) -> gymnasium.Env[Any, Any]:
     """The environment without `OrderEnforcing`, which only checks that a reset comes before the first step.
 
     The collector always resets first, and the wrapper costs a twentieth of a CartPole step.
@@ -228,7 +222,7 @@ def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any
     while type(env) is OrderEnforcing:
         env = env.env
     if isinstance(env, gymnasium.Wrapper):
-        env.env = _without_order_check(env.env)
+        env.env = without_order_check(env.env)
     return env
 
 

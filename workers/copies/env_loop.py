@@ -32,7 +32,7 @@ from millrace.workers.activity import (
     activity,
 )
 from millrace.workers.copies.env_errors import CopyFailed
-from millrace.workers.copy_slots import close_copy, make_copy
+from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 CopyInfos = list[tuple[int, dict[str, Any]]]
@@ -56,10 +56,12 @@ class EnvLoop:
         ended: bool = False,
         first: EnvCopy = FIRST_COPY,
         stepping: int = STEPPING,
+        dress: Dress[gymnasium.Env[Any, Any]] = as_made,
     ) -> None:
         """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them.
 
         `first` says which copy the first one is; the others follow it. `stepping`: what the worker does during a step.
+        `dress`: takes each copy, and returns what to step in its place, as of `make_copy`.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
         self._activity = activity()
@@ -68,7 +70,7 @@ class EnvLoop:
             try:
                 which = replace(first, number=first.number + n, copy=first.copy + n)
                 with self._activity.during(MAKING):
-                    self.envs.append(make_copy(which, make))
+                    self.envs.append(make_copy(which, make, dress))
             except UsageError:
                 self.close()
                 raise

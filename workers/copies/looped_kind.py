@@ -13,11 +13,12 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.seated_copies import SeatedCopies
+from millrace.workers.copy_slots import EnvMaker
 
 
 def open_loop(run: RunSpec, first: EnvCopy, pulse: Pulse) -> LoopedCopies:
     """Make the copies of a lane."""
-    return loop_over(run, run.env.make, run.copies, first, pulse)
+    return loop_over(run, EnvMaker(run.env), run.copies, first, pulse)
 
 
 def loop_over(

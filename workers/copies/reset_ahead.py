@@ -47,7 +47,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise UsageError(
                 f"ResetAhead: expected an environment of gymnasium.make, got {type(env).__name__} without a spec"
             )
-        self._spec, self._copy = env.spec, being_made.get() or FIRST_COPY
+        self._spec, self._copy = env.spec, being_made() or FIRST_COPY
         self._second: gymnasium.Env[Any, Any] | None = None
         self._second_seed: int | None = None  # of the second instance's next reset
         self._prepared: Future[Prepared] | None = None

@@ -11,7 +11,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from time import perf_counter
 from types import MappingProxyType
 
@@ -32,6 +31,7 @@ from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.looped_kind import loop_over
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
+from millrace.workers.copy_slots import EnvMaker
 from millrace.workers.evaluate.episode_rows import RowSender, SendRows, as_frame
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.rows import EpisodesLost, Rows, RowsOfLane
@@ -45,7 +45,7 @@ OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCop
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
     """Copies in this process. Raises `UsageError` if the environment does not render in this mode, `rgb_array`."""
-    make = partial(run.env.for_evaluation().make, render_mode)
+    make = EnvMaker(run.env.for_evaluation(), render_mode)
     with warnings.catch_warnings():
         if render_mode is not None:
             warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below

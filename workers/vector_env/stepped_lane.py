@@ -7,7 +7,6 @@ copies.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,6 +24,7 @@ from millrace.workers.activity import MAKING, activity
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import CopyInfos, EnvLoop, Pulse
 from millrace.workers.copies.row_writers import ObservationWriter, read_leaves, write_numbers
+from millrace.workers.copy_slots import EnvMaker
 
 
 class ResultRows(NamedTuple):
@@ -53,9 +53,10 @@ class SteppedLane:
         self.executed = 0
         """number of the newest order through shared memory that was executed"""
         first, self.count = spec.first_copy(lane), spec.lanes[lane]
-        makes = [partial(_make_copy, spec, first + copy) for copy in range(self.count)]
+        makes = [EnvMaker(spec.envs[of], spec.render_mode) for of in spec.copies[first : first + self.count]]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
-        self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=_first_copy(spec, lane))
+        which, check = _first_copy(spec, lane), partial(_checked, spec)
+        self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=which, dress=check)
         with activity().during(MAKING):  # to read an attribute of the environment may run code of its own
             observation, action = self._loop.envs[0].observation_space, self._loop.envs[0].action_space
         self._nested_actions = _is_nested(action)
@@ -134,9 +135,9 @@ def _first_copy(spec: StepSpec, lane: int) -> EnvCopy:
     return EnvCopy(number, lane) if position < 0 else EnvCopy(position, copy=position, evaluation=True)
 
 
-def _make_copy(spec: StepSpec, number: int) -> gymnasium.Env[Any, Any]:
-    """Copy `number` of the vector environment. Raises `UsageError` if its spaces are others."""
-    env = spec.envs[spec.copies[number]].make(spec.render_mode)
+def _checked(spec: StepSpec, env: gymnasium.Env[Any, Any], which: EnvCopy) -> gymnasium.Env[Any, Any]:
+    """A copy of the vector environment. Raises `UsageError` if its spaces are others."""
+    copy = f"{'evaluation ' if which.evaluation else ''}copy {which.number}"
     try:
         fits = (leaves_with_own_dtype(env.observation_space), leaves_with_own_dtype(env.action_space)) == (
             spec.observation,
@@ -146,12 +147,10 @@ def _make_copy(spec: StepSpec, number: int) -> gymnasium.Env[Any, Any]:
         fits = False
     if fits and (agents := agents_of(env)[0]) == spec.seats:
         return env
-    with suppress(BaseException):
-        env.close()
     if fits:
-        raise UsageError(f"copy {number}: expected agents {list(spec.seats)} as copy 0 has, got {list(agents)}")
+        raise UsageError(f"{copy}: expected agents {list(spec.seats)} as copy 0 has, got {list(agents)}")
     raise UsageError(
-        f"copy {number}: its observations {env.observation_space} and actions {env.action_space} are not those of the "
+        f"{copy}: its observations {env.observation_space} and actions {env.action_space} are not those of the "
         "vector environment; all copies must have the same, and each machine the same version of the environment"
     )
 

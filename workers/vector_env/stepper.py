@@ -204,7 +204,7 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
             )
         with activity().during(STEPPING):
             if order.name == DESCRIPTION:
-                described = [Described(order.session, each) for each in lane.describe(order.copies)]
+                described = [Described(order.session, order.ticket, each) for each in lane.describe(order.copies)]
                 results = [[bytes(frame) for frame in encode(each)] for each in described]
             elif order.assign:
                 lane.assign(order.copies, order.name, arguments)

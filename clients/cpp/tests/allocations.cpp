@@ -42,8 +42,8 @@ int main(int, char** words) {
   const std::vector<Frames> corpus = read_corpus(words[1]);
   Counted client;
   millrace::Writer head;
-  client.take(corpus[1]);  // Welcome, StepSpec
-  client.take(corpus[2]);  // Reset
+  client.take(corpus[2]);  // Welcome, StepSpec
+  client.take(corpus[3]);  // Reset
   std::vector<unsigned char> actions(16);
   for (std::uint64_t i = 0; i < 1100; ++i) {
     if (i == 100) allocations = 0;
@@ -52,9 +52,9 @@ int main(int, char** words) {
     client.take({head.bytes, actions});
   }
   std::printf("%ld\n", allocations);
-  client.take(corpus[8]);  // Rejoin
-  client.take(corpus[9]);  // Welcome, RunSpec
-  client.take(corpus[11]);  // Weights
+  client.take(corpus[9]);  // Rejoin
+  client.take(corpus[10]);  // Welcome, RunSpec
+  client.take(corpus[12]);  // Weights
   for (std::uint64_t i = 0; i < 40; ++i) {
     if (i == 20) allocations = 0;
     head.begin("Collect", 5).natural(77).natural(3).array(1).array(5).natural(i).natural(0).natural(0).natural(i).nil().array(1).array(3).natural(0).natural(0).natural(i).array(1).natural(3);

@@ -100,7 +100,7 @@ void fuzz(const std::vector<Frames>& corpus, long left) {
   long read = 0, unreadable = 0;
   while (left > 0) {
     Victim<Client> victim;  // until it leaves, or for some messages
-    for (std::size_t i = 0, start = below(2) ? 0 : 9; i < 300 && left > 0 && !victim.over(); ++i, --left) {
+    for (std::size_t i = 0, start = below(2) ? 0 : 10; i < 300 && left > 0 && !victim.over(); ++i, --left) {
       Frames frames = corpus[i < corpus.size() - start ? start + i : below(corpus.size())];
       if (i) mutate(frames);
       victim.take(frames) ? ++read : ++unreadable;

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from millrace.extras.conformance import rules
 from millrace.extras.conformance.join_checks import (
     POLE_GAINS,
+    begins,
     described,
     heartbeats,
     is_gymnasium_pole,
@@ -171,6 +172,13 @@ def collecting(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Sc
     yield from learner.joining()
     learner.welcome(run)
     return Collecting(learner, run)
+
+
+def begins_in_its_session(learner: Learner) -> Script[None]:
+    """The client waits for the run, which begins in the same session."""
+    run = yield from run_spec(learner)
+    yield from begins(learner, run)
+    yield from Collecting(learner, run).collect()
 
 
 def collecting_at_length(learner: Learner, lasts_s: float = LONG_S) -> Script[Collecting]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from msgspec.structs import replace
 
 from millrace.extras.conformance import rules
 from millrace.extras.conformance.learner import Learner
@@ -17,13 +18,14 @@ from millrace.protocol.bounds import MAX_LINE
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, UsageError
 from millrace.protocol.messages import (
+    Answer,
+    Describe,
     Described,
     Drain,
     Goodbye,
     Heartbeat,
     HeartbeatReply,
     Hello,
-    Message,
     Refuse,
     Rejoin,
     Release,
@@ -31,7 +33,7 @@ from millrace.protocol.messages import (
     Weights,
     Welcome,
 )
-from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.socket_options import routing_id
 
 MOST_LIMIT_STEPS = 2000  # of a time limit that a check walks to
@@ -39,27 +41,38 @@ POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # balance the pole of a cart, so that its epi
 SILENCE_S = 1.5  # learner_timeout_s of the check of silence
 
 
-def describe_spec(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> DescribeSpec:
-    """A session in which the client describes its environment."""
-    settings = learner.settings
-    return DescribeSpec(settings.env, heartbeat_s=heartbeat_s or settings.heartbeat_s, learner_timeout_s=learner_timeout_s)
+def wait_spec(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> WaitSpec:
+    """A session in which the client waits for the run."""
+    return WaitSpec(heartbeat_s=heartbeat_s or learner.settings.heartbeat_s, learner_timeout_s=learner_timeout_s)
+
+
+def describe(learner: Learner) -> Describe:
+    """An order to describe the client's environment."""
+    return Describe(learner.session, next(learner.tickets), learner.settings.env)
 
 
 def described(learner: Learner) -> Script[DescribedEnv]:
     """The client's environment. If it is not known yet, the client joins and describes it."""
     if learner.env is None:
-        yield from learner.joining()
-        learner.welcome(describe_spec(learner))
-        within_s = learner.settings.start_s
-        text = f"Described of the environment {learner.settings.env.id} after a Welcome with a DescribeSpec"
-        found = yield from learner.expect((Described, Goodbye), rules.DESCRIBE, text, within_s=within_s)
-        if not isinstance(found, Described):
-            raise Broken(rules.DECLINED, text, brief(found))
-        try:
-            learner.env = read_description(found.description)
-        except (BadMessage, UsageError) as error:
-            raise Broken(rules.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
+        yield from in_any_session(learner)
+        yield from describes_on_order(learner)
+        assert learner.env is not None
     return learner.env
+
+
+def describes_on_order(learner: Learner) -> Script[Describe]:
+    """The client describes its environment, in a session in which it waits for the run. Returns the order."""
+    order = describe(learner)
+    learner.send(order)
+    text = f"Described of the environment {order.env.id}, with ticket {order.ticket} of the order"
+    found = yield from learner.expect((Described, Goodbye), rules.DESCRIBE, text, within_s=learner.settings.start_s)
+    if not isinstance(found, Described):
+        raise Broken(rules.DECLINED, text, brief(found))
+    try:
+        learner.env = read_description(found.description)
+    except (BadMessage, UsageError) as error:
+        raise Broken(rules.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
+    return order
 
 
 def time_limit(learner: Learner) -> Script[int]:
@@ -83,7 +96,7 @@ def heartbeats(learner: Learner, number: int, rule: Rule = rules.HEARTBEAT) -> S
     return beat
 
 
-def over_a_new_connection(learner: Learner, *others: type[Message | Rollout]) -> Script[None]:
+def over_a_new_connection(learner: Learner, *others: type[Answer | Rollout]) -> Script[None]:
     """Every connection is reset. A Heartbeat of the same session comes, or one of these messages."""
     learner.do(CutConnection(), Listen())
     text = "a message of the same session over a new connection"
@@ -137,21 +150,24 @@ def ignores_early_messages(learner: Learner) -> Script[None]:
 def accepts_only_its_welcome(learner: Learner) -> Script[None]:
     """A Welcome that answers another attempt comes late."""
     hello = yield from learner.joining()
-    learner.send(Welcome(77, hello.attempt - 1, describe_spec(learner)))
-    learner.send(Welcome(78, hello.attempt + 1, describe_spec(learner)))
+    learner.send(Welcome(77, hello.attempt - 1, wait_spec(learner)))
+    learner.send(Welcome(78, hello.attempt + 1, wait_spec(learner)))
     text = f"Hello until a Welcome for attempt {hello.attempt} comes"
-    found = yield from learner.expect((Hello, Heartbeat, Described), rules.WELCOME_ATTEMPT, text, within_s=6.0)
+    found = yield from learner.expect((Hello, Heartbeat), rules.WELCOME_ATTEMPT, text, within_s=6.0)
     if not isinstance(found, Hello):
         raise Broken(rules.WELCOME_ATTEMPT, text, brief(found))
 
 
 def describes(learner: Learner) -> Script[None]:
-    """The spaces of the environment, with every Heartbeat."""
-    learner.env = None
-    yield from described(learner)
-    for _ in range(2):
-        yield from heartbeats(learner, 1)
-        yield from learner.expect(Described, rules.DESCRIBE_AGAIN, "Described after each Heartbeat")
+    """The answer is lost, and the order comes again; then there is another order, and one of another session."""
+    yield from in_any_session(learner)
+    order = yield from describes_on_order(learner)
+    learner.send(order)
+    text = f"Described again, as ticket {order.ticket} came again"
+    yield from learner.expect(Described, rules.DESCRIBE_AGAIN, text, ticket=order.ticket)
+    yield from describes_on_order(learner)
+    learner.send(replace(order, session=order.session + 1000, ticket=next(learner.tickets)))
+    yield from learner.quiet(Described, rules.OTHER_SESSION, "no Described after an order of another session", for_s=1.0)
 
 
 # ------------------------------------------------------------------------------------------- a session of any kind
@@ -160,7 +176,7 @@ def describes(learner: Learner) -> Script[None]:
 def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
     """Replies are lost, late and repeated."""
     yield from learner.joining()
-    learner.welcome(describe_spec(learner))  # the first Heartbeat may come before Described, and is answered
+    learner.welcome(wait_spec(learner))
     first = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat", within_s=learner.settings.start_s)
     if first.replies:
         raise Broken(rules.HEARTBEAT_REPLIES, "replies 0 before the first HeartbeatReply of a session", f"{first.replies}")
@@ -186,10 +202,10 @@ def _replies(learner: Learner, number: int) -> Script[None]:
 
 
 def in_any_session(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> Script[None]:
-    """The client joins, and describes its environment: a session that every client has."""
+    """The client joins, and waits for the run: a session that every client has."""
     yield from learner.joining()
-    learner.welcome(describe_spec(learner, heartbeat_s, learner_timeout_s))
-    yield from learner.expect(Described, rules.DESCRIBE, "Described", within_s=learner.settings.start_s)
+    learner.welcome(wait_spec(learner, heartbeat_s, learner_timeout_s))
+    yield from heartbeats(learner, 1)
 
 
 def keeps_the_rhythm(learner: Learner) -> Script[None]:
@@ -209,8 +225,33 @@ def joins_again(learner: Learner) -> Script[None]:
     learner.send(Rejoin(learner.session + 1000))
     yield from learner.quiet(Hello, rules.OTHER_SESSION, "no Hello after a Rejoin of another session", for_s=1.0)
     yield from learner.rejoin()
-    learner.welcome(describe_spec(learner))
+    learner.welcome(wait_spec(learner))
     yield from heartbeats(learner, 1, rules.SESSION)
+
+
+def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
+    """The client joins before there is a run, describes its environment, and begins the run in the same session."""
+    yield from in_any_session(learner)
+    yield from describes_on_order(learner)
+    waited = learner.watch.welcome
+    yield from _replies(learner, 1)
+    learner.begin(run)
+    for message in (waited, learner.watch.welcome):  # late copies
+        learner.send(message)
+    for _ in range(2):
+        found = yield from heartbeats(learner, 1, rules.BEGINS)
+        if not found.replies:
+            raise Broken(rules.BEGINS, "a session that goes on (replies above 0)", "one that began again")
+    yield from _begun(learner)
+
+
+def _begun(learner: Learner) -> Script[None]:
+    """Heartbeats say that the client waits no more."""
+    for _ in range(4):  # one may have been on its way
+        found = yield from heartbeats(learner, 1, rules.BEGINS)
+        if not found.waits:
+            return
+    raise Broken(rules.BEGINS, "waits false in a Heartbeat after the second Welcome", "true")
 
 
 def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
@@ -253,8 +294,8 @@ def outlives_a_restart(learner: Learner) -> Script[None]:
     yield Wait(1.0)
     yield from over_a_new_connection(learner)
     yield from learner.rejoin()
-    learner.welcome(describe_spec(learner))
-    yield from learner.expect(Described, rules.DESCRIBE, "Described in the new session")
+    learner.welcome(wait_spec(learner))
+    yield from describes_on_order(learner)
 
 
 # -------------------------------------------------------------------------------------------------------------- leaving

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, TypeVar
 
+from msgspec.structs import replace
+
 from millrace.extras.conformance import rules
 from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import (
@@ -47,7 +49,7 @@ from millrace.protocol.messages import (
     ToWorker,
     Welcome,
 )
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import Buffer, encode
 
 M = TypeVar("M")
@@ -122,7 +124,7 @@ class Learner:
         self.watch.unreadable(ticket)
         self.effects += [SendFrames(self.peer, frames) for frames in messages]
 
-    def welcome(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
+    def welcome(self, run: WaitSpec | RunSpec | StepSpec) -> None:
         """Answer the newest Hello: a new session begins."""
         assert self.hello is not None
         self.answers_heartbeats = True
@@ -130,6 +132,10 @@ class Learner:
         self._watch = WatchedSession(welcome, self.now, self._steps, is_first=not self._had_a_session)
         self._had_a_session = True
         self.send(self._watch.welcome)
+
+    def begin(self, run: RunSpec | StepSpec) -> None:
+        """The run begins in the session in which the client waits for it."""
+        self.send(replace(self.watch.welcome, run=run))
 
     def do(self, *effects: LearnerEffect) -> None:
         """Have these effects on the client's process and its connections."""

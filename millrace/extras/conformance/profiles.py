@@ -11,13 +11,14 @@ JOINING = [
     Check("says Hello first, under its own name", join_checks.says_hello),
     Check("takes a Welcome of its newest attempt only", join_checks.accepts_only_its_welcome),
     Check("ignores what belongs to no session while it is joining", join_checks.ignores_early_messages),
-    Check("describes its environment, with every Heartbeat", join_checks.describes),
+    Check("describes its environment on order", join_checks.describes),
     Check("beats as often as heartbeat_s says", join_checks.keeps_the_rhythm),
     Check("reports the last HeartbeatReply; replies are lost, late and repeated", join_checks.answers_heartbeats_in_order),
     Check("goes on after a repeated Welcome", join_checks.takes_a_repeated_welcome),
     Check("joins again after Rejoin of its session only", join_checks.joins_again),
 ]
 STEPPING = [
+    Check("begins a vector environment in the session in which it waited", step_checks.begins_in_its_session),
     Check("says nothing without an order", step_checks.says_nothing_without_an_order),
     Check("answers Reset and Step", step_checks.answers_reset_and_step),
     Check("ends episodes, and resets a copy in the step after", step_checks.ends_episodes),
@@ -58,6 +59,7 @@ FAULTS = [
     Check("leaves after SIGTERM while no learner answers", join_checks.stops_while_joining),
 ]
 COLLECTING = [
+    Check("begins a run in the session in which it waited", collect_checks.begins_in_its_session),
     Check("collects rollouts of a lane", collect_checks.collects),
     Check("keeps the row format where episodes end", collect_checks.keeps_rows),
     Check("declines a run of agents that its environment does not have", collect_checks.declines_other_agents),

@@ -182,15 +182,25 @@ HEARTBEAT_VERSIONS = Rule(
     "of the weights held, ascending",
     "list the version of every Weights that is held, and drop all weights when a session ends",
 )
+HEARTBEAT_WAITS = Rule(
+    "Heartbeat",
+    "true: the worker knows of no run, because its `Welcome` brought a `WaitSpec`, and no second one has come",
+    "set `waits` in each Heartbeat from the Welcome that brings a WaitSpec to the one that brings the run, and in no other",
+)
 DESCRIBE = Rule(
     "Describe",
-    "The worker makes one env copy, sends `Described` and then closes the copy",
-    "answer a Welcome whose run has the type DescribeSpec with Described",
+    "The worker makes one env copy and answers with `Described`, which has the ticket of the order",
+    "answer a Describe of this session with Described, and copy its ticket",
 )
 DESCRIBE_AGAIN = Rule(
     "Describe",
-    "It repeats `Described` with every `Heartbeat`, before or after it, because a message may be lost",
-    "keep the description until the session ends, and send it after each Heartbeat",
+    "An order that comes again is answered by the same description again",
+    "answer each Describe that comes, and keep the description, or make it of what does not change",
+)
+BEGINS = Rule(
+    "Describe",
+    "the second `Welcome` has the same `session` and `attempt`, and brings the run. The session goes on",
+    "when a Welcome of the current session brings a run and none is known, begin it; the number of the last reply stays",
 )
 ORDER_ANSWERED = Rule(
     "Environment profile",

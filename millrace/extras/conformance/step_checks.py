@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from millrace.extras.conformance import rules
 from millrace.extras.conformance.join_checks import (
     POLE_GAINS,
+    begins,
     described,
     heartbeats,
     is_gymnasium_pole,
@@ -133,6 +134,15 @@ def stepping(learner: Learner, *lanes: int, mode: Mode = "NextStep") -> Script[S
     for lane in lanes:
         yield from steps.do(steps.reset(lane))
     return steps
+
+
+def begins_in_its_session(learner: Learner) -> Script[None]:
+    """The client waits for the vector environment, which begins in the same session."""
+    env = yield from described(learner)
+    steps = Stepping(learner, env)
+    yield from begins(learner, steps.spec)
+    yield from steps.do(steps.reset())
+    yield from steps.do(steps.step())
 
 
 def answers_reset_and_step(learner: Learner) -> Script[None]:

@@ -21,6 +21,7 @@ from millrace.protocol.messages import (
     Answer,
     Call,
     Collect,
+    Describe,
     Described,
     Drain,
     EpisodeRows,
@@ -47,7 +48,7 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.rows.stepped import wrong_rows
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds
@@ -68,6 +69,7 @@ class WatchedSession:
     def __init__(self, welcome: Welcome, now: float, steps: int = 0, *, is_first: bool = True) -> None:
         """`steps`: env steps that the process has reported in earlier sessions. `is_first`: it had none."""
         self.welcome = welcome
+        """the newest"""
         self.session = welcome.session
         self.run = welcome.run
         self._is_first_session = is_first
@@ -80,6 +82,8 @@ class WatchedSession:
         """False: the learner says of no rollout that it has arrived"""
         self.versions: dict[int, Weights] = {}
         """the weights sent, by version"""
+        self.descriptions: dict[int, Describe] = {}
+        """orders to describe, by ticket"""
         self.orders: dict[int, Order | Evaluate] = {}
         """by ticket"""
         self.permits: dict[int, Dealt] = {}
@@ -90,7 +94,8 @@ class WatchedSession:
         """the newest answer to each Evaluate, by ticket"""
         self.said_goodbye = False
         self._refused = self._drains = False  # whether the learner has sent Refuse, or Drain
-        self._description: Described | None = None
+        self._welcomed = -1  # number of the last reply before the Welcome that brought the run; -1: it was the first one
+        self._described: dict[int, Described] = {}  # the first answer to each Describe
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
         self._lanes: dict[int, int] = {}  # the client's lanes, each in its highest incarnation
         self._asked, self._answered = Counter[int](), Counter[int]()
@@ -115,6 +120,15 @@ class WatchedSession:
     def sent(self, message: ToWorker) -> None:
         """The learner has sent this message, which may be lost."""
         match message:
+            case Welcome(session, _, RunSpec() | StepSpec() as run) if session == self.session:
+                if isinstance(self.run, WaitSpec):
+                    self.welcome, self.run, self._welcomed = message, run, self.replies
+                    self._due.clear()  # what is still to be described is not wanted any more
+            case Describe() if message.session != self.session:
+                self._ignored[message.ticket] = OTHER_SESSION
+            case Describe():
+                self.descriptions[message.ticket] = message
+                self._counts(message.ticket)
             case Weights(version):
                 self.versions[version] = message
             case Reset() | Step() | Call() | Evaluate() if message.session != self.session:
@@ -189,20 +203,14 @@ class WatchedSession:
         match message:
             case Heartbeat():
                 self._see_heartbeat(message, now)
-            case Described() if not isinstance(self.run, DescribeSpec):
-                raise Broken(
-                    rules.DESCRIBE, f"Described only with a DescribeSpec, not a {type(self.run).__name__}", brief(message)
-                )
-            case Described():
-                first = self._description = self._description or message
-                if repr(message.description) != repr(first.description):
-                    raise Broken(rules.DESCRIBE_AGAIN, "the same description again", "another")
-            case Stepped() | Returned() | Rollout():
+            case Described() | Stepped() | Returned() | Rollout():
                 if message.ticket in self._ignored:
                     rule, why = self._ignored[message.ticket]
                     raise Broken(rule, f"ticket {message.ticket} to be ignored: {why}", brief(message))
                 if isinstance(message, Rollout):
                     self._see_rollout(message)
+                elif isinstance(message, Described):
+                    self._see_description(message)
                 else:
                     self._see_answer(message)
             case Evaluated() | EpisodeRows():
@@ -234,11 +242,18 @@ class WatchedSession:
         if list(message.versions) != sorted(self.versions.keys() & message.versions):
             sent = f"those sent: {sorted(self.versions)}" if self.versions else "none: no weights were sent in this session"
             raise Broken(rules.HEARTBEAT_VERSIONS, f"versions in ascending order, of {sent}", f"{list(message.versions)}")
+        self._see_if_it_waits(message)
         self._see_tickets(message.tickets)
         self._see_if_all_are_listed(message)
 
+    def _see_if_it_waits(self, message: Heartbeat) -> None:
+        expected = isinstance(self.run, WaitSpec)
+        may_be_late = message.replies <= self._welcomed
+        if message.waits != expected and not (message.waits and may_be_late):
+            raise Broken(rules.HEARTBEAT_WAITS, f"waits {expected} with a {type(self.run).__name__}", f"{message.waits}")
+
     def _see_tickets(self, tickets: Sequence[int]) -> None:
-        known = self.orders.keys() | self.permits.keys()
+        known = self.descriptions.keys() | self.orders.keys() | self.permits.keys()
         if strange := [ticket for ticket in tickets if ticket not in known]:
             raise Broken(
                 rules.HEARTBEAT_TICKETS,
@@ -271,6 +286,8 @@ class WatchedSession:
         """Whether the client must hold this ticket."""
         if ticket in self.answers or ticket in self._results or ticket in self._ignored:
             return False
+        if ticket in self.descriptions:
+            return ticket == max(self.descriptions) and ticket not in self._described
         order = self.orders.get(ticket) or self.permits[ticket].permit
         if isinstance(order, Evaluate):
             later = (each for each in self.orders.values() if isinstance(each, Evaluate) and each.ticket > ticket)
@@ -302,6 +319,22 @@ class WatchedSession:
         if self._results.setdefault(ticket, message) != message and not order.send_rows:
             raise Broken(rules.EVALUATE_ONCE, f"the same answer to ticket {ticket} again", "another")
         return None
+
+    def _see_description(self, message: Described) -> None:
+        ticket = message.ticket
+        if ticket not in self.descriptions:
+            raise Broken(
+                rules.DESCRIBE, f"the ticket of a Describe: {sorted(self.descriptions) or 'none yet'}", brief(message)
+            )
+        self._answered[ticket] += 1
+        asked, answered = self._asked[ticket], self._answered[ticket]
+        if answered > asked:
+            raise Broken(
+                rules.DESCRIBE, f"answers to ticket {ticket} as often as it was sent: {asked}", f"{answered} answers"
+            )
+        first = self._described.setdefault(ticket, message)
+        if repr(message.description) != repr(first.description):
+            raise Broken(rules.DESCRIBE_AGAIN, "the same description again", "another")
 
     def _see_answer(self, message: Answer) -> None:
         order = self.orders.get(message.ticket)

@@ -15,7 +15,7 @@ import pytest
 
 from millrace.extras.conformance import collect_checks, rules
 from millrace.extras.conformance.examiner import CHECK_S, Check, Examiner
-from millrace.extras.conformance.join_checks import describe_spec, leaves_when_refused_later, says_hello
+from millrace.extras.conformance.join_checks import leaves_when_refused_later, says_hello, wait_spec
 from millrace.extras.conformance.learner import Learner, Settings
 from millrace.extras.conformance.profiles import PROFILES
 from millrace.extras.conformance.report import as_data, explanation, line_of, summary
@@ -39,6 +39,7 @@ from millrace.protocol.keys.keys import Key, Token
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
+    Describe,
     Described,
     Drain,
     Evaluate,
@@ -56,7 +57,7 @@ from millrace.protocol.messages import (
     Weights,
     Welcome,
 )
-from millrace.protocol.specs import DescribeSpec, Leaf, StepSpec
+from millrace.protocol.specs import Leaf, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
@@ -95,7 +96,7 @@ def waits_for_ever(learner: Learner) -> Script[None]:
 
 def in_a_session(learner: Learner) -> Script[None]:
     yield from learner.newly_started()
-    learner.welcome(describe_spec(learner))
+    learner.welcome(wait_spec(learner))
     yield Wait(30.0)
 
 
@@ -140,7 +141,7 @@ def test_what_is_not_checked_within_the_limit_has_failed() -> None:
 
 def sends_what_cannot_be_read(learner: Learner) -> Script[None]:
     yield from learner.newly_started()
-    learner.welcome(describe_spec(learner))
+    learner.welcome(wait_spec(learner))
     learner.send_unreadable(7, [b"\xc1"])
     yield Wait(30.0)
 
@@ -156,7 +157,7 @@ def welcomed(script: Callable[[Learner], Script[None]] = in_a_session) -> tuple[
 
 
 def beat(session: int, replies: int = 0) -> Heartbeat:
-    return Heartbeat(session, replies, (), (), 0, {}, 0)
+    return Heartbeat(session, replies, (), (), 0, {}, 0, waits=True)
 
 
 def test_a_heartbeat_that_is_missing_breaks_a_rule() -> None:
@@ -217,8 +218,7 @@ def test_a_rollout_that_answers_the_last_word_of_a_check_at_once_is_heard(monkey
 
 def test_a_client_may_end_at_once_when_it_is_refused() -> None:
     test, session = welcomed(leaves_when_refused_later)
-    description: Any = None
-    test.handle(Heard(b"w", Described(session, description)), 0.2)
+    test.handle(Heard(b"w", beat(session)), 0.2)
     test.handle(Ended(2, ""), 0.2)
     assert [each.outcome for each in test.results] == ["passed"]
 
@@ -345,14 +345,42 @@ def test_an_answer_that_is_sent_again_is_the_same() -> None:
 
 
 def test_a_description_that_is_sent_again_is_the_same() -> None:
-    watch = WatchedSession(Welcome(1, 71, DescribeSpec(EnvSpec("own"))), 0.0)
+    watch = WatchedSession(Welcome(1, 71, WaitSpec()), 0.0)
     description: Any
     for description in ("one", "one"):
-        watch.see(Described(1, description), 0.1)
+        watch.sent(Describe(1, 7, EnvSpec("own")))
+        watch.see(Described(1, 7, description), 0.1)
+    watch.sent(Describe(1, 7, EnvSpec("own")))
     description = "other"
     with pytest.raises(Broken) as broken:
-        watch.see(Described(1, description), 0.2)
+        watch.see(Described(1, 7, description), 0.2)
     assert broken.value.rule is rules.DESCRIBE_AGAIN
+
+
+@pytest.mark.parametrize("ticket", [7, 8], ids=["too often", "of no order"])
+def test_a_description_answers_an_order(ticket: int) -> None:
+    watch = WatchedSession(Welcome(1, 71, WaitSpec()), 0.0)
+    watch.sent(Describe(1, 7, EnvSpec("own")))
+    description: Any = "one"
+    watch.see(Described(1, 7, description), 0.1)
+    with pytest.raises(Broken) as broken:
+        watch.see(Described(1, ticket, description), 0.2)
+    assert broken.value.rule is rules.DESCRIBE
+
+
+def test_a_heartbeat_says_that_the_worker_waits_until_it_must_have_heard_of_the_run() -> None:
+    watch = WatchedSession(Welcome(1, 71, WaitSpec()), 0.0)
+    late = Heartbeat(1, 0, (), (), 0, {}, 0, waits=True)
+    watch.see(late, 0.1)
+    with pytest.raises(Broken) as broken:
+        watch.see(msgspec.structs.replace(late, waits=False), 0.2)
+    assert broken.value.rule is rules.HEARTBEAT_WAITS
+    watch.sent(Welcome(1, 71, run_spec()))
+    watch.see(late, 0.3)
+    watch.sent(watch.reply(1))
+    with pytest.raises(Broken) as broken:
+        watch.see(msgspec.structs.replace(late, replies=1), 0.4)
+    assert broken.value.rule is rules.HEARTBEAT_WAITS
 
 
 def test_last_words_of_a_process_that_was_ended_do_not_count_for_the_next() -> None:

@@ -1,4 +1,6 @@
-"""The conversation in which a worker describes the environment: its pure half, and the shell's deadlines on a fake clock."""
+"""The conversation before a run, in which a worker describes the environment: its pure half, and the lobby's deadlines on a
+fake clock.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from millrace.learner.members.describe import DescribeSettings, described_by_workers
-from millrace.learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
-from millrace.learner.members.events import EnvironmentRaised, Failed, WorkerProcessFailed
+from millrace.learner.members.describe_coordinator import FIRST_TICKET, Accept, DescribeCoordinator, Unknown, accept_any
+from millrace.learner.members.events import EnvironmentRaised, Failed, WorkerJoined, WorkerProcessFailed
+from millrace.learner.members.lobby import Lobby, LobbySettings
+from millrace.learner.members.member_states import TimedOut
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.protocol.alive import NO_SLOT, WorkerActivity
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
@@ -24,35 +29,43 @@ from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     TOLD_TO_STOP,
     Alive,
+    Collect,
+    Describe,
     Described,
     Failure,
     Goodbye,
     Heartbeat,
+    HeartbeatReply,
     Hello,
     Refuse,
-    Rejoin,
     ToLearner,
+    Weights,
     Welcome,
     WorkerExit,
 )
 from millrace.protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
-from millrace.protocol.specs import DescribeSpec
+from millrace.protocol.specs import StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.plain_values import pack
+from tests.support.conversation.fake_ends import run_spec
 from tests.support.conversation.fake_link import FakeLink
 
-SPEC = DescribeSpec(EnvSpec("Fake-v0"))
+WAIT = WaitSpec()
+ENV = EnvSpec("Fake-v0")
 A, B = b"w0", b"w1"
 NOTHING = np.frombuffer(pack({}), np.uint8)
 DESCRIPTION = EnvDescription(DiscreteSpace(3, 0, "int64"), DiscreteSpace(2, 0, "int64"), NOTHING, "", 7, "")
 OF_NINE = msgspec.structs.replace(DESCRIPTION, observation=DiscreteSpace(9, 0, "int64"))
 BROKEN = msgspec.structs.replace(DESCRIPTION, observation=BoxSpace((2,), "float32", np.ones(3), np.ones(())))
-SETTINGS = DescribeSettings(worker_timeout_s=5, no_workers_timeout_s=60, stall_timeout_s=100, max_env_failures=1)
+SETTINGS = LobbySettings(WAIT, worker_timeout_s=5, no_workers_timeout_s=60, stall_timeout_s=100, max_env_failures=1)
 
 
 def coordinator(*, decliners_to_end: int = 1, accept: Accept = accept_any) -> DescribeCoordinator:
-    return DescribeCoordinator(SPEC, 10, worker_timeout_s=5, decliners_to_end=decliners_to_end, accept=accept)
+    """One that wants to know the environment, and has no members."""
+    made = DescribeCoordinator(WAIT, 10, worker_timeout_s=5, decliners_to_end=decliners_to_end)
+    assert made.ask(Unknown(ENV, accept=accept)) == []
+    return made
 
 
 def of_three(env: DescribedEnv) -> None:
@@ -66,41 +79,177 @@ def hello(name: bytes, nonce: int = 1, attempt: int = 1) -> Hello:
 
 
 def join(made: DescribeCoordinator, name: bytes, nonce: int = 1) -> int:
-    ((_, welcome),) = made.receive(name, hello(name, nonce), 0.0)
+    """The session of a worker that joins."""
+    (_, welcome), *orders = made.receive(name, hello(name, nonce), 0.0)
     assert isinstance(welcome, Welcome)
-    assert welcome.run == SPEC
+    assert welcome.run == WAIT
+    assert [type(order) for _, order in orders] in ([], [Describe])
     return welcome.session
+
+
+def order(made: DescribeCoordinator, name: bytes) -> int:
+    """The ticket of the order that this worker was sent."""
+    (ticket,) = made.members[name].tickets
+    return ticket
+
+
+def describes(
+    made: DescribeCoordinator, name: bytes, nonce: int = 1, description: EnvDescription = DESCRIPTION
+) -> list[Outgoing]:
+    """What comes of it if this worker joins, is asked for a description and sends this one."""
+    session = join(made, name, nonce)
+    return made.receive(name, Described(session, order(made, name), description), 1.0)
+
+
+def beat(session: int, replies: int, tickets: tuple[int, ...] = ()) -> Heartbeat:
+    return Heartbeat(session, replies, (), tickets, 0, {}, 0, waits=True)
 
 
 # -------------------------------------------------------------------------------------------------- the pure half
 
 
-def test_the_first_description_is_the_run_s_and_all_members_say_hello_again() -> None:
+def test_the_first_that_joins_describes_the_environment_and_the_others_wait() -> None:
     made = coordinator()
-    one, two = join(made, A), join(made, B)
-    assert made.receive(A, Described(one, DESCRIPTION), 1.0) == []
-    assert made.receive(B, Described(two, OF_NINE), 1.0) == []
+    (_, welcome), (peer, asked) = made.receive(A, hello(A), 0.0)
+    assert isinstance(welcome, Welcome)
+    assert (peer, asked) == (A, Describe(welcome.session, order(made, A), ENV))
+    join(made, B)
+    assert made.members[B].tickets == {}
+    assert made.receive(A, Described(welcome.session, order(made, A), DESCRIPTION), 1.0) == []
     assert made.described is not None
     assert made.described.observation_space == spaces.Discrete(3)
     assert made.described.max_episode_steps == 7
-    assert made.finish() == [(A, Rejoin(one)), (B, Rejoin(two))]
+    assert made.members.keys() == {A, B}, "nobody joins again"
+
+
+def test_a_worker_that_only_evaluates_describes_if_no_other_is_there() -> None:
+    made = DescribeCoordinator(WAIT, 10, worker_timeout_s=5, decliners_to_end=1)
+    made.receive(A, msgspec.structs.replace(hello(A), evaluates=True), 0.0)
+    made.receive(B, hello(B), 0.0)
+    ((peer, _),) = made.ask(Unknown(ENV))
+    assert peer == B
+    made.membership.remove(made.members[B], TimedOut, "left")
+    ((peer, _),) = made.ask_more()
+    assert peer == A
+
+
+def test_when_the_worker_that_describes_is_lost_another_one_is_asked() -> None:
+    made = coordinator()
+    join(made, A)
+    two = join(made, B)
+    made.members[B].heard_s = 10.0
+    ((peer, asked),) = made.remove_silent(10.0)
+    assert (peer, asked) == (B, Describe(two, order(made, B), ENV))
+
+
+def test_each_worker_that_was_asked_and_is_lost_doubles_the_number_that_describes() -> None:
+    """So an environment that fails everywhere is found out soon, however many workers there are."""
+    made = coordinator(decliners_to_end=0)
+    sessions = [join(made, b"w%d" % number) for number in range(8)]
+    asked = []
+    for lost in range(3):
+        failure = Failure(sessions[lost], "OSError: no display", "", None)
+        asked.append([int(peer[1:]) for peer, _ in made.receive(b"w%d" % lost, failure, 1.0)])
+    assert asked == [[1, 2], [3, 4, 5], [6, 7]]
+
+
+def test_when_no_description_comes_for_long_another_one_is_asked_as_well() -> None:
+    """A constructor may hang on one machine only."""
+    made = coordinator()
+    one, two = join(made, A), join(made, B)
+    ticket = order(made, A)
+    ((peer, asked),) = made.ask_more()
+    assert (peer, asked) == (B, Describe(two, ticket, ENV))
+    assert made.ask_more() == [], "nobody is left"
+    made.receive(B, Described(two, ticket, DESCRIPTION), 1.0)
+    assert made.described is not None
+    assert made.receive(A, Described(one, ticket, OF_NINE), 2.0) == []
+    assert made.described.observation_space == spaces.Discrete(3)
+
+
+def test_an_order_that_a_heartbeat_shows_to_be_lost_is_sent_again() -> None:
+    made = coordinator()
+    session = join(made, A)
+    ticket = order(made, A)
+    for replies, tickets, again in ((0, (), False), (1, (ticket,), False), (2, (), True), (2, (), False), (4, (), True)):
+        out = made.receive(A, beat(session, replies, tickets), 1.0)
+        assert [type(message) for _, message in out] == [Describe] * again + [HeartbeatReply], replies
+    made.receive(A, Described(session, ticket, DESCRIPTION), 1.0)
+    assert [type(message) for _, message in made.receive(A, beat(session, 6), 1.0)] == [HeartbeatReply]
+
+
+def test_of_two_environments_each_is_described_once_and_a_late_answer_is_not_of_the_second() -> None:
+    made = coordinator()
+    session = join(made, A)
+    late = order(made, A)
+    ((_, asked),) = made.ask(Unknown(ENV, render_mode="rgb_array"))
+    assert asked == Describe(session, order(made, A), ENV, "loop", "rgb_array")
+    made.receive(A, Described(session, late, OF_NINE), 1.0)
+    assert made.described is None
+    made.receive(A, Described(session, order(made, A), DESCRIPTION), 1.0)
+    assert made.described is not None
+
+
+def test_the_run_begins_in_the_sessions_of_those_that_wait_for_it() -> None:
+    made = coordinator(decliners_to_end=0)
+    refused = made.receive(A, Goodbye(join(made, A), "no such environment", ()), 1.0)
+    session = join(made, B)
+    made.receive(B, beat(session, 0), 1.0)
+    run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
+    attempt = made.members[B].hello.attempt
+    welcome = (B, Welcome(session, attempt, run_spec()))
+    assert run.take_over(made.membership, 100.0) == [welcome]
+    assert [event for event in run.events if isinstance(event, WorkerJoined)] == [WorkerJoined("w1", "host", 1)]
+    assert run.remove_silent(104.0) == [], "it was not listened to meanwhile"
+    assert run.receive(B, hello(B), 104.0) == [welcome], "a Hello that is repeated"
+    assert run.receive(A, hello(A), 104.0) == refused, "a process that was refused stays refused"
+    (_, told), *_ = run.receive(b"w2", hello(b"w2"), 104.0)
+    assert isinstance(told, Welcome)
+    assert told.session == session + 1
+
+
+def test_the_welcome_that_brings_the_run_is_sent_again_if_a_heartbeat_shows_that_it_was_lost() -> None:
+    made = coordinator()
+    session = join(made, A)
+    made.receive(A, beat(session, 0), 1.0)
+    run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
+    run.take_over(made.membership, 2.0)
+    run.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    assert [type(message) for _, message in run.begin_update()] == [Collect, Weights]
+    for replies, again in ((0, []), (1, []), (2, [Welcome, Collect, Weights]), (2, [])):
+        out = run.receive(A, beat(session, replies), 3.0)
+        assert [type(message) for _, message in out] == [*again, HeartbeatReply], replies
+
+
+def test_a_description_that_comes_after_the_run_has_begun_is_no_mistake() -> None:
+    """Of a worker that was asked as well, because the first one took long."""
+    made = coordinator()
+    session = join(made, A)
+    late = Described(session, order(made, A), DESCRIPTION)
+    for run in (
+        TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10),
+        OrderCoordinator(StepSpec((ENV,), (0,), (1,), (), ()), 10),
+    ):
+        run.take_over(made.membership, 2.0)
+        assert run.receive(A, late, 3.0) == []
+        assert A in run.members
 
 
 def test_a_description_that_cannot_be_read_gets_its_sender_refused_and_another_is_used() -> None:
     made = coordinator(decliners_to_end=0)
-    ((peer, refusal),) = made.receive(A, Described(join(made, A), BROKEN), 1.0)
+    ((peer, refusal),) = describes(made, A, description=BROKEN)
     assert peer == A
     assert isinstance(refusal, Refuse)
     assert "low: expected float32(2,)" in refusal.reason
     assert made.described is None
     assert made.receive(A, hello(A), 1.0) == [(A, refusal)]  # the same process does not come back
-    made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
+    describes(made, B)
     assert made.described is not None
 
 
 def test_a_description_of_a_worker_of_ours_that_cannot_be_read_ends_the_start_with_the_reason() -> None:
     made = coordinator()
-    made.receive(A, Described(join(made, A), BROKEN), 1.0)
+    describes(made, A, description=BROKEN)
     assert "its description of the environment: " in str(made.unsuitable)
     assert "low: expected float32(2,)" in str(made.unsuitable)
 
@@ -127,13 +276,13 @@ def test_a_worker_from_elsewhere_that_declines_is_refused_and_the_learner_waits_
     assert made.unsuitable is None
     ((_, refusal),) = made.receive(A, hello(A), 2.0)
     assert refusal == Refuse("environment Fake-v0 is not registered")
-    made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
+    describes(made, B)
     assert made.described is not None
 
 
 def test_a_description_that_is_not_accepted_ends_the_start_if_the_worker_is_ours() -> None:
     made = coordinator(accept=of_three)
-    made.receive(A, Described(join(made, A), OF_NINE), 1.0)
+    describes(made, A, description=OF_NINE)
     assert made.described is None
     assert isinstance(made.unsuitable, UsageError)
     assert str(made.unsuitable) == "expected Discrete(3), got Discrete(9)"
@@ -142,10 +291,10 @@ def test_a_description_that_is_not_accepted_ends_the_start_if_the_worker_is_ours
 
 def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_and_another_is_used() -> None:
     made = coordinator(decliners_to_end=0, accept=of_three)
-    ((peer, refusal),) = made.receive(A, Described(join(made, A), OF_NINE), 1.0)
+    ((peer, refusal),) = describes(made, A, description=OF_NINE)
     assert (peer, refusal) == (A, Refuse("expected Discrete(3), got Discrete(9)"))
     assert (made.described, made.unsuitable) == (None, None)
-    made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
+    describes(made, B)
     assert made.described is not None
     assert made.unsuitable is None
 
@@ -153,7 +302,7 @@ def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_an
 def test_once_the_environment_is_described_a_worker_that_declines_ends_nothing() -> None:
     made = coordinator()
     one, two = join(made, A), join(made, B)
-    made.receive(A, Described(one, DESCRIPTION), 1.0)
+    made.receive(A, Described(one, order(made, A), DESCRIPTION), 1.0)
     made.receive(B, Goodbye(two, "environment Fake-v0 is not registered", ()), 1.0)
     assert made.unsuitable is None
 
@@ -219,11 +368,9 @@ class Ends(Exception):
 
 def shell(
     link: FakeLink, check: Callable[[], None] = lambda: None, processes: ProcessCallbacks | None = None
-) -> tuple[object, list[Outgoing]]:
-    found = described_by_workers(
-        cast(LearnerLink, link), SPEC, SETTINGS, processes or ProcessCallbacks(expected=1), check, lambda: link.now
-    )
-    return found, [(b"", decode_to_worker([bytes(frame) for frame in frames])) for frames in link.sent]
+) -> tuple[DescribedEnv, Lobby]:
+    lobby = Lobby(cast(LearnerLink, link), processes or ProcessCallbacks(expected=1), SETTINGS, lambda: link.now)
+    return lobby.describe(Unknown(ENV), check), lobby
 
 
 def saying(link: FakeLink, *messages: Callable[[int], ToLearner], name: bytes = A, nonce: int = 1) -> None:
@@ -240,12 +387,16 @@ def saying(link: FakeLink, *messages: Callable[[int], ToLearner], name: bytes = 
     link.inbox.append((name, hello(name, nonce)))
 
 
-def test_the_shell_returns_the_description_and_asks_for_another_hello() -> None:
+def test_the_lobby_returns_the_description_and_answers_the_workers_until_the_run_begins() -> None:
     link = FakeLink()
-    saying(link, lambda session: Described(session, DESCRIPTION))
-    found, sent = shell(link)
-    assert found.action_space == spaces.Discrete(2)  # type: ignore[attr-defined]
-    assert isinstance(sent[-1][1], Rejoin)
+    saying(link, lambda session: Described(session, FIRST_TICKET + 1, DESCRIPTION))
+    found, lobby = shell(link)
+    assert found.action_space == spaces.Discrete(2)
+    (session,) = (member.session for member in lobby._coordinator.members.values())
+    link.inbox.append((A, beat(session, 0)))
+    lobby.listen()
+    assert decode_to_worker([bytes(frame) for frame in link.sent[-1]]) == HeartbeatReply(session, 1, ())
+    assert lobby.hand_over().members.keys() == {A}
 
 
 def test_one_failure_too_many_ends_the_start() -> None:

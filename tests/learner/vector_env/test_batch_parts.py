@@ -53,7 +53,7 @@ def frames(message: ToLearner) -> list[bytes]:
 
 def test_copies_are_what_their_worker_describes_or_unknown_where_it_cannot() -> None:
     env = gymnasium.make("CartPole-v1")
-    found = _descriptions(returned(pack([frames(Described(1, describe_env(env)))] * 2)), 2)
+    found = _descriptions(returned(pack([frames(Described(1, 1, describe_env(env)))] * 2)), 2)
     assert [copy and (copy.observation_space, copy.action_space) for copy in found] == [
         (env.observation_space, env.action_space)
     ] * 2

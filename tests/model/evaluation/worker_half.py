@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from millrace.protocol.messages import Evaluate, ToLearner, ToWorker
+from millrace.protocol.messages import Describe, Evaluate, ToLearner, ToWorker
 from millrace.workers.conversation.session import EvaluationTask, RolloutTask
 from tests.model import worker_part
 from tests.model.conversation import Content
@@ -49,7 +49,7 @@ class EvaluatingWorker(Worker):
         last_rows = _rows(self.task.order, EPISODE_STEPS - 1) if isinstance(self.task, EvaluationTask) else []
         return [*last_rows, *super().finish(now)]
 
-    def _begin(self, work: RolloutTask | EvaluationTask) -> list[ToLearner]:
+    def _begin(self, work: RolloutTask | EvaluationTask | Describe) -> list[ToLearner]:
         first_rows = super()._begin(work)
         if isinstance(work, EvaluationTask):
             order = work.order

@@ -8,18 +8,28 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from millrace.learner.members.membership import Member
+from millrace.learner.members.describe_coordinator import Unknown, accept_any
+from millrace.learner.members.membership import Member, Membership
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import Rollout, ToLearner, ToWorker, Weights
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
-from millrace.workers.conversation.session import CloseLanes, EvaluationTask, Leave, RolloutTask, SendMessage, StartSession
+from millrace.workers.conversation.session import (
+    BeginRun,
+    CloseLanes,
+    EvaluationTask,
+    Leave,
+    RolloutTask,
+    SendMessage,
+    StartSession,
+)
 
 SUFFIX = ".trace"
 KEPT_WEIGHTS = 64  # digests of weights: the learner of a soak must not grow by them
@@ -73,6 +83,10 @@ class SaidMember(NamedTuple):
     peer: bytes
 
 
+class SaidWaiting(NamedTuple):
+    """The workers that wait for the run: those of the `DescribeCoordinator` of this process."""
+
+
 class Digests:
     """Digests of messages. A message that stands for a large one has the digest of that one."""
 
@@ -107,8 +121,8 @@ class Digests:
         match value:
             case SendMessage(message):
                 return type(message).__name__, self.of(message)
-            case StartSession():
-                return "StartSession"
+            case StartSession() | BeginRun():
+                return type(value).__name__
             case CloseLanes(lanes):
                 return "CloseLanes", lanes
             case Leave():
@@ -148,6 +162,10 @@ def argument(value: Any) -> Any:
             return SaidWeights("Weights", digest_of(value), value.version)
         case Member():
             return SaidMember(value.peer)
+        case Membership():
+            return SaidWaiting()
+        case Unknown():
+            return replace(value, accept=accept_any)  # all that was asked for was accepted
         case AcceptedRollout():
             return value.rollout.ticket
         case list():

@@ -28,20 +28,20 @@ METHODS = {
     "TicketCoordinator": (
         *COMMON,
         *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation"),
-        *("share_evaluation", "drain"),
+        *("share_evaluation", "drain", "take_over"),
     ),
     "RolloutDealer": ("take", "not_used", "incarnations"),
     "EvaluationDealer": ("end",),
-    "DescribeCoordinator": (*COMMON, "finish"),
+    "DescribeCoordinator": (*COMMON, "ask", "ask_more"),
     "Membership": ("refuse", "record_activity"),
     "Session": (
-        *("handle", "tick", "heartbeat_if_due", "update_statistics", "stop", "fail", "decline", "refused", "described"),
+        *("handle", "tick", "heartbeat_if_due", "update_statistics", "stop", "fail", "decline", "refused"),
         *("next_work", "work_ended"),
     ),
 }
 NOT_RECORDED = {  # it changes nothing, or nobody calls it
     "TicketCoordinator": {"collected", "steps_of_update"},
-    "DescribeCoordinator": {"drain", "status"},
+    "DescribeCoordinator": {"drain", "status", "take_over"},
     "Session": {"is_unwanted", "missing_versions"},
 }
 MADE_BY_THE_COORDINATOR = ("Membership", "RolloutDealer", "EvaluationDealer")

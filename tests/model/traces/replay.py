@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from millrace.learner.members.describe_coordinator import DescribeCoordinator, accept_any
+from millrace.learner.members.describe_coordinator import DescribeCoordinator
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.workers.conversation.session import Session
 from tests.model import learner_part
-from tests.model.traces.record import Digests, Record, SaidMember, message_of
+from tests.model.traces.record import Digests, Record, SaidMember, SaidWaiting, message_of
 from tests.support.conversation.rules import waiting_rollouts
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
@@ -114,13 +114,13 @@ class Replay:
     # ---------------------------------------------------------------- inside
 
     def _made(self, said: Any, *, to_learner: bool) -> Any:
+        if isinstance(said, SaidWaiting):
+            return self.parts["DescribeCoordinator"].membership
         if isinstance(said, list):
             return [self._made(each, to_learner=to_learner) for each in said]
         return message_of(said, self._digests, to_learner=to_learner)
 
     def _begin(self, part: str, given: list[Any], named: dict[str, Any], used: set[int]) -> None:
-        if part == "DescribeCoordinator":
-            named["accept"] = accept_any
         made = self.parts[part] = CLASSES[part](*given, **named)
         if part == "TicketCoordinator":
             self._rules = Rules(made, named["max_lag"], {each for each in used if each < made.rollouts.ledger.issued})

@@ -10,7 +10,7 @@ import gymnasium
 import pytest
 
 from millrace.protocol.env_spec import AllowedCode, EnvSpec
-from millrace.protocol.envs.which_copy import EnvCopy, being_made, filled, takes_copy
+from millrace.protocol.envs.which_copy import EnvCopy, Making, filled, making, takes_copy
 from millrace.protocol.errors import UsageError
 from tests.support.envs.toy import Countdown
 
@@ -19,11 +19,10 @@ COPY = EnvCopy(number=7, lane=3, copy=1, evaluation=False, slot=12)
 
 
 @pytest.fixture(autouse=True)
-def making() -> Iterator[None]:
+def under_way() -> Iterator[Making]:
     """`COPY` is being made."""
-    token = being_made.set(COPY)
-    yield
-    being_made.reset(token)
+    with making(COPY) as found:
+        yield found
 
 
 @pytest.mark.parametrize(

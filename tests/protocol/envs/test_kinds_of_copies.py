@@ -13,8 +13,8 @@ from millrace.learner.config.layers import resolve
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.kinds_of_copies import GROUP, KINDS, CopiesKind, check_kind, copies_kind
 from millrace.protocol.errors import UsageError
-from millrace.protocol.specs import DescribeSpec
-from millrace.workers.described_copy import describing
+from millrace.protocol.messages import Describe
+from millrace.workers.described_copy import describe
 from tests.support.in_process.collectors import trained
 from tests.support.installed_package import install_package
 
@@ -86,6 +86,6 @@ def test_a_name_that_nobody_has_is_refused_before_workers_start(install: Install
 )
 def test_an_entry_point_that_is_no_kind_is_one_line(install: Install, entry_point: str, why: str) -> None:
     install(f"odd = {entry_point}")
-    with pytest.raises(UsageError) as caught, describing(DescribeSpec(EnvSpec("CartPole-v1"), "odd")):
-        pass
+    with pytest.raises(UsageError) as caught:
+        describe(Describe(1, 1, EnvSpec("CartPole-v1"), "odd"))
     assert str(caught.value) == why

@@ -77,7 +77,7 @@ def described(observation: SpaceSpec) -> EnvDescription:
 
 
 def over_the_wire(spec: SpaceSpec) -> SpaceSpec:
-    frames = [bytes(frame) for frame in encode(Described(1, described(spec)))]
+    frames = [bytes(frame) for frame in encode(Described(1, 1, described(spec)))]
     message = decode_to_learner(frames)
     assert isinstance(message, Described)
     return message.description.observation
@@ -215,7 +215,7 @@ def test_an_environment_is_read_as_it_was_described() -> None:
 
 
 def over_the_wire_and_read(env: gymnasium.Env[Any, Any]) -> DescribedEnv:
-    message = decode_to_learner([bytes(frame) for frame in encode(Described(1, describe_env(env)))])
+    message = decode_to_learner([bytes(frame) for frame in encode(Described(1, 1, describe_env(env)))])
     assert isinstance(message, Described)
     return read_description(message.description)
 
@@ -261,7 +261,7 @@ STATE = "0" * 64 + "0" + "0" * 8
 def test_generators_that_no_space_has_are_a_bad_message(states: tuple[str, ...]) -> None:
     description = msgspec.structs.replace(described(DiscreteSpace(2, 0, "int64")), generators=states)
     with pytest.raises(BadMessage):
-        message = decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
+        message = decode_to_learner([bytes(frame) for frame in encode(Described(1, 1, description))])
         assert isinstance(message, Described)
         read_description(message.description)
 
@@ -289,7 +289,7 @@ def test_an_entry_point_that_json_cannot_hold_leaves_the_spec_out() -> None:
 def test_a_description_with_names_of_seats_that_are_none_is_not_decoded(seats: Any) -> None:
     description = msgspec.structs.replace(described(DiscreteSpace(2, 0, "int64")), seats=seats)
     with pytest.raises(BadMessage, match=r"description\[8\]"):
-        decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
+        decode_to_learner([bytes(frame) for frame in encode(Described(1, 1, description))])
 
 
 @pytest.mark.parametrize(
@@ -318,6 +318,6 @@ def test_a_description_of_as_many_arrays_as_may_be_fits_into_a_message() -> None
     own = spaces.Box(np.array([0.0, 1.0]), np.array([2.0, 3.0]), dtype=np.float64)
     space = describe_space(spaces.Tuple([own] * MAX_LEAVES))
     both = msgspec.structs.replace(described(space), action=space)
-    message = decode_to_learner([bytes(frame) for frame in encode(Described(1, both))])
+    message = decode_to_learner([bytes(frame) for frame in encode(Described(1, 1, both))])
     assert isinstance(message, Described)
     assert facts(make_space(message.description.action)) == facts(make_space(space))

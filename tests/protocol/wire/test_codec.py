@@ -23,6 +23,7 @@ from millrace.protocol.env_spec import PickledCallable
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
     Alive,
+    Describe,
     EpisodeRows,
     Evaluate,
     Failure,
@@ -207,8 +208,8 @@ def test_a_default_stands_at_the_end_alone() -> None:
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
     assert defaults == {
         Hello: (False,), Alive: (None,),
-        Weights: (None,), Heartbeat: (0, ""), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
-        Evaluate: ((), (), ()),
+        Weights: (None,), Heartbeat: (0, "", False), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, (), None),
+        Evaluate: ((), (), ()), Describe: ("loop", None),
     }  # fmt: skip
     assert Rollout.__struct_fields__[-4:] == ("episodes", "mask", "extras", "resets")
 
@@ -220,9 +221,9 @@ def test_a_default_stands_at_the_end_alone() -> None:
         (["Heartbeat", 7, 0, [], [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
         (["Heartbeat", 7, 0, [], [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
         (["Heartbeat", 7, 0, [], [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
-        (["Heartbeat", 7, 0, [], [], 0, {}], "Heartbeat expected 9 fields, got 6"),
-        (["Heartbeat", 7, 0, [], [], 0, {}, 0, 0, "", 0], "Heartbeat expected 9 fields, got 10"),
-        (["Heartbeat"], "Heartbeat expected 9 fields, got 0"),
+        (["Heartbeat", 7, 0, [], [], 0, {}], "Heartbeat expected 10 fields, got 6"),
+        (["Heartbeat", 7, 0, [], [], 0, {}, 0, 0, "", False, 0], "Heartbeat expected 10 fields, got 11"),
+        (["Heartbeat"], "Heartbeat expected 10 fields, got 0"),
         (["Inquire", 1], "Inquire expected 0 fields, got 1"),
         ({"type": "Hello", "protocol": None}, "Expected `int`, got `null` - at `$.protocol`"),
         ({"type": "Hello"}, "Object missing required field `protocol`"),

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
     Call,
     Collect,
+    Describe,
     Described,
     Drain,
     EpisodeRows,
@@ -59,7 +61,7 @@ def to_learner(session: int, worker: str = "w0", nonce: int = 1) -> list[ToLearn
         Failure(session, "ValueError: ünïcode", "Traceback: …", 0),
         Stepped(session, 1, 0, 0, (np.ones((2, 4)),), np.ones(2), np.zeros(2, bool), np.ones(2, bool), PACKED),
         Returned(session, 1, 0, 0, PACKED, "ValueError: ünïcode", "Traceback: …"),
-        Described(session, EnvDescription(BOXES, DiscreteSpace(2, 0, "int64"), PACKED, "{}", 500, "human")),
+        Described(session, 1, EnvDescription(BOXES, DiscreteSpace(2, 0, "int64"), PACKED, "{}", 500, "human")),
         EpisodeRows(session, 1, 0, 0, (np.ones((3, 4)),), np.ones(2), np.ones(2), np.zeros(2, bool), np.ones(2, bool)),
         Evaluated(session, 1, (Episode(1.5, 2, 0.1),), (False,)),
         Alive((WorkerActivity(worker, nonce, "stepping", 0.5, 7),), (WorkerExit("w1", 2, "was killed by SIGKILL", True),)),
@@ -72,6 +74,7 @@ def to_worker(session: int, attempt: int = 1) -> list[ToWorker]:
         Welcome(session, attempt, run_spec()),
         Refuse("no"),
         Rejoin(session),
+        Describe(session, 1, EnvSpec("Fake-v0")),
         Weights(5, np.arange(5, dtype=np.float32), np.zeros(0, np.float32)),
         Collect(session, 0, (Permit(50, 0, 0, 0),), (Received(0, 0, 0, (1,)),), (0,)),
         Release(session, (LaneIncarnation(0, 0),)),

@@ -13,16 +13,18 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.learner.vector_env.spec import requested_copies
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description
-from millrace.protocol.messages import Described
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.messages import Describe, Described
+from millrace.protocol.specs import RunSpec, StepSpec
 from millrace.protocol.wire.codec import decode_to_learner, encode
-from millrace.workers.described_copy import describing
+from millrace.workers.copy_slots import close_described
+from millrace.workers.described_copy import describe
 
 
 def described(env: EnvSpec, vector: str = "loop", render_mode: str | None = None) -> DescribedEnv:
     """The description, sent and received. Raises what a worker would report."""
-    with describing(DescribeSpec(env, vector, render_mode)) as description:
-        message = decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
+    description = describe(Describe(1, 1, env, vector, render_mode))
+    close_described()
+    message = decode_to_learner([bytes(frame) for frame in encode(Described(1, 1, description))])
     assert isinstance(message, Described)
     return read_description(message.description)
 

@@ -18,7 +18,7 @@ import pytest
 
 import millrace
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.protocol.messages import PROTOCOL_VERSION, Described, Hello, Refuse, Welcome
+from millrace.protocol.messages import PROTOCOL_VERSION, Describe, Described, Hello, Refuse
 from millrace.protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescription
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
@@ -178,7 +178,9 @@ def test_an_unknown_id_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize("fault", ["close_raises", pytest.param("close_hangs", marks=pytest.mark.soak)])
 def test_a_copy_whose_close_fails_does_not_hurt_the_run(stage: Stage, simulator: Path, fault: str) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
-    learner = stage.learner(address, {"env-kwargs": f"fault {fault}"}, env="mysim:Sim-v0")
+    # The copy of evaluations is described first, and closed before that of training is made.
+    settings = {"env-kwargs": f"fault {fault}", "eval-env-kwargs": "seconds 0.1"}
+    learner = stage.learner(address, settings, env="mysim:Sim-v0")
     host = stage.worker(address, "host", "--processes", "2", before=with_path(simulator))
     learner.trains(3)
     if fault == "close_hangs":
@@ -243,12 +245,12 @@ def test_a_description_that_exceeds_the_bounds_is_refused_and_the_next_is_used(s
     link = WorkerLink(address, "huge")
     try:
         link.send(encode(Hello(PROTOCOL_VERSION, "huge", "here", 1, 1, "test", 1)))
-        welcome = wait_for(lambda: [m for m in link.receive() if isinstance(m, Welcome)], START_S, "a welcome")[0]
+        order = wait_for(lambda: [m for m in link.receive() if isinstance(m, Describe)], START_S, "an order")[0]
         bounds = np.zeros(()), np.ones(())
         huge = BoxSpace((MAX_ELEMENTS, 4096), "float64", *bounds)
         nothing = np.frombuffer(pack({}), np.uint8)
         description = EnvDescription(huge, DiscreteSpace(2, 0, "int64"), nothing, "", 0, "")
-        link.send(encode(Described(welcome.session, description)))
+        link.send(encode(Described(order.session, order.ticket, description)))
         refusal = wait_for(lambda: [m for m in link.receive() if isinstance(m, Refuse)], 10.0, "a refusal")[0]
     finally:
         link.close()

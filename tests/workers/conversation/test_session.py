@@ -16,6 +16,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
+    Describe,
     Described,
     Drain,
     Evaluate,
@@ -40,7 +41,7 @@ from millrace.protocol.messages import (
     Welcome,
 )
 from millrace.protocol.space_spec import DiscreteSpace, EnvDescription
-from millrace.protocol.specs import DescribeSpec, RunSpec, StepSpec
+from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_learner, encode
 from millrace.workers.conversation.connection_rules import wait_limits_s
 from millrace.workers.conversation.held import KEPT_RESULTS
@@ -48,6 +49,7 @@ from millrace.workers.conversation.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
     NO_LEARNER,
+    BeginRun,
     CloseLanes,
     EvaluationTask,
     Leave,
@@ -583,23 +585,87 @@ def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     assert session.due_s == 2.0
 
 
-def test_a_description_is_sent_at_once_and_with_every_heartbeat_of_its_session() -> None:
-    """One that is lost on the way must not stall the start."""
-    three = DiscreteSpace(3, 0, "int64")
-    said = Described(SESSION, EnvDescription(three, three, np.zeros(0, np.uint8), "", 0, ""))
+# ---------------------------------------------------------------------------------------------- before there is a run
+
+THREE = DiscreteSpace(3, 0, "int64")
+DESCRIPTION = EnvDescription(THREE, THREE, np.zeros(0, np.uint8), "", 0, "")
+WAIT = Welcome(SESSION, FIRST, WaitSpec())
+
+
+def asked(ticket: int, session: int = SESSION) -> Describe:
+    return Describe(session, ticket, EnvSpec("Fake-v0"))
+
+
+def described(ticket: int) -> Described:
+    return Described(SESSION, ticket, DESCRIPTION)
+
+
+def waiting(*messages: ToWorker) -> Session:
+    """A session in which the worker waits for the run."""
     session = joining()
     session.tick(0.0)
-    session.handle(Welcome(SESSION, FIRST, DescribeSpec(EnvSpec("Fake-v0"))), 0.0)
-    assert sent(session.tick(session.due_s), Described) == []
-    assert session.described(said.description) == [SendMessage(said)]
-    for _ in range(2):
-        effects = session.tick(session.due_s)
-        assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [said])
-    session.handle(Rejoin(SESSION), 5.0)
-    assert session.described(said.description) == [], "no session may hear of it"
-    session.handle(Welcome(SESSION + 1, FIRST + 1, DescribeSpec(EnvSpec("Fake-v0"))), 5.0)
-    effects = session.tick(session.due_s)
-    assert (len(sent(effects, Heartbeat)), sent(effects, Described)) == (1, [])
+    for message in (WAIT, *messages):
+        session.handle(message, 0.0)
+    return session
+
+
+def test_a_worker_that_waits_says_so_until_a_second_welcome_of_its_session_brings_the_run() -> None:
+    session = waiting(HeartbeatReply(SESSION, 3, ()))
+    (heartbeat,) = sent(session.tick(session.due_s), Heartbeat)
+    assert (heartbeat.waits, heartbeat.replies) == (True, 3)
+    assert session.handle(Welcome(SESSION, FIRST, RUN), 1.0) == [BeginRun(RUN)]
+    (heartbeat,) = sent(session.tick(session.due_s), Heartbeat)
+    assert (heartbeat.waits, heartbeat.replies) == (False, 3)
+    for late in (WAIT, Welcome(SESSION, FIRST, RUN)):
+        assert session.handle(late, 2.0) == []
+        assert session.run == RUN
+
+
+def test_a_description_is_asked_for_once_and_its_answer_is_sent_again_if_it_was_lost() -> None:
+    session = waiting(asked(7))
+    assert session.next_work() == asked(7)
+    (heartbeat,) = sent(session.tick(session.due_s), Heartbeat)
+    assert heartbeat.tickets == (7,)
+    assert session.work_ended([described(7)]) == [SendMessage(described(7))]
+    (heartbeat,) = sent(session.tick(session.due_s), Heartbeat)
+    assert heartbeat.tickets == ()
+    assert session.handle(asked(7), 3.0) == [SendMessage(described(7))]
+    assert session.next_work() is None
+
+
+def test_only_the_newest_order_to_describe_counts() -> None:
+    session = waiting(asked(7))
+    assert session.next_work() == asked(7)
+    session.handle(asked(8), 0.0)
+    assert session.work_ended([described(7)]) == [], "it is not wanted any more"
+    assert session.handle(asked(7), 0.0) == [], "a late copy"
+    assert session.next_work() == asked(8)
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_description_that_is_not_wanted_any_more_is_not_sent(begun: bool) -> None:
+    """The run has begun, or the session has ended, while the copy was made."""
+    session = waiting(asked(7))
+    session.next_work()
+    session.handle(Welcome(SESSION, FIRST, RUN) if begun else Rejoin(SESSION), 1.0)
+    assert sent(session.work_ended([described(7)]), Described) == []
+
+
+@pytest.mark.parametrize("message", [collect((7, 0), version=9), asked(7, session=SESSION + 1)])
+def test_a_worker_that_waits_takes_no_other_order(message: ToWorker) -> None:
+    session = waiting(message)
+    assert session.next_work() is None
+    (heartbeat,) = sent(session.tick(session.due_s), Heartbeat)
+    assert heartbeat.tickets == ()
+
+
+def test_in_a_run_no_environment_is_described() -> None:
+    assert ready(asked(7)).next_work() is None
+
+
+def test_a_worker_that_waits_leaves_at_once_when_it_is_asked_to() -> None:
+    session = waiting()
+    assert session.handle(Drain("over"), 1.0) == [SendMessage(Goodbye(SESSION, "over", ())), Leave(0, "over")]
 
 
 def test_a_heartbeat_reports_what_the_worker_counts() -> None:

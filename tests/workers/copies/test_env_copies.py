@@ -11,19 +11,21 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from msgspec.structs import replace
 
 import millrace
 from millrace import EnvCopy
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
-from millrace.protocol.messages import Reset
-from millrace.protocol.specs import DescribeSpec, RunSpec
+from millrace.protocol.messages import Describe, Reset
+from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers import copy_slots
 from millrace.workers.collect.collector import open_env_copies
 from millrace.workers.copies.reset_ahead import ResetAhead
-from millrace.workers.described_copy import describing
+from millrace.workers.copy_slots import close_described
+from millrace.workers.described_copy import describe
 from millrace.workers.evaluate.evaluator import open_looped_copies
 from millrace.workers.vector_env.stepper import Stepper
 from tests.support.envs.toy import Countdown
@@ -56,8 +58,8 @@ class Asks(Countdown):
     closed_late: ClassVar[list[int]] = []
     fails_at: ClassVar[int] = -1
 
-    def __init__(self) -> None:
-        super().__init__(3)
+    def __init__(self, k: int = 3) -> None:
+        super().__init__(k)
         self.copy = millrace.env_copy()
         self.made.append(self.copy)
         if self.copy.number == Asks.fails_at:
@@ -160,9 +162,77 @@ def test_copies_that_play_evaluations_are_numbered_among_themselves(taken: set[i
 
 @pytest.mark.parametrize("vector", ["loop", "native"])
 def test_the_copy_that_is_described_is_number_0(vector: str, taken: set[int]) -> None:
-    with describing(DescribeSpec(EnvSpec("Asks-v0"), vector)):
-        assert Asks.made == [EnvCopy(slot=0), EnvCopy(slot=1)][: 1 if vector == "loop" else 2]
+    describe(Describe(1, 1, EnvSpec("Asks-v0"), vector))
+    assert Asks.made == [EnvCopy(slot=0), EnvCopy(slot=1)][: 1 if vector == "loop" else 2]
+    assert taken == {0}
+    close_described()
     assert not taken
+
+
+def test_the_copy_that_was_described_is_the_first_of_the_run(taken: set[int]) -> None:
+    describe(Describe(1, 1, EnvSpec("Asks-v0")))
+    copies = open_env_copies(run_with(), 0, no_pulse)
+    assert Asks.made == [EnvCopy(0, 0, 0, False, 0), EnvCopy(1, 0, 1, False, 1)]
+    assert taken == {0, 1}
+    copies.close()
+    assert not taken
+
+
+@pytest.mark.parametrize(
+    ("env", "kwargs", "lane"),
+    [("Asks-v0", {}, 1), ("Asks-v0", {"k": 4}, 0), ("tests.support.envs.toy:Countdown-v0", {}, 0)],
+    ids=["of another lane", "with other arguments", "of another environment"],
+)
+def test_a_copy_that_was_described_and_is_not_the_next_one_is_closed_first(
+    env: str, kwargs: dict[str, Any], lane: int, taken: set[int]
+) -> None:
+    """So that it takes no place on its machine, such as a licence."""
+    describe(Describe(1, 1, EnvSpec(env, kwargs)))
+    Asks.made.clear()
+    copies = open_env_copies(run_with(), lane, no_pulse)
+    assert Asks.made == [EnvCopy(2 * lane + copy, lane, copy, False, copy) for copy in range(2)]
+    copies.close()
+    assert not taken
+
+
+def test_the_next_copy_that_is_described_takes_the_place_of_the_last_one(taken: set[int]) -> None:
+    for _ in range(2):
+        describe(Describe(1, 1, EnvSpec("Asks-v0")))
+    assert Asks.made == [EnvCopy(slot=0)] * 2
+    close_described()
+    assert not taken
+
+
+def test_a_described_copy_that_never_asked_which_it_is_is_any_copy(monkeypatch: pytest.MonkeyPatch, taken: set[int]) -> None:
+    env = EnvSpec("tests.support.envs.toy:Countdown-v0", {"k": 3})
+    run = replace(run_with(), env=env)
+    made: list[gymnasium.Env[Any, Any]] = []
+    make = EnvSpec.make
+
+    def counted(self: EnvSpec, render_mode: str | None = None) -> Any:
+        made.append(make(self, render_mode))
+        return made[-1]
+
+    monkeypatch.setattr(EnvSpec, "make", counted)
+    describe(Describe(1, 1, env))
+    lane = open_env_copies(run, 3, no_pulse)
+    assert (len(made), taken) == (2, {0, 1})
+    lane.close()
+    describe(Describe(1, 1, env))
+    evaluation = open_looped_copies(run, 1, None, no_pulse)
+    assert (len(made), taken) == (3, {0})
+    evaluation.close()
+    assert not taken
+
+
+def test_only_the_thread_that_has_described_a_copy_uses_it(taken: set[int]) -> None:
+    """Workers over inproc are threads of one process."""
+    describe(Describe(1, 1, EnvSpec("Asks-v0")))
+    other = threading.Thread(target=lambda: open_env_copies(run_with(), 0, no_pulse).close())
+    other.start()
+    other.join(20)
+    assert len(Asks.made) == 3
+    close_described()
 
 
 def test_the_slot_of_a_copy_that_cannot_be_made_is_not_free_because_its_constructor_may_have_started_something(
@@ -173,8 +243,8 @@ def test_the_slot_of_a_copy_that_cannot_be_made_is_not_free_because_its_construc
         open_env_copies(run_with(), 0, no_pulse)
     assert taken == {1}
     monkeypatch.setattr(Asks, "fails_at", 0)
-    with pytest.raises(millrace.EnvironmentFailed, match="no licence"), describing(DescribeSpec(EnvSpec("Asks-v0"))):
-        pass
+    with pytest.raises(millrace.EnvironmentFailed, match="no licence"):
+        describe(Describe(1, 1, EnvSpec("Asks-v0")))
     assert taken == {0, 1}
 
 

@@ -34,7 +34,7 @@ struct Leaf {  // Leaf and ActionSpec of the wire document
   std::uint64_t divisor = 1;
 };
 
-struct Run {  // DescribeSpec, RunSpec or StepSpec
+struct Run {  // WaitSpec, RunSpec or StepSpec; or what a Describe asks for
   std::string type, env, vector = "loop", autoreset = "NextStep";
   std::string beyond;  // a thing that the learner asks for and this library cannot do; empty if there is none
   double heartbeat_s = 1, learner_timeout_s = 30;
@@ -55,7 +55,7 @@ struct Permit { std::uint64_t ticket, lane, incarnation, sequence; };
 struct Received { std::uint64_t lane, incarnation, next_sequence; std::size_t first, count; };  // of `numbers`: out of order
 struct LaneIncarnation { std::uint64_t lane, incarnation; };
 
-enum class Type { Welcome, Refuse, Rejoin, Weights, Collect, Release, Evaluate, HeartbeatReply, Drain, Reset, Step, Call };
+enum class Type { Welcome, Refuse, Rejoin, Describe, Weights, Collect, Release, Evaluate, HeartbeatReply, Drain, Reset, Step, Call };
 
 struct Message {
   Type type;
@@ -148,6 +148,10 @@ class Decoder {
       for (auto& seed : m.seeds) expect(seed.has_value());
     } else if (name == "HeartbeatReply") {
       m.type = Type::HeartbeatReply, expect(fields == 3), session(), m.number = r.natural(), received(r, m);
+    } else if (name == "Describe") {
+      m.type = Type::Describe, expect(fields == 5), session(), m.ticket = r.natural();
+      m.run = Run{}, env(r, m.run), m.run.vector = r.text(200);
+      if (!r.nil()) r.skip(), m.run.beyond = "a render mode";
     } else if (name == "Reset") {
       m.type = Type::Reset, expect(fields == 7), order();
       for (std::size_t n = r.array(); n; --n) m.copies.push_back(r.natural());
@@ -293,9 +297,9 @@ class Decoder {
       else return false;
       return true;
     });
-    if (run.learner_timeout_s == -1) run.learner_timeout_s = run.type == "StepSpec" ? 600 : 30;  // its default
+    if (run.learner_timeout_s == -1) run.learner_timeout_s = run.type == "RunSpec" ? 30 : 600;  // its default
     bool collects = run.type == "RunSpec";
-    if (!collects && run.type != "StepSpec" && run.type != "DescribeSpec") throw BadMessage("Welcome: expected a known run");
+    if (!collects && run.type != "StepSpec" && run.type != "WaitSpec") throw BadMessage("Welcome: expected a known run");
     if (collects && (!run.rollout_steps || !run.copies || run.observation.empty() || run.action.empty()))
       throw BadMessage("RunSpec: expected its steps, copies and spaces");
     bool many = run.copies > MAX_COPIES || std::any_of(run.lanes.begin(), run.lanes.end(), [](std::size_t n) { return n > MAX_COPIES; });

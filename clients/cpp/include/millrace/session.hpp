@@ -176,6 +176,7 @@ class Session {
       case Type::Rejoin: return draining ? leave(1, "the learner does not know this session") : rejoin("the learner asks for it");
       case Type::Weights: return handle(m);
       case Type::HeartbeatReply: return replied(m);
+      case Type::Describe: return draining || run_.type != "WaitSpec" ? void() : describe(m);
       default: if (draining) return;
     }
     if (m.type != Type::Release) return handle(m);
@@ -246,16 +247,15 @@ class Session {
   void heartbeat_if_due(double now) {
     if (now < due_s_) return;
     due_s_ = now + run_.heartbeat_s;
-    Writer& w = beat_head_.begin("Heartbeat", 8).natural(session_).natural(replies_);
+    Writer& w = beat_head_.begin("Heartbeat", 10).natural(session_).natural(replies_);
     for (const std::vector<std::uint64_t>* held : {&versions(), &tickets()}) {
       w.array(held->size());
       for (std::uint64_t each : *held) w.natural(each);
     }
     w.natural(steps_).map(4).text("act").real(act_s_).text("step").real(step_s_).text("evaluate").real(evaluate_s_)
         .text("wait").real(std::max(0.0, now - began_s_ - act_s_ - step_s_ - evaluate_s_)).natural(resident_bytes())
-        .natural(late_actions_);
+        .natural(late_actions_).text("").boolean(run_.type == "WaitSpec");
     link_.send(beat_head_);
-    if (run_.type == "DescribeSpec") return describe();  // it may have been lost
     beat_head_.begin("Alive", 2).array(1).array(5).text(options_.name).natural(process_nonce_).text(doing_)
         .real(std::max(0.0, now - since_s_)).natural(env_calls_).array(0);
     link_.send(beat_head_);
@@ -270,19 +270,25 @@ class Session {
   }
 
   void welcome(const Message& m) {
-    if (m.attempt != attempt_ || (state_ == State::ready && *m.session == session_)) return;
+    if (m.attempt != attempt_) return;
+    const bool again = state_ == State::ready && *m.session == session_;  // the run begins for which this session waits, or a late copy
+    if (again && (run_.type != "WaitSpec" || m.run.type == "WaitSpec")) return;
     end();
     state_ = State::ready, session_ = *m.session, run_ = m.run;
-    replies_ = 0;
+    if (!again) replies_ = 0;
     heard_s_ = now_s(), due_s_ = heard_s_ + run_.heartbeat_s;
     join_timeout_s_ = options_.rejoin_timeout_s;
-    std::string why;
-    if (run_.env != description_.id) why = "this client has the environment " + description_.id + ", the learner asks for " + run_.env;
-    else if (!run_.beyond.empty()) why = "the C++ client does not support " + run_.beyond + ", which the learner asks for" + (run_.type == "RunSpec" ? "; try --inference learner" : "");
-    else if (run_.vector != "loop") why = "the C++ client steps copies one by one, the learner asks for --vector " + run_.vector;
-    else if (run_.type == "DescribeSpec") return log("joined"), describe();
-    else why = begin(run_);
-    why.empty() ? log("joined") : decline(why);
+    std::string why = run_.type == "WaitSpec" ? "" : unable(run_);
+    if (why.empty() && run_.type != "WaitSpec") why = begin(run_);
+    if (!why.empty()) return decline(why);
+    if (!again) log("joined");
+  }
+
+  std::string unable(const Run& run) const {  // why we are not what the learner asks for, or nothing
+    if (run.env != description_.id) return "this client has the environment " + description_.id + ", the learner asks for " + run.env;
+    if (!run.beyond.empty()) return "the C++ client does not support " + run.beyond + ", which the learner asks for" + (run.type == "RunSpec" ? "; try --inference learner" : "");
+    if (run.vector != "loop") return "the C++ client steps copies one by one, the learner asks for --vector " + run.vector;
+    return "";
   }
 
   void rejoin(const std::string& why) {
@@ -315,9 +321,10 @@ class Session {
   }
   void leave(int code, const std::string& why) { state_ = State::left, exit_code_ = code, reason_ = why; }
 
-  void describe() {
+  void describe(const Message& m) {
+    if (const std::string why = unable(m.run); !why.empty()) return decline(why);
     std::vector<std::vector<unsigned char>> bounds;  // the arrays, in the order of their frames
-    beat_head_.begin("Described", 2).natural(session_).array(description_.seats.empty() ? 6 : 10);
+    beat_head_.begin("Described", 3).natural(session_).natural(m.ticket).array(description_.seats.empty() ? 6 : 10);
     space(description_.observation, bounds), space(description_.action, bounds);
     bounds.push_back({0x80});  // an empty dict
     beat_head_.described("|u1", bounds.size(), {1}).text("").natural(description_.longest_episode).text("");

@@ -1,0 +1,114 @@
+"""The workers of a learner before its run begins: they join here, and one describes the environment. A shell.
+
+Rule: every wait has a deadline and says what it waits for. The hub of the run takes over the link, and the workers with
+their sessions.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
+from millrace.learner.members.events import Event
+from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from millrace.learner.members.membership import Member, Membership
+from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import Stalled
+from millrace.protocol.logs.long_wait import LongWait
+from millrace.protocol.specs import WaitSpec
+from millrace.protocol.wire.learner_link import LearnerLink
+
+log = logging.getLogger("millrace.learner")
+
+POLL_S = 0.05
+
+
+@dataclass(frozen=True)
+class LobbySettings:
+    """The settings of a run that matter before it begins, named as there."""
+
+    wait: WaitSpec
+    """What the workers are welcomed by."""
+    worker_timeout_s: float
+    no_workers_timeout_s: float
+    stall_timeout_s: float
+    max_env_failures: int
+    steps: int = 0
+    launched_workers: int = 0
+
+
+def _never() -> None: ...
+
+
+class Lobby:
+    """A link, the worker processes that this program started, and the workers that have joined."""
+
+    def __init__(
+        self,
+        link: LearnerLink,
+        processes: ProcessCallbacks,
+        settings: LobbySettings,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.link, self.processes = link, processes
+        self.first_session = int.from_bytes(os.urandom(6), "little")
+        """also of the run: it counts on"""
+        self._settings, self._clock = settings, clock
+        coordinator = self._coordinator = DescribeCoordinator(
+            settings.wait,
+            self.first_session,
+            worker_timeout_s=settings.worker_timeout_s,
+            decliners_to_end=1 if processes.expected else settings.launched_workers,
+        )
+        failures = self._failures = FailureCount(settings.max_env_failures, began_s=clock())
+
+        def count(event: Event) -> None:
+            failures.count(event, clock())  # none comes after env steps, so there is no line to log
+
+        callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), count)
+        self._server = MemberServer(link, coordinator, callbacks, processes, ServerSettings(log_joins=False), clock)
+
+    def describe(self, unknown: Unknown, check_interrupt: Callable[[], None] = _never) -> DescribedEnv:
+        """The environment as the first worker describes it whose description is accepted.
+
+        `check_interrupt` is called at least every 0.1 s: what it raises ends the wait. Raises `UsageError` if a worker of
+        this program, or each of `launched_workers`, says that there is no such environment, or describes one that is not
+        accepted; `EnvironmentFailed` if it fails too often; `NoWorkers` or `Stalled` if a deadline passes.
+        """
+        coordinator, server, settings = self._coordinator, self._server, self._settings
+        members = coordinator.members
+        began_s = self._clock()
+        wait = LongWait(began_s)
+        server.send(coordinator.ask(unknown))
+        while coordinator.described is None:
+            server.listen(POLL_S)
+            check_interrupt()
+            self._failures.check()
+            if coordinator.unsuitable is not None:
+                raise coordinator.unsuitable
+            now = self._clock()
+            server.check_members(settings.no_workers_timeout_s)
+            # In environment code, a worker is ended by the timeouts of the calls, which name themselves.
+            busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
+            if now - max(began_s, busy_s) > settings.stall_timeout_s and members:
+                told = server.what_workers_do()
+                raise Stalled(f"no description of the environment within {settings.stall_timeout_s:.0f} s; {told}")
+            if wait.due(now):
+                log.warning("no env steps for %.0f s: %s", wait.seconds(now), server.what_workers_do())
+                server.send(coordinator.ask_more())
+        return coordinator.described
+
+    def listen(self) -> None:
+        """Answer the workers, while the learner prepares the run."""
+        self._server.listen(0.0)
+
+    def hand_over(self) -> Membership[Member]:
+        """The run begins. Returns the workers that wait for it: its hub takes them over."""
+        self._server.close()
+        return self._coordinator.membership

@@ -1,0 +1,118 @@
+"""The learner of a run that begins with a description: a real `DescribeCoordinator`, then the learner of a training run.
+
+Rules: one worker is asked for the description, and more if one that was asked is lost, as long as any are there; every
+worker that waits is taken over in its session; and unless something goes wrong, none is told to join again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gymnasium import spaces
+
+from millrace.learner.members.describe_coordinator import FIRST_TICKET, DescribeCoordinator, Unknown
+from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.messages import Rejoin, WorkerExit
+from tests.model import learner_part, membership_part
+from tests.model.conversation import Content, Event, Facts
+from tests.model.learner_part import Learner
+from tests.model.message_content import ENV, WAIT, message_of, peer_of
+from tests.model.settings import TIMEOUT_S
+from tests.model.training import learner_event
+
+if TYPE_CHECKING:
+    from tests.model.describing.describing import Describing
+
+SAVED = {"membership", "described", "_at_once"}
+"""What of `DescribeCoordinator` is saved."""
+NOT_SAVED = {"worker_timeout_s", "unsuitable", "_unknown", "_tickets", "_decliners_to_end", "_decliners"}
+"""There is one environment, and nobody declines."""
+DESCRIBED = DescribedEnv(spaces.Discrete(2), spaces.Discrete(2))
+
+
+def start(settings: Describing) -> Content:
+    """A learner that has started, without members."""
+    return _saved(_lobby(0), settings, 0.0), None
+
+
+def facts(content: Content) -> Facts:
+    """Those of a learner whose run has not begun."""
+    described, _, members = content[0]
+    return Facts(updating=described, members=tuple(member[0].value for member in members[0]))
+
+
+def event(
+    content: Content, settings: Describing, event: Event, message: Content | None, now: float
+) -> tuple[Content, list[Outgoing]]:
+    """The learner after this event, and what it sends."""
+    lobby, run = content
+    if run is not None:
+        learner, out = learner_event(learner_part.loaded(run, settings), event, message, now)
+        return (None, learner_part.saved(learner, now)), _checked(out, settings)
+    coordinator = _loaded(lobby)
+    if event == ("publish",):
+        learner, out = _taken_over(coordinator, settings, now)
+        return (None, learner_part.saved(learner, now)), _checked(out, settings)
+    out = _in_lobby(coordinator, event, message, now)
+    asked = sum(bool(member.tickets) for member in coordinator.members.values())
+    wanted = min(coordinator._at_once, len(coordinator.members))
+    assert coordinator.described or asked == wanted, f"{asked} workers are asked to describe, instead of {wanted}"
+    assert settings.faults or coordinator._at_once == 1, "several workers are asked although none was lost"
+    return (_saved(coordinator, settings, now), None), _checked(out, settings)
+
+
+def _in_lobby(coordinator: DescribeCoordinator, event: Event, message: Content | None, now: float) -> list[Outgoing]:
+    match event:
+        case "receive", worker, _:
+            assert message is not None
+            return coordinator.receive(peer_of(worker), message_of(message, worker, WAIT), now)
+        case ("time",):
+            return coordinator.remove_silent(now)
+        case "revoke", worker:
+            return coordinator.revoke(peer_of(worker), "its key was revoked")
+        case "ended", worker, nonce:
+            return coordinator.process_ended(WorkerExit(f"w{worker}", nonce, "killed", True))
+    raise AssertionError(event)
+
+
+def _taken_over(coordinator: DescribeCoordinator, settings: Describing, now: float) -> tuple[Learner, list[Outgoing]]:
+    """The hub is made: it has the workers, and no weights yet."""
+    made = TicketCoordinator(settings.run, max_lag=settings.max_lag, worker_timeout_s=TIMEOUT_S, first_session=0)
+    out = made.take_over(coordinator.membership, now)
+    before = {peer: member.session for peer, member in coordinator.members.items()}
+    assert {peer: member.session for peer, member in made.members.items()} == before, "a worker has lost its session"
+    learner = Learner(settings, made)
+    learner.updating = True
+    return learner, out
+
+
+def _checked(out: list[Outgoing], settings: Describing) -> list[Outgoing]:
+    if not settings.faults:
+        assert not any(isinstance(message, Rejoin) for _, message in out), "a worker is told to join again"
+    return out
+
+
+# -------------------------------------------------------------------- to tuples and back
+
+
+def _lobby(first_session: int) -> DescribeCoordinator:
+    coordinator = DescribeCoordinator(WAIT, first_session, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
+    coordinator.ask(Unknown(ENV))
+    assert coordinator._tickets == FIRST_TICKET + 1
+    return coordinator
+
+
+def _saved(coordinator: DescribeCoordinator, settings: Describing, now: float) -> Content:
+    at_once = min(coordinator._at_once, settings.workers)  # more are never there
+    return coordinator.described is not None, at_once, membership_part.saved(coordinator.membership, now)
+
+
+def _loaded(content: Content) -> DescribeCoordinator:
+    described, at_once, members = content
+    coordinator = _lobby(members[1].value)
+    coordinator._at_once = at_once
+    coordinator.described = DESCRIBED if described else None
+    membership_part.load(coordinator.membership, members, Member)
+    return coordinator

@@ -1,0 +1,69 @@
+"""Mistakes made on purpose in the conversation before a run, one at a time, to see whether the checker finds them.
+
+`python -m tests.model.describing.mutations NAME` explores small runs with this mistake. Exit code 1: a rule is broken.
+
+Not in the list: an order to describe that stays when the run begins, because the workers of the model begin it at once.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tests.model.mutations import HELD, MEMBERSHIP, SESSION, Mutation, play
+
+if TYPE_CHECKING:
+    from tests.model.conversation import Conversation
+
+COORDINATOR = "millrace.learner.members.describe_coordinator"
+
+MUTATIONS = {
+    "all workers describe": Mutation(COORDINATOR, "in free[: max(0, self._at_once - asked)]", "in free"),
+    "a worker that is asked counts as free": Mutation(
+        COORDINATOR, "member.tickets[self._tickets] = member.replies\n", "pass\n"
+    ),
+    "a lost order to describe is not sent again": Mutation(
+        COORDINATOR, "return [self._order(member)] if lost else []", "return []"
+    ),
+    "a description is not taken": Mutation(COORDINATOR, "self.described = described\n", "pass\n"),
+    "nobody is asked in place of a lost worker": Mutation(
+        COORDINATOR, "if self._unknown is None or", "if self._at_once > 1 or self._unknown is None or"
+    ),
+    "the Welcome that brings the run is not sent again": Mutation(
+        MEMBERSHIP, "return [self._welcome(member)] if lost else []", "return []"
+    ),
+    "the run begins in other sessions": Mutation(
+        MEMBERSHIP, "            member.tickets = {}\n", "            member.tickets = {}\n            member.session += 1\n"
+    ),
+    "replies are counted anew when the run begins": Mutation(
+        MEMBERSHIP, "            member.tickets = {}\n", "            member.tickets, member.replies = {}, 0\n"
+    ),
+    "no environment is described": Mutation(
+        SESSION, "case Describe() if isinstance(self.run, WaitSpec):", "case Describe() if False:"
+    ),
+    "the second Welcome is taken for a repeat": Mutation(
+        SESSION, "if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):", "if True:"
+    ),
+    "a late copy of the first Welcome ends the run": Mutation(
+        SESSION, "if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):", "if False:"
+    ),
+    "a worker does not say that it waits": Mutation(SESSION, "waits=isinstance(self.run, WaitSpec)", "waits=False"),
+    "a description is not sent": Mutation(SESSION, "return self.descriptions.keep(answer)", "return False"),
+    "a description that is asked for again is made again": Mutation(HELD, "if ticket > newest:", "if ticket >= newest:"),
+}
+
+
+def runs() -> list[Conversation]:
+    """Small runs, the smallest first."""
+    from tests.model.describing.describing import Describing
+
+    return [
+        Describing(workers=1, lanes=1, updates=1, faults=0),
+        Describing(workers=2, lanes=1, updates=1, faults=0),
+        Describing(workers=1, lanes=1, updates=1, faults=1),
+        Describing(workers=2, lanes=1, updates=1, faults=1),
+        Describing(workers=1, lanes=1, updates=1, faults=2),
+    ]
+
+
+if __name__ == "__main__":
+    play(MUTATIONS, runs)
