@@ -124,8 +124,8 @@ MUTATIONS = {
     "two tickets of a lane have one sequence number": Mutation(LANES, "self.dealt += 1", "self.dealt = 1"),
     "sequence numbers go on in the next incarnation": Mutation(
         LANES,
-        "self.dealt, self.next_sequence, self.out_of_order = 0, 0, set()",
-        "self.next_sequence, self.out_of_order = 0, set()",
+        "            self.dealt = 0\n            self.next_sequence = 0\n",
+        "            self.next_sequence = 0\n",
     ),
     "a checkpoint repeats an incarnation": Mutation(
         ROLLOUTS, "lane.incarnation + (lane.dealt > 0) for", "lane.incarnation + 0 for"
