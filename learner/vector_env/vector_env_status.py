@@ -7,6 +7,7 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.protocol.bounds import LARGEST
 from millrace.protocol.messages import Status
 from millrace.protocol.progress import RunProgress
 
@@ -20,8 +21,9 @@ def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], 
     members = coordinator.members.values()
     if of_run is not None:
         return replace(of_run(now), workers=workers)
+    steps = sum(member.heartbeat.steps for member in members if member.heartbeat is not None)
     progress = RunProgress(
-        env_steps=sum(member.heartbeat.steps for member in members if member.heartbeat is not None),
+        env_steps=min(steps, LARGEST),  # workers may report anything
         steps_per_s=sum(row.steps_per_s for row in workers),
     )
     envs = ", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs))

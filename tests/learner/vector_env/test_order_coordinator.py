@@ -12,6 +12,7 @@ import pytest
 from millrace.learner.members.events import WorkerLeft, WorkerRefused
 from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from millrace.learner.vector_env.vector_env_status import status
+from millrace.protocol.bounds import LARGEST
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import (
@@ -28,11 +29,13 @@ from millrace.protocol.messages import (
     Refuse,
     Release,
     Returned,
+    Status,
     Step,
     Stepped,
 )
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import Leaf, StepSpec
+from millrace.protocol.wire.codec import decode_to_observer, encode
 from millrace.protocol.wire.plain_values import pack
 from tests.support.conversation.fake_ends import fake_rollout, process_ends
 
@@ -284,6 +287,15 @@ def test_it_says_how_it_is() -> None:
     assert found.env == "Fake-v0"
     assert found.progress == RunProgress(env_steps=350, steps_per_s=100.0)
     assert [(one.worker, one.lanes, one.silent_s) for one in found.workers] == [("b", (1,), 1.0), ("a", (0,), 1.0)]
+
+
+def test_it_can_be_sent_whatever_workers_report() -> None:
+    made = order_coordinator(B, A)
+    for peer in (A, B):
+        beat(made, peer, 10.0, steps=LARGEST)
+    found = decode_to_observer(encode(status(made, 13.0)))
+    assert isinstance(found, Status)
+    assert found.progress.env_steps == LARGEST
 
 
 def call(session: int, ticket: int, life: LaneIncarnation) -> Order:
