@@ -151,7 +151,7 @@ class Decoder {
     } else if (name == "Describe") {
       m.type = Type::Describe, expect(fields == 5), session(), m.ticket = r.natural();
       m.run = Run{}, env(r, m.run), m.run.vector = r.text(200);
-      if (!r.nil()) r.skip(), m.run.beyond = "a render mode";
+      r.skip();  // the render mode: the description says that this client has none
     } else if (name == "Reset") {
       m.type = Type::Reset, expect(fields == 7), order();
       for (std::size_t n = r.array(); n; --n) m.copies.push_back(r.natural());
