@@ -110,5 +110,6 @@ class Lobby:
 
     def hand_over(self) -> Membership[Member]:
         """The run begins. Returns the workers that wait for it: its hub takes them over."""
+        self.listen()  # so that it takes over nobody whose process has ended, or whose key was revoked meanwhile
         self._server.close()
         return self._coordinator.membership

@@ -21,6 +21,7 @@ from millrace.protocol.progress import RunProgress
 
 PROGRESS_FILE = "progress.json"
 EVERY_S = 1.0
+LONGEST_SILENCE_S = 10.0  # then it is written again although nothing has changed: it is also a sign of life
 
 
 class ProgressFile:
@@ -32,7 +33,7 @@ class ProgressFile:
         self._looked_s = 0.0
 
     def write(self, progress: Callable[[], RunProgress], now: float) -> None:
-        """Write how far the run is, if a second has passed since the last time, and something has changed.
+        """Write how far the run is, if a second has passed since the last time, and something has changed or is long ago.
 
         `now`: seconds since 1970.
         """
@@ -40,7 +41,8 @@ class ProgressFile:
             return
         newest = replace(progress(), at_s=now)
         self._looked_s = now
-        if replace(newest, at_s=self._written.at_s) == self._written:
+        is_new = replace(newest, at_s=self._written.at_s) != self._written
+        if not is_new and now - self._written.at_s < LONGEST_SILENCE_S:
             return
         with suppress(OSError, ValueError):  # ValueError: a text of the environment that is not UTF-8
             content = msgspec.json.encode(newest)

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from millrace.learner.run_folder.progress import Progress
-from millrace.learner.run_folder.progress_file import EVERY_S, PROGRESS_FILE, ProgressFile, last_progress
+from millrace.learner.run_folder.progress_file import EVERY_S, LONGEST_SILENCE_S, PROGRESS_FILE, ProgressFile, last_progress
 from millrace.learner.run_folder.results import Summary
 from millrace.protocol.progress import RunProgress
 from tests.support.run_folders import a_run
@@ -51,6 +51,14 @@ def test_what_has_not_changed_is_not_written_again(tmp_path: Path) -> None:
     now += EVERY_S
     file.write(lambda: at(10), now)
     assert os.path.samestat((tmp_path / PROGRESS_FILE).stat(), before), "another file stands in its place"
+
+
+def test_a_run_that_stands_still_gives_a_sign_of_itself(tmp_path: Path) -> None:
+    file = ProgressFile(tmp_path)
+    for second in range(int(2 * LONGEST_SILENCE_S)):
+        file.write(lambda: at(10), BEGAN_S + second)
+    now = BEGAN_S + second
+    assert now - last_progress(tmp_path, None).at_s < LONGEST_SILENCE_S
 
 
 def test_what_the_disk_refuses_is_dropped_and_written_later(tmp_path: Path) -> None:
