@@ -31,7 +31,8 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.own_module import refuse_modules_in
 from millrace.protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
 
-RIVAL, POLICY = 0, 1
+RIVAL = 0
+POLICY = 1
 """The versions of the weights."""
 
 
@@ -90,7 +91,10 @@ class PolicyPlayer:
         if policy.against is not None:
             _check_rival(policy, policy.against)
         self._lobby = lobby
-        self._check_interrupt, self._watch, self._settings, self._described = check_interrupt, watch, settings, described
+        self._check_interrupt = check_interrupt
+        self._watch = watch
+        self._settings = settings
+        self._described = described
         self._hub: Hub | None = None
 
     @property

@@ -103,7 +103,8 @@ def read_line(path: Path, now: float) -> RunLine:
         name = environment_name(config["env"], config.get("env_kwargs", {}), config["algo"])
     except UsageError as error:
         return RunLine(path, "unreadable", problem=str(error))
-    summary, owner = None, None
+    summary = None
+    owner = None
     with suppress(UsageError):
         owner = living_owner(path, now)
     if owner is None:

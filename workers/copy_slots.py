@@ -78,7 +78,8 @@ def keep_described(described: DescribedCopy) -> None:
 
 def close_described() -> None:
     """Close the copy that this thread has described, unless it was used."""
-    described, _of_thread.described = _of_thread.described, None
+    described = _of_thread.described
+    _of_thread.described = None
     if described is not None:
         close_copy(described.copy)
 

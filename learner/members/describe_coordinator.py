@@ -63,7 +63,9 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def ask(self, unknown: Unknown) -> list[Outgoing]:
         """Have a worker describe this environment. `described` is what it says, until the next call."""
-        self.described, self._unknown, self._at_once = None, unknown, 1
+        self.described = None
+        self._unknown = unknown
+        self._at_once = 1
         self._tickets += 1
         for member in self.members.values():
             member.tickets.clear()

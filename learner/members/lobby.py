@@ -56,10 +56,12 @@ class Lobby:
         settings: LobbySettings,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.link, self.processes = link, processes
+        self.link = link
+        self.processes = processes
         self.first_session = int.from_bytes(os.urandom(6), "little")
         """also of the run: it counts on"""
-        self._settings, self._clock = settings, clock
+        self._settings = settings
+        self._clock = clock
         coordinator = self._coordinator = DescribeCoordinator(
             settings.wait,
             self.first_session,
@@ -81,7 +83,9 @@ class Lobby:
         this program, or each of `launched_workers`, says that there is no such environment, or describes one that is not
         accepted; `EnvironmentFailed` if it fails too often; `NoWorkers` or `Stalled` if a deadline passes.
         """
-        coordinator, server, settings = self._coordinator, self._server, self._settings
+        coordinator = self._coordinator
+        server = self._server
+        settings = self._settings
         members = coordinator.members
         began_s = self._clock()
         wait = LongWait(began_s)

@@ -120,10 +120,14 @@ class Hub:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`check_interrupt` is called while the hub waits: what it raises ends the wait."""
-        self.link, self.coordinator, self.settings = link, coordinator, settings
+        self.link = link
+        self.coordinator = coordinator
+        self.settings = settings
         link.packed_bytes_limit = rollout_bytes(coordinator.run)
         self._processes = processes or ProcessCallbacks()
-        self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
+        self._check_interrupt = check_interrupt
+        self._observer = observer
+        self._clock = clock
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
         self.lag_statistics = LagStatistics()
         self._progress = Progress()
@@ -177,7 +181,8 @@ class Hub:
 
     def opponent_policies(self) -> tuple[Floats, Floats] | None:
         """Those of all snapshots, float32, if there are any."""
-        kept, pool = self.coordinator.weights.kept, self.coordinator.rollouts.opponents
+        kept = self.coordinator.weights.kept
+        pool = self.coordinator.rollouts.opponents
         if pool is None or not pool.versions:
             return None
         found = [kept[version] for version in pool.versions]
@@ -189,7 +194,8 @@ class Hub:
         `watch` is called at least every `POLL_S` of a long wait.
         """
         began_s = self._clock()
-        wait, steps = LongWait(began_s), self._worker_steps()
+        wait = LongWait(began_s)
+        steps = self._worker_steps()
 
         def watch_and_log() -> None:
             nonlocal steps
@@ -197,7 +203,8 @@ class Hub:
             if now - began_s >= LONG_S:
                 watch()
             if wait.due(now):
-                before, steps = steps, self._worker_steps()
+                before = steps
+                steps = self._worker_steps()
                 if steps != before:
                     log.info("%s", self.waiting(now))
                 else:
@@ -226,14 +233,18 @@ class Hub:
         `watch` is called with the numbers of episodes played and of env steps, at least every `POLL_S`. Raises as `gather`
         does.
         """
-        evaluation, steps_before = self.coordinator.evaluation, self._worker_steps()
-        wait, steps = LongWait(self._clock()), steps_before  # since env steps were made, and how many there were then
+        evaluation = self.coordinator.evaluation
+        steps_before = self._worker_steps()
+        wait = LongWait(self._clock())  # since env steps were made
+        steps = steps_before  # how many there were then
 
         def watch_and_log() -> None:
             nonlocal wait, steps
-            now, steps_now = self._clock(), self._worker_steps()
+            now = self._clock()
+            steps_now = self._worker_steps()
             if steps_now != steps:
-                wait, steps = LongWait(now), steps_now
+                wait = LongWait(now)
+                steps = steps_now
             elif wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), self._server.what_workers_do())
             watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # they fall if a worker is lost
@@ -299,7 +310,9 @@ class Hub:
 
     def snapshot(self) -> HubSnapshot:
         """A snapshot of the current state."""
-        link, coordinator, now = self.link, self.coordinator, self._clock()
+        link = self.link
+        coordinator = self.coordinator
+        now = self._clock()
         spent_s = self._time.until(now)
         return HubSnapshot(
             ledger=coordinator.rollouts.ledger.copy(),
@@ -351,7 +364,8 @@ class Hub:
     def _share_evaluation(self, now: float) -> None:
         """A second worker plays what one has played for too long, if a worker is free."""
         if out := self.coordinator.share_evaluation():
-            seconds, line = self.settings.stall_timeout_s, self.waiting(now)
+            seconds = self.settings.stall_timeout_s
+            line = self.waiting(now)
             log.warning("no episode of an evaluation came for %.0f s, so another worker plays it as well: %s", seconds, line)
             self._server.send(out)
 

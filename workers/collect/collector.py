@@ -127,7 +127,8 @@ class Collector:
 
     def _lane_for(self, assignment: Assignment, pulse: Pulse) -> Lane:
         """The lane in this incarnation. It is opened if it does not exist."""
-        number, incarnation = assignment.lane, assignment.incarnation
+        number = assignment.lane
+        incarnation = assignment.incarnation
         if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
         run = self._run

@@ -173,9 +173,11 @@ class Evaluator:
         """Add the row of the sender's episode to what it sends. `chosen` [k · A, *action]: the actions of all copies."""
         n = sender.episode
         if rows.columns is not None:
-            terminated, truncated = rows.columns.over[n], False
+            terminated = rows.columns.over[n]
+            truncated = False
         else:
-            terminated, truncated = rows.terminated[0, n], rows.truncated[0, n]
+            terminated = rows.terminated[0, n]
+            truncated = rows.truncated[0, n]
         reward = rows.reward[0].reshape(-1, self._run.seats_of_copy)[n].sum()
         sender.step(self._of_copy(n, chosen), float(reward), bool(terminated), bool(truncated) or cut)
 

@@ -80,7 +80,8 @@ class Rows:
         whole = len(self.step_end_s)
         if whole == self.steps:
             return self._of_rows(whole)
-        before, after = self._of_rows(whole), self._of_rows(whole + 1)
+        before = self._of_rows(whole)
+        after = self._of_rows(whole + 1)
         # Calls in this row that have returned. At worst the copies that it resets were called first.
         calls = self._calls[ENV_CALLS] - self._calls_before_row
         resets = sum(each.lane.count for each in self.of_lanes) - (after - before)
