@@ -95,7 +95,8 @@ class Interrupts:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if not self.received:
-            self.received, self._end_s = True, monotonic() + self._grace_s
+            self.received = True
+            self._end_s = monotonic() + self._grace_s
             for each, handler in self._handlers_before.items():
                 if each == signal.SIGINT or math.isinf(self._grace_s):
                     signal.signal(each, handler)  # the second one does what it would have done without us

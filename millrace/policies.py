@@ -175,7 +175,8 @@ class PolicyParameters:
         """The policy as plain data."""
         self.size = acting_size(spec)
         """P, the length of the flat vector."""
-        self._fields, self._buffer_fields = parameter_layout(spec)[0], buffer_layout(spec)
+        self._fields = parameter_layout(spec)[0]
+        self._buffer_fields = buffer_layout(spec)
         self.layout = _pieces(self._fields)
         """Its pieces, in order."""
         self.buffers = _pieces(self._buffer_fields)

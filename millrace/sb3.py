@@ -94,7 +94,8 @@ class Sb3VecEnv(VecEnv):
         self._rows_of_copy = max(1, len(env.seats))
         space = env.single_action_space
         self._nested_actions = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
-        self._flatten, self._unflatten = make_flatten(space), make_unflatten(space)
+        self._flatten = make_flatten(space)
+        self._unflatten = make_unflatten(space)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

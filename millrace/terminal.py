@@ -184,10 +184,13 @@ class RateLimitedView:
     """
 
     def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:
-        self._view, self._every_s, self._clock = view, every_s, clock
+        self._view = view
+        self._every_s = every_s
+        self._clock = clock
         self._shown_s = -every_s
         self._waiting: Progress | None = None
-        self._updates, self._updated_s = -1, 0.0  # number of updates, and since when it is this one
+        self._updates = -1
+        self._updated_s = 0.0  # since when it is this number of updates
         self._note = ""
 
     def __call__(self, progress: Progress) -> None:
@@ -197,7 +200,8 @@ class RateLimitedView:
         self._note = progress.note
         self._waiting = progress
         if progress.updates != self._updates:
-            self._updates, self._updated_s = progress.updates, self._clock()
+            self._updates = progress.updates
+            self._updated_s = self._clock()
         seldom_s = (self._clock() - self._updated_s) / 2 if self._every_s >= LINE_EVERY_S else 0.0
         if self._clock() - self._shown_s >= max(self._every_s, seldom_s):
             self._show()
@@ -209,7 +213,8 @@ class RateLimitedView:
     def _show(self) -> None:
         if self._waiting is not None:
             self._view.show(self._waiting)
-            self._waiting, self._shown_s = None, self._clock()
+            self._waiting = None
+            self._shown_s = self._clock()
 
 
 class PlainLines(ProgressView):
@@ -253,7 +258,8 @@ class NotebookBlock(PlainLines):
     """A block that is updated in the cell's output. Notes are lines below it."""
 
     def __init__(self, cell: NotebookCell) -> None:
-        self._cell, self._returns = cell, Sparkline()
+        self._cell = cell
+        self._returns = Sparkline()
 
     def show(self, progress: Progress) -> None:
         """Update the block."""
@@ -286,7 +292,8 @@ class LiveBlock(ProgressView):
     """A block that is redrawn in place on a terminal."""
 
     def __init__(self, console: Console) -> None:
-        self._console, self._returns = console, Sparkline(ASCII if console.options.ascii_only else BLOCKS)
+        self._console = console
+        self._returns = Sparkline(ASCII if console.options.ascii_only else BLOCKS)
         self._live = Live(console=console, auto_refresh=False)
         self._live.start()
 

@@ -371,7 +371,8 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
 
     def rows(self, lane: int) -> slice:
         """The lane's rows in arrays of all lanes."""
-        first, A = self.first_copy(lane), self.seats_of_copy
+        first = self.first_copy(lane)
+        A = self.seats_of_copy
         return slice(first * A, (first + self.lanes[lane]) * A)
 
     def rejection_reason(self, code: AllowedCode) -> str:

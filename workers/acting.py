@@ -84,7 +84,9 @@ class _EncodingPolicy:
     """A policy of ours whose encoder is the user's: a call is named on the page, and what it raises is the policy's."""
 
     def __init__(self, encoder: str, policy: Policy) -> None:
-        self._encoder, self._policy, self._page = encoder, policy, activity()
+        self._encoder = encoder
+        self._policy = policy
+        self._page = activity()
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         self._policy.load(parameters, buffers)
@@ -102,7 +104,8 @@ class _BuiltInActing:
     """A policy of ours. The noise of a whole rollout is drawn in one call, and so are the log-probabilities computed."""
 
     def __init__(self, run: RunSpec, policy: Policy) -> None:
-        self.run, self.policy = run, policy
+        self.run = run
+        self.policy = policy
         self.distribution = masked_distribution(run.policy) if run.masked else distribution(run.policy)
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -127,8 +130,13 @@ class _BuiltInActing:
 
 class _BuiltInActions:
     def __init__(self, acting: _BuiltInActing, generators: Sequence[np.random.Generator]) -> None:
-        run, self._distribution, self._params_of = acting.run, acting.distribution, acting.params
-        L, T, N, action = len(generators), run.rollout_steps, run.columns, run.policy.action
+        run = acting.run
+        self._distribution = acting.distribution
+        self._params_of = acting.params
+        L = len(generators)
+        T = run.rollout_steps
+        N = run.columns
+        action = run.policy.action
         self._noise = np.stack([self._distribution.noise(generator, (T, N)) for generator in generators])  # [L, T, N, noise]
         self._params = np.empty((L, T, N, self._distribution.params_size), np.float32)
         self._action = np.empty((L, T, N, *action.shape), action.stored_dtype)
@@ -152,7 +160,9 @@ class _OwnActing:
     """A policy of the user's, called once for each lane."""
 
     def __init__(self, run: RunSpec, policy: CalledPolicy) -> None:
-        self.run, self._policy, self._page = run, policy, activity()
+        self.run = run
+        self._policy = policy
+        self._page = activity()
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         with self._page.during(ACTING):
@@ -175,8 +185,11 @@ class _OwnActing:
 
 class _OwnActions:
     def __init__(self, acting: _OwnActing, generators: Sequence[np.random.Generator]) -> None:
-        run, self._acting, self._generators = acting.run, acting, generators
-        lead, action = (len(generators), run.rollout_steps, run.columns), run.policy.action
+        run = acting.run
+        self._acting = acting
+        self._generators = generators
+        lead = (len(generators), run.rollout_steps, run.columns)
+        action = run.policy.action
         self._action = np.empty((*lead, *action.shape), action.stored_dtype)
         self._extras = [np.empty((*lead, *extra.shape), extra.dtype) for extra in run.extras]
         self._log_prob = np.zeros(lead, np.float32)
@@ -185,7 +198,8 @@ class _OwnActions:
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
         for i, generator in enumerate(self._generators):
             acted = self._acting.act([leaf[i] for leaf in obs], state[i], generator)
-            self._action[i, t], state[i] = acted.action, acted.state
+            self._action[i, t] = acted.action
+            state[i] = acted.state
             for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
                 array[i, t] = extra
         return np.array(self._action[:, t])  # a copy, because an environment may change its action

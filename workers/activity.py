@@ -41,7 +41,8 @@ class Activity:
     def __init__(self, fd: int | None = None) -> None:
         """`fd`: the page that the supervisor made. None: a page of this thread alone."""
         page = memoryview(mmap.mmap(-1 if fd is None else fd, PAGE_BYTES))
-        self.numbers, self.seconds = page.cast("q"), page.cast("d")
+        self.numbers = page.cast("q")
+        self.seconds = page.cast("d")
         self.begin(STARTING)
         if fd is not None and STACK_SIGNAL is not None:
             os.lseek(fd, PAGE_BYTES, os.SEEK_SET)
@@ -73,7 +74,8 @@ class Activity:
 
     def limit(self, timeouts: CallTimeouts) -> None:
         """From now on, a call of the user's code may take so long. Before, it may take any time."""
-        self.seconds[START_TIMEOUT_S], self.seconds[STEP_TIMEOUT_S] = timeouts.start_s, timeouts.step_s
+        self.seconds[START_TIMEOUT_S] = timeouts.start_s
+        self.seconds[STEP_TIMEOUT_S] = timeouts.step_s
 
     def leave(self, exit_code: int) -> None:
         """The worker is about to leave on purpose, with this exit code."""
@@ -121,9 +123,11 @@ class ActivityReader:
             self.fd = _anonymous_file()
             os.ftruncate(self.fd, PAGE_BYTES)
             memory = memoryview(mmap.mmap(self.fd, PAGE_BYTES))
-            self._numbers, self._seconds = memory.cast("q"), memory.cast("d")
+            self._numbers = memory.cast("q")
+            self._seconds = memory.cast("d")
         else:
-            self._numbers, self._seconds = page.numbers, page.seconds
+            self._numbers = page.numbers
+            self._seconds = page.seconds
 
     def read(self, now: float) -> Reading:
         """What the worker does. Environment code can write to the page, so every value is made to fit its bounds."""

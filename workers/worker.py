@@ -122,7 +122,9 @@ class Worker:
         options: WorkerOptions | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._link, self._session, self._clock = link, session, clock
+        self._link = link
+        self._session = session
+        self._clock = clock
         self._options = options or WorkerOptions()
         self._handled_stop_requests = 0
         self._collector: Collector | None = None
@@ -250,11 +252,13 @@ class Worker:
 
     def _serve_shared_memory(self, timeout_s: float) -> float:
         """Execute the orders in shared memory, if it is used, until a message may have arrived. How long to wait for it."""
-        stepper, orders = self._stepper, SharedOrders(self._session.session)
+        stepper = self._stepper
+        orders = SharedOrders(self._session.session)
         if stepper is None or not stepper.uses_shared_memory:
             return timeout_s
         message_announced = False
-        began_s, stepped_s = self._clock(), stepper.stages["step"]
+        began_s = self._clock()
+        stepped_s = stepper.stages["step"]
         try:
             with self._heartbeats.lock_released():
                 message_announced = stepper.serve_shared_memory(
@@ -321,7 +325,8 @@ class Worker:
         self._do([leave])
 
     def _update_statistics(self) -> None:
-        earlier, source = self._earlier.stages, self._collector or self._stepper
+        earlier = self._earlier.stages
+        source = self._collector or self._stepper
         stages: Stages = {**earlier, "wait": self._waited_s}
         steps = self._earlier.steps
         if source is not None:

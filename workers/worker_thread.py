@@ -33,7 +33,8 @@ class WorkerThread:
         evaluates: bool = False,
     ) -> None:
         """`evaluates`: whether it only plays evaluations."""
-        self.name, self._identity = name, identity(name, evaluates=evaluates)
+        self.name = name
+        self._identity = identity(name, evaluates=evaluates)
         self.process_nonce = self._identity.process_nonce
         self._page = Activity()
         self._reader = ActivityReader(self._page)

@@ -79,7 +79,9 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
         resume = newest_run(config)
         if resume is None:
             return config, None
-        file, preset = None, "none"  # the settings of the run that was found already contain them
+        # the settings of the run that was found already contain them
+        file = None
+        preset = "none"
     lower = read_lower_layers(algo, file=file, resume=resume, preset=preset)
     return _read_flags(command, argv, typed, lower), resume
 

@@ -77,7 +77,8 @@ class LowerLayers(NamedTuple):
         """The preset of this algorithm and environment, or of the environment that --preset names."""
         if self.preset == "none":
             return NOTHING
-        presets, named = environment_presets(self.algo), named_presets()
+        presets = environment_presets(self.algo)
+        named = named_presets()
         name = env if self.preset == "auto" or self.preset in named else self.preset
         if name not in presets and name == self.preset:
             hint = did_you_mean(name, [*presets, *named]) or "; millrace presets lists them"
@@ -130,7 +131,8 @@ def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | Non
             raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
         if preset not in ("auto", "none"):
             raise UsageError(f"a preset ({preset}) or a run to resume ({resume}): expected one, got both")
-        file, preset = resume / CONFIG_FILE, "none"
+        file = resume / CONFIG_FILE
+        preset = "none"
         if not file.is_file():
             raise UsageError(f"run {resume}: expected a run folder with a {CONFIG_FILE} to resume, got none")
         check_format(resume)

@@ -24,7 +24,8 @@ log = logging.getLogger("millrace.learner")
 
 TEMPORARY = ".tmp"
 SAY_AGAIN_S = 60.0  # that something is refused for the same reason
-TRY_FOR_S, TRY_EVERY_S = 10.0, 0.5  # at the end of a run: somebody may make space
+TRY_FOR_S = 10.0  # at the end of a run: somebody may make space
+TRY_EVERY_S = 0.5
 
 Write = Callable[[], object]
 """Writes the present state of something. Raises `RunError` if the disk refuses it."""
@@ -72,7 +73,8 @@ class Writes:
     """What a run writes, by name, and what of it the disk has refused."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
-        self._clock, self._sleep = clock, sleep
+        self._clock = clock
+        self._sleep = sleep
         self._refused: dict[str, tuple[Write, RunError]] = {}
         self._said: dict[str, tuple[str, float]] = {}
         self.at_most: Callable[[float], float] = lambda seconds: seconds
@@ -82,7 +84,8 @@ class Writes:
         """Call `write`. If the disk refuses it, a warning says so, and `confirm` calls it again."""
         if self._is_written(name, write):
             return
-        line, now = str(self._refused[name][1]), self._clock()
+        line = str(self._refused[name][1])
+        now = self._clock()
         said, since_s = self._said.get(name, ("", -math.inf))
         if line != said or now - since_s >= SAY_AGAIN_S:
             self._said[name] = line, now

@@ -51,7 +51,8 @@ class Requests:
 
     def take_logged(self) -> dict[str, float | None]:
         """The numbers that were logged since the last call."""
-        taken, self._logged = self._logged, {}
+        taken = self._logged
+        self._logged = {}
         return taken
 
 

@@ -37,7 +37,8 @@ class EnvAttributes:
         self._refusal = refusal
         self._next = _unpacked(state.sent)  # what the next weights carry
         self._after: dict[str, Any] | None = _unpacked(state.waiting)  # what the weights after those carry; None: the same
-        self._sent, self._version = state.sent, -1
+        self._sent = state.sent
+        self._version = -1
         self.changes = 0
         """how often an attribute was set, in this process"""
 
@@ -66,9 +67,11 @@ class EnvAttributes:
     def table(self, version: int) -> Array | None:
         """What the weights of this version carry, however often it is asked; None if there are no attributes."""
         if version != self._version:
-            self._sent, self._version = pack(self._next) if self._next else b"", version
+            self._sent = pack(self._next) if self._next else b""
+            self._version = version
             if self._after is not None:
-                self._next, self._after = self._after, None
+                self._next = self._after
+                self._after = None
         return np.frombuffer(self._sent, np.uint8) if self._sent else None
 
     def state(self, version: int) -> AttributesState:

@@ -18,7 +18,9 @@ from millrace.learner.run_folder.run_folder import as_folder_name
 from millrace.protocol.arrays import Array
 from millrace.protocol.specs import Leaf
 
-ROWS, GAP, GRAY = 4, 2, 128  # rows of the picture; pixels between images, and their brightness
+ROWS = 4  # of the picture
+GAP = 2  # pixels between images
+GRAY = 128  # their brightness
 MOST_PIXELS = 256  # of a side of an image
 Pixels = npt.NDArray[np.uint8]
 

@@ -15,7 +15,8 @@ from millrace.flags.program_name import typed_name
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.errors import UserFacingError, first_line
 
-OURS, OF_LEARNER = "millrace.", "millrace.learner."  # how names of our modules begin
+OURS = "millrace."  # how names of our modules begin
+OF_LEARNER = "millrace.learner."
 
 
 def resume_command(run: Path, *, elsewhere: bool) -> str:

@@ -110,7 +110,9 @@ class LeaseWatch:
     """One observer of one lock file."""
 
     def __init__(self, content: bytes, now: float, dead_after_s: float) -> None:
-        self._content, self._since_s, self._dead_after_s = content, now, dead_after_s
+        self._content = content
+        self._since_s = now
+        self._dead_after_s = dead_after_s
 
     def judge(self, content: bytes, now: float) -> Verdict:
         """What the content read now says. `now`: seconds by the observer's monotonic clock."""

@@ -24,7 +24,8 @@ class RecordFile:
 
     def __init__(self, run: Path, name: str) -> None:
         """`name`: of a file in this run folder, or in a folder of it. Raises OSError."""
-        self._run, self._path = run, run / name
+        self._run = run
+        self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
         self._cut = 0  # bytes at the end of the file that the first record that waits replaces
@@ -59,7 +60,8 @@ class RecordFile:
                 gone.close()
             if self._cut:
                 self._file.truncate(self._bytes - self._cut)
-                self._bytes, self._cut = self._bytes - self._cut, 0
+                self._bytes = self._bytes - self._cut
+                self._cut = 0
             while self._waiting:
                 rest = self._waiting[0]
                 while rest:  # a disk that takes a part says why with the next
@@ -81,4 +83,5 @@ class RecordFile:
             subfolder(self._run, self._path.parent.name)
         self._file = os.fdopen(open_regular(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab", buffering=0)
         self._number = self._file.fileno()
-        self._bytes, self._cut = self._path.stat().st_size, 0
+        self._bytes = self._path.stat().st_size
+        self._cut = 0

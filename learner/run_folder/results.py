@@ -17,7 +17,8 @@ from millrace.protocol.specs import SCORE
 SUMMARY_FILE = "summary.json"
 ALL_STEPS_DONE = "all steps done"
 """why a run ended that was not ended before"""
-EVALUATION_KEY, EVALUATION_LENGTH_KEY = "eval/mean_reward", "eval/mean_ep_length"
+EVALUATION_KEY = "eval/mean_reward"
+EVALUATION_LENGTH_KEY = "eval/mean_ep_length"
 Z_95 = 1.959964
 """Quantile of the normal distribution for an interval of 95 %."""
 EVALUATED_AT_KEY = "eval/env_steps"
@@ -115,8 +116,10 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
         score = self.facts.get(SCORE)
         if not self.matches or score is None or score.mean is None:
             return None
-        n, z2 = self.matches, Z_95**2
-        middle, half = score.mean + z2 / (2 * n), math.sqrt(z2 * score.mean * (1 - score.mean) / n + (z2 / (2 * n)) ** 2)
+        n = self.matches
+        z2 = Z_95**2
+        middle = score.mean + z2 / (2 * n)
+        half = math.sqrt(z2 * score.mean * (1 - score.mean) / n + (z2 / (2 * n)) ** 2)
         return max(0.0, (middle - half) / (1 + z2 / n)), min(1.0, (middle + half) / (1 + z2 / n))
 
     def metrics(self) -> dict[str, float | None]:

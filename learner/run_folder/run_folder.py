@@ -155,7 +155,8 @@ class RunFolder:
 
     def __init__(self, path: Path, made: Path | None = None) -> None:
         """`made`: if the folder is new, the topmost folder that was made for it."""
-        self.path, self._made = path, made
+        self.path = path
+        self._made = made
         self._is_relative = False
         self._workers_elsewhere = False  # as `write_config` was told last
         self.started_from = ""
@@ -300,7 +301,8 @@ class RunFolder:
 
         `parameters` [P] begins with the acting part; the rest (the critic) is not written.
         """
-        spec, env = run.policy, run.env
+        spec = run.policy
+        env = run.env
         acting, _ = parameter_layout(spec)
         arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
         description = PolicyDescription(

@@ -32,7 +32,8 @@ log = logging.getLogger("millrace.learner")
 
 LOCK_FILE = "run.lock"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-NETWORK, NUMBERS = Path("/proc/self/ns/net"), Path("/proc/self/ns/pid")
+NETWORK = Path("/proc/self/ns/net")
+NUMBERS = Path("/proc/self/ns/pid")
 
 
 class Pace(NamedTuple):
@@ -65,8 +66,11 @@ class RunLock:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._folder, self._path = folder, folder / LOCK_FILE
-        self._pace, self._clock, self._sleep = pace, clock, sleep
+        self._folder = folder
+        self._path = folder / LOCK_FILE
+        self._pace = pace
+        self._clock = clock
+        self._sleep = sleep
         self._owner = Owner(
             host=socket.gethostname(),
             pid=os.getpid(),
@@ -131,10 +135,12 @@ class RunLock:
     def _take(self) -> None:
         while True:
             try:
-                self._file, made = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL), True
+                self._file = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+                made = True
             except FileExistsError:
                 try:
-                    self._file, made = open_regular(self._path, os.O_RDWR), False
+                    self._file = open_regular(self._path, os.O_RDWR)
+                    made = False
                 except FileNotFoundError:
                     continue  # it was released between the two
             try:
@@ -301,7 +307,8 @@ def living_owner(folder: Path, now: float) -> Owner:
     """
     path = folder / LOCK_FILE
     try:
-        owner, age_s = decoded(read(path, WIDTH)), now - path.lstat().st_mtime
+        owner = decoded(read(path, WIDTH))
+        age_s = now - path.lstat().st_mtime
     except FileNotFoundError:
         raise UsageError(f"run {folder}: {'no process trains it now' if folder.is_dir() else 'no such folder'}") from None
     except OSError as error:

@@ -93,13 +93,15 @@ def slowest_part(stages: Mapping[str, float | None]) -> str:
     """Which part of a run takes most of the time, by the seconds spent in each stage. Empty while nothing is known."""
     learner = {name: stages.get(f"learner_{name}") or 0.0 for name in ("wait", "update", "other", "evaluate")}
     worker = {name: stages.get(f"worker_{name}") or 0.0 for name in COLLECTING}
-    all_s, collecting_s = sum(learner.values()), sum(worker.values())
+    all_s = sum(learner.values())
+    collecting_s = sum(worker.values())
     training_s = all_s - learner["evaluate"]
     if learner["evaluate"] > all_s / 2 > 0:
         return f"Evaluations are the slowest part: they take {learner['evaluate'] / all_s:.0%} of the time."
     if not (training_s and collecting_s):
         return ""
-    waits, idle = learner["wait"] / training_s, worker["wait"] / collecting_s
+    waits = learner["wait"] / training_s
+    idle = worker["wait"] / collecting_s
     worker_s = sum(seconds or 0.0 for name, seconds in stages.items() if name.startswith("worker_"))
     both_wait = learner["wait"] / all_s + worker["wait"] / worker_s > 1 + BOTH_WAIT
     if both_wait and learner["wait"] > learner["update"] + learner["other"]:
@@ -109,9 +111,13 @@ def slowest_part(stages: Mapping[str, float | None]) -> str:
         return f"No part is the slowest: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
     if waits > idle:
         return f"Collecting is the slowest part: the learner waits for {waits:.0%} of the time, and workers for {idle:.0%}."
-    what, did, seconds = "Updates are", "updates", learner["update"]
+    what = "Updates are"
+    did = "updates"
+    seconds = learner["update"]
     if learner["other"] > seconds:
-        what, did, seconds = "Callbacks, checkpoints and metrics are", "is busy with them", learner["other"]
+        what = "Callbacks, checkpoints and metrics are"
+        did = "is busy with them"
+        seconds = learner["other"]
     of_time = f"{seconds / training_s:.0%} of the time, and workers wait for {idle:.0%}"
     return f"{what} the slowest part: the learner {did} for {of_time}."
 

@@ -29,7 +29,8 @@ class BatchArrays:
     ) -> None:
         """`observation_space`: of a single row. `memory`: shared with local workers."""
         N = layout.rows[-1].stop
-        self._layout, self._nest = layout, make_unflatten(observation_space)
+        self._layout = layout
+        self._nest = make_unflatten(observation_space)
         self._leaves: tuple[Array, ...]  # [N, *leaf] each
         self.reward: Array  # [N] float64
         self.terminated: Array  # [N] bool
@@ -53,12 +54,16 @@ class BatchArrays:
         rows = self._layout.rows[lane]
         for array, leaf in zip(self._leaves, answer.obs, strict=True):
             array[rows] = leaf
-        self.reward[rows], self.terminated[rows], self.truncated[rows] = answer.reward, answer.terminated, answer.truncated
+        self.reward[rows] = answer.reward
+        self.terminated[rows] = answer.terminated
+        self.truncated[rows] = answer.truncated
 
     def truncate(self, lane: int) -> None:
         """Truncate the episodes of a lane: reward 0 at the newest observation."""
         rows = self._layout.rows[lane]
-        self.reward[rows], self.terminated[rows], self.truncated[rows] = 0.0, False, True
+        self.reward[rows] = 0.0
+        self.terminated[rows] = False
+        self.truncated[rows] = True
         for array in self._seats:
             array[rows] = 0
 

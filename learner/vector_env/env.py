@@ -78,7 +78,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """who is asked; it may be told what to call while it waits"""
         self.address = hub.address
         """the address that workers connect to"""
-        self._action_leaves, self._read_actions = step.action, make_flatten(self.single_action_space)
+        self._action_leaves = step.action
+        self._read_actions = make_flatten(self.single_action_space)
         memory = None if hub.shared is None else hub.shared.memory
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
         self._state = AsyncState.DEFAULT

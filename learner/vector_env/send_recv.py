@@ -127,7 +127,9 @@ class SendRecv:
         self._check_back(lanes)
         lost_lanes.add(hub.coordinator.take_lost())
         self._check_steppable(lanes)
-        now, (arrays, fit), shared = self._watched.look(hub.now()), actions, []
+        now = self._watched.look(hub.now())
+        (arrays, fit) = actions
+        shared = []
         unreported = lost_lanes.unreported
         awaiting_reset = lost_lanes.awaiting_reset
         self._sent.send(lanes, Sent(Asked.STEP, now))

@@ -114,7 +114,8 @@ class StepHub:
 
     def send_order(self, lane: int, make: MakeOrder) -> None:
         """Send an order to this lane, as soon as it has a worker. `take` returns what has come of it."""
-        self._waiting_orders[lane], self._waiting_since_s[lane] = make, self.now()
+        self._waiting_orders[lane] = make
+        self._waiting_since_s[lane] = self.now()
         self._send_waiting_orders()
 
     def send_steps(self, lanes: Sequence[int], *, together: bool) -> None:

@@ -149,7 +149,8 @@ def _arguments(fields: Sequence[FlagField], words: list[str], command: str) -> d
     given = {}
     for field in fields:
         if field.many:
-            given[field.name], words = read_words(field, words), []
+            given[field.name] = read_words(field, words)
+            words = []
         elif words:
             given[field.name] = read_words(field, words[:1])
             words = words[1:]

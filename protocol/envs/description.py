@@ -151,7 +151,8 @@ def _metadata(metadata: object) -> Array:
         except TypeError:
             continue
         if type(name) is str and len(longer) <= MAX_METADATA_BYTES:
-            kept[name], packed = value, longer
+            kept[name] = value
+            packed = longer
     return np.frombuffer(packed, np.uint8)
 
 

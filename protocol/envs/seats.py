@@ -231,9 +231,11 @@ class ParallelSeats(SeatedEnv):
         for agent in given:
             seat = self.seat_of[agent]
             info = infos.get(agent, _NO_INFO)
-            complete[seat], reward[seat] = True, float(rewards[agent])
+            complete[seat] = True
+            reward[seat] = float(rewards[agent])
             told[seat] = info if type(info) is dict else _info(agent, info)
-            terminates[seat], truncates[seat] = bool(terminated[agent]), bool(truncated[agent])
+            terminates[seat] = bool(terminated[agent])
+            truncates[seat] = bool(truncated[agent])
             # The last observation of a task that has ended may be missing: nobody learns from it.
             if not terminates[seat] or observations.get(agent) is not None:
                 seen[seat] = self._seen(seat, observations[agent])
@@ -263,7 +265,8 @@ class ParallelSeats(SeatedEnv):
 
     def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Any) -> None:
         seat = self.seat_of[agent]
-        found.observations[seat], found.acts[seat] = self._seen(seat, observation), True
+        found.observations[seat] = self._seen(seat, observation)
+        found.acts[seat] = True
         found.infos[seat] = _info(agent, info)
 
 
@@ -297,8 +300,10 @@ class TurnSeats(SeatedEnv):
                 raise WrongAnswer(f"its last() returned {in_words(answer)}; {OF_STEP}") from error
             try:
                 if self._waits[seat]:
-                    found.complete[seat], found.reward[seat] = True, float(reward)
-                    found.terminated[seat], found.truncated[seat] = bool(terminated), bool(truncated)
+                    found.complete[seat] = True
+                    found.reward[seat] = float(reward)
+                    found.terminated[seat] = bool(terminated)
+                    found.truncated[seat] = bool(truncated)
                 else:
                     found.outside[seat] = float(reward)
             except RETURNED_WRONGLY:

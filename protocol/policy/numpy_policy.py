@@ -86,5 +86,6 @@ class NumpyPolicy:
             return out
         width = out.shape[-1]
         params = np.empty((*out.shape[:-1], width + len(self._appended_params)), np.float32)
-        params[..., :width], params[..., width:] = out, self._appended_params
+        params[..., :width] = out
+        params[..., width:] = self._appended_params
         return params

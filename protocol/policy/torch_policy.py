@@ -60,7 +60,8 @@ class TorchPolicy:
             L, N = x.shape[:2]
             flat_state = state.reshape(L * N, -1)
             flat = self._lane(x.reshape(L * N, -1), [image.reshape(L * N, *image.shape[2:]) for image in images], flat_state)
-            out, state[...] = flat.reshape(L, N, -1), flat_state.reshape(state.shape)
+            out = flat.reshape(L, N, -1)
+            state[...] = flat_state.reshape(state.shape)
         else:
             out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
         appended = appended_params(self.spec, self._buffers)

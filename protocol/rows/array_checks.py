@@ -81,7 +81,8 @@ def _misfit(array: Array, shape: tuple[int, ...], dtype: str) -> str:
 def _first(array: Array, wrong: Bools, axes: Axes, first: int) -> str:
     """The first wrong value and its place."""
     index = np.argwhere(wrong)[0]
-    value, index[:1] = array[tuple(index)], index[:1] + first
+    value = array[tuple(index)]
+    index[:1] = index[:1] + first
     return f"{value} at {place}" if (place := place_of(index, axes)) else f"{value}"
 
 

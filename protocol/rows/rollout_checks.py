@@ -79,7 +79,8 @@ def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> Non
     row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last
     gone = np.zeros_like(reset)  # the seat has left this episode
     plays = np.zeros_like(reset)  # it has a row in this episode
-    gone[1:], plays[1:] = end > begin, row > end
+    gone[1:] = end > begin
+    plays[1:] = row > end
     idle = plays[:-1] & ~valid if not run.takes_turns else np.zeros_like(valid)
     for wrong, expected in (
         (ended & ~valid, "valid: expected no end in a row that is not valid"),

@@ -108,7 +108,9 @@ class EvaluationCopies(EnvCopies, Protocol):
 
 def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
     """Raise `UsageError` unless the copies have the spaces of the run's policy, and its agents."""
-    observation, action, policy = copies.observation_space, copies.action_space, run.policy
+    observation = copies.observation_space
+    action = copies.action_space
+    policy = run.policy
     if (observation_leaves(observation), action_spec(action)) != (policy.seen, policy.action):
         raise UsageError(
             f"environment {run.env.id}: its observations {observation} and actions {action} are not those of the policy; "
@@ -145,14 +147,17 @@ class LoopedCopies:
         `critic_keys`: those of a Dict observation whose arrays come last.
         `first`: which copy the first one is. In an evaluation, no step resets a copy.
         """
-        self._facts, self._activity = facts, activity()
+        self._facts = facts
+        self._activity = activity()
         evaluates = first.evaluation
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
         stepping = EVALUATING if evaluates else STEPPING
         self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=stepping, dress=without_order_check)
-        self.envs, self.count = self._loop.envs, len(self._loop.envs)
+        self.envs = self._loop.envs
+        self.count = len(self._loop.envs)
         with self._activity.during(MAKING):  # to read an attribute of the environment may run code of its own
-            self.observation_space, self.action_space = self.envs[0].observation_space, self.envs[0].action_space
+            self.observation_space = self.envs[0].observation_space
+            self.action_space = self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
         self.note = ""
         if masked:

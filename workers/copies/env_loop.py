@@ -86,8 +86,10 @@ class EnvLoop:
         self.truncated: list[Any] = [ended] * len(self.envs)
         """[N] of the last step"""
         self._step_functions = [env.step for env in self.envs]
-        self._stepping, self._all = stepping, range(len(self.envs))
-        self._next_step, self._same_step = autoreset == "NextStep", autoreset == "SameStep"
+        self._stepping = stepping
+        self._all = range(len(self.envs))
+        self._next_step = autoreset == "NextStep"
+        self._same_step = autoreset == "SameStep"
 
     def reset(
         self,
@@ -107,7 +109,9 @@ class EnvLoop:
                     into[n], info = reset_answer(self.envs[n].reset(seed=seed, **further))
             except BaseException as error:
                 raise CopyFailed(n, "reset") from error
-            self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False
+            self.reward[n] = 0.0
+            self.terminated[n] = False
+            self.truncated[n] = False
             if info:
                 infos.append((n, _kept(info)))
         return infos
@@ -120,14 +124,21 @@ class EnvLoop:
         chosen: Sequence[int] = self._all
         steps = self._step_functions
         if copies is not None:
-            chosen, steps = copies, [steps[n] for n in copies]
+            chosen = copies
+            steps = [steps[n] for n in copies]
         stepping = self._stepping
-        reward, terminated, truncated = self.reward, self.terminated, self.truncated
-        next_step, same_step = self._next_step, self._same_step
+        reward = self.reward
+        terminated = self.terminated
+        truncated = self.truncated
+        next_step = self._next_step
+        same_step = self._same_step
         infos: CopyInfos = []
         # What the worker does is written here in full, because this loop must be fast: once per step of the lane, when a
         # copy is reset, and every `PULSE_S`.
-        numbers, seconds, begin, counted = self._activity.numbers, self._activity.seconds, self._activity.begin, 0
+        numbers = self._activity.numbers
+        seconds = self._activity.seconds
+        begin = self._activity.begin
+        counted = 0
         seconds[SINCE_S] = now_s = perf_counter()
         numbers[DOING] = stepping
         pulse_due_s = now_s + PULSE_S
@@ -138,7 +149,9 @@ class EnvLoop:
                     begin(RESETTING)
                     observation, info = reset_answer(self.envs[n].reset())
                     begin(stepping)
-                    reward[n], terminated[n], truncated[n] = 0.0, False, False
+                    reward[n] = 0.0
+                    terminated[n] = False
+                    truncated[n] = False
                 else:
                     answer = step(action)
                     try:

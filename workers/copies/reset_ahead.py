@@ -47,7 +47,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise UsageError(
                 f"ResetAhead: expected an environment of gymnasium.make, got {type(env).__name__} without a spec"
             )
-        self._spec, self._copy = env.spec, being_made() or FIRST_COPY
+        self._spec = env.spec
+        self._copy = being_made() or FIRST_COPY
         self._second: gymnasium.Env[Any, Any] | None = None
         self._second_seed: int | None = None  # of the second instance's next reset
         self._prepared: Future[Prepared] | None = None
@@ -61,8 +62,10 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._prepared is None:
             self._prepare(self._second)
             return self.env.reset()
-        prepared, self._prepared = self._prepared, None
-        played, (self.env, observation, info) = self.env, prepared.result()
+        prepared = self._prepared
+        self._prepared = None
+        played = self.env
+        self.env, observation, info = prepared.result()
         self._second = played
         self._prepare(played)
         return observation, info
@@ -73,7 +76,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _prepare(self, instance: gymnasium.Env[Any, Any] | None) -> None:
         """Reset the second instance in a thread; make it first if there is none."""
         prepared: Future[Prepared] = Future()
-        seed, self._second_seed = self._second_seed, None
+        seed = self._second_seed
+        self._second_seed = None
 
         def prepare() -> None:
             try:
@@ -97,7 +101,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _finish(self) -> None:
         """Wait until the reset in progress has ended. Its episode will not be played."""
-        prepared, self._prepared = self._prepared, None
+        prepared = self._prepared
+        self._prepared = None
         if prepared is not None:
             with suppress(BaseException):
                 prepared.result()

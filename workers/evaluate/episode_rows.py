@@ -44,7 +44,8 @@ class RowSender:
     def observe(self, leaves: Sequence[Array], frame: Array | None) -> None:
         """Add an observation: its arrays, which are copied, and what was rendered. Raises `ValueError` for another size."""
         if frame is not None and self._frames and frame.shape != self._frames[-1].shape:
-            before, now = list(self._frames[-1].shape), list(frame.shape)
+            before = list(self._frames[-1].shape)
+            now = list(frame.shape)
             raise ValueError(f"render: expected pictures of one size, {before} as the one before, got {now}")
         self._obs.append(tuple(leaf.copy() for leaf in leaves))
         self._bytes += sum(leaf.nbytes for leaf in leaves)
@@ -62,7 +63,8 @@ class RowSender:
             self._flush()
 
     def _flush(self) -> None:
-        spec, order = self._policy, self._order
+        spec = self._policy
+        order = self._order
         actions, rewards, terminated, truncated = zip(*self._rows, strict=True)
         has_frames = len(self._frames) == len(self._obs)
         self._send(
@@ -80,7 +82,9 @@ class RowSender:
             )
         )
         self._first_step += len(self._rows)
-        self._obs, self._rows, self._bytes = self._obs[-1:], [], 0
+        self._obs = self._obs[-1:]
+        self._rows = []
+        self._bytes = 0
         self._frames = self._frames[-1:] if self._frames_so_far < MOST_FRAMES else []
 
 

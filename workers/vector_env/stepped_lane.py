@@ -52,13 +52,16 @@ class SteppedLane:
         self.rows = rows
         self.executed = 0
         """number of the newest order through shared memory that was executed"""
-        first, self.count = spec.first_copy(lane), spec.lanes[lane]
+        first = spec.first_copy(lane)
+        self.count = spec.lanes[lane]
         makes = [EnvMaker(spec.envs[of], spec.render_mode) for of in spec.copies[first : first + self.count]]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
-        which, check = _first_copy(spec, lane), partial(_checked, spec)
+        which = _first_copy(spec, lane)
+        check = partial(_checked, spec)
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=which, dress=check)
         with activity().during(MAKING):  # to read an attribute of the environment may run code of its own
-            observation, action = self._loop.envs[0].observation_space, self._loop.envs[0].action_space
+            observation = self._loop.envs[0].observation_space
+            action = self._loop.envs[0].action_space
         self._nested_actions = _is_nested(action)
         self._nest = make_unflatten(action)
         self._nested_observations = _is_nested(observation)
@@ -102,7 +105,8 @@ class SteppedLane:
         return infos
 
     def _write_numbers(self) -> None:
-        rows, loop = self.rows, self._loop
+        rows = self.rows
+        loop = self._loop
         of_all = slice(None)
         write_numbers((rows.reward, rows.terminated, rows.truncated), of_all, (loop.reward, loop.terminated, loop.truncated))
 

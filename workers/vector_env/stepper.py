@@ -45,7 +45,8 @@ class Stepper:
         """env steps made"""
         self.stages: Stages = {"open": 0.0, "step": 0.0}
         """seconds spent making and resetting copies, and stepping them"""
-        self._spec, self._allow_private_names = spec, allow_private_names
+        self._spec = spec
+        self._allow_private_names = allow_private_names
         self.lanes = OpenLanes[SteppedLane]()
         """the lanes that an order has come for, until they are closed"""
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
@@ -107,7 +108,8 @@ class Stepper:
         return any(self._memory.ordered(number) != lane.executed for number, lane in self.lanes.items())
 
     def _serve_lane(self, number: int, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
-        memory, lane = self._memory, self.lanes[number]
+        memory = self._memory
+        lane = self.lanes[number]
         assert memory is not None
         assert self._wake_out is not None
         order = memory.ordered(number)
@@ -144,7 +146,8 @@ class Stepper:
         """The lane in this incarnation. It is made if it does not exist."""
         if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
-        began, kind = perf_counter(), SeatedLane if self._spec.seats else SteppedLane
+        began = perf_counter()
+        kind = SeatedLane if self._spec.seats else SteppedLane
         lane = self.lanes.open(number, lambda: kind(self._spec, number, incarnation, self._rows(number), pulse))
         if self._memory is not None:
             lane.executed = self._memory.ordered(number)
@@ -212,9 +215,7 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
                 results = lane.call(order.copies, order.name, *arguments)
         packed = pack(results)
     except BaseException as raised:
-        packed, error, detail = (
-            b"",
-            one_line(f"{type(raised).__name__}: {first_line(raised)}"),
-            last_text(traceback.format_exc()),
-        )
+        packed = b""
+        error = one_line(f"{type(raised).__name__}: {first_line(raised)}")
+        detail = last_text(traceback.format_exc())
     return Returned(order.session, order.ticket, order.lane, order.incarnation, _array(packed), error, detail)

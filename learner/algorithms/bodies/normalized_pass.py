@@ -87,7 +87,8 @@ class NormalizedPass(torch.autograd.Function):
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
         """The gradients of x and of the flat parameters."""
         refuse_second_derivatives()
-        (flat,), plan = ctx.saved_tensors, ctx.plan
+        (flat,) = ctx.saved_tensors
+        plan = ctx.plan
         by_flat = torch.zeros_like(flat)
         layers = plan.layers_of(flat)
         by_layers = plan.layers_of(by_flat)
@@ -151,7 +152,8 @@ def _normalized(
     if running is not None:
         if renormalizes:
             r, d = renormalization(mean, inverse, running)
-            gain, shift = gain * r, shift + gain * d
+            shift = shift + gain * d
+            gain = gain * r
         running.mean.lerp_(mean.expand_as(running.mean), MOMENTUM)
         running.variance.lerp_(variance.expand_as(running.variance), MOMENTUM)
     return torch.addcmul(shift, x_hat, gain), _Normalization(x_hat, inverse, r, d)

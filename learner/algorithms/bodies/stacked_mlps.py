@@ -100,8 +100,10 @@ class StackedMLPs:
     def __init__(self, shape: MLPShape, parameters: Tensor, statistics: Tensor) -> None:
         """`parameters`: a leaf of the graph. `statistics`: as `initial_statistics`, changed in place."""
         self.shape = shape
-        self._fields, self._folded_fields = shape.fields(), shape.folded().fields()
-        self._trained, self._constant = parameters, parameters.detach()
+        self._fields = shape.fields()
+        self._folded_fields = shape.folded().fields()
+        self._trained = parameters
+        self._constant = parameters.detach()
         found = named_views(statistics, shape.statistics())
         norms = len(found) // 2
         self._running = [RunningStatistics(found[f"{i}.mean"], found[f"{i}.variance"]) for i in range(norms)]

@@ -94,7 +94,8 @@ class _CategoricalKernel:
         total = np.add.reduce(p, 0)
         p /= total
         log_p -= np.log(total, out=total)
-        self._log_p, self._p = log_p, p
+        self._log_p = log_p
+        self._p = p
         self._entropy = -np.add.reduce(p * log_p, 0)
         rows = params.shape[1]
         self._chosen = action[:, 0] * rows + np.arange(rows)  # index of log π(a) in [P · B]
@@ -132,7 +133,8 @@ class _BernoulliKernel:
     """Independent bits with logits l: ∂log π/∂l = bit − σ(l);  ∂H/∂l = −l σ(l) (1 − σ(l))."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
-        self._logits, self._bits = params, action.T.astype(params.dtype)
+        self._logits = params
+        self._bits = action.T.astype(params.dtype)
         self._on = 0.5 + 0.5 * np.tanh(0.5 * params)
         softplus = np.logaddexp(0, params)
         return (self._bits * params - softplus).sum(0), (softplus - params * self._on).sum(0)
@@ -147,7 +149,8 @@ class _GaussianKernel:
     """z = (a − μ) / σ: ∂log π/∂μ = z / σ;  ∂log π/∂log σ = z² − 1;  ∂H/∂log σ = 1. log σ does not depend on the state."""
 
     def __init__(self, log_std: Array, by_log_std: Array) -> None:
-        self._log_std, self._by_log_std = log_std, by_log_std
+        self._log_std = log_std
+        self._by_log_std = by_log_std
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         self._inverse = np.exp(-self._log_std)[:, None]

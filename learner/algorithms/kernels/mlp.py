@@ -120,8 +120,12 @@ class SmallMLP:
         top: MakeTop = lambda values, gradients: Outputs(),
     ) -> None:
         """`parameters`: a leaf [P], with these fields."""
-        self._parameters, self._constants = parameters, parameters.detach()
-        self._fields, self._trunks, self._relu, self._top = fields, trunks, relu, top
+        self._parameters = parameters
+        self._constants = parameters.detach()
+        self._fields = fields
+        self._trunks = trunks
+        self._relu = relu
+        self._top = top
         self._free: list[_Workspace] = []
 
     def __call__(self, x: Tensor, *given: Tensor | None, constant: bool = False) -> tuple[Tensor, ...]:
@@ -154,7 +158,8 @@ class _Pass(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, mlp: SmallMLP, x: Tensor, parameters: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
-        ctx.mlp, ctx.kept = mlp, mlp.take()
+        ctx.mlp = mlp
+        ctx.kept = mlp.take()
         ctx.save_for_backward(parameters)  # so that torch raises if a step changes them before the backward pass
         found: tuple[Tensor, ...] = ctx.kept.forward(x, given)
         return found
@@ -176,7 +181,8 @@ def taken_once(ctx: Any) -> Any:
             "millrace differentiates small networks and distributions in numpy, which has no second derivatives; call "
             "backward without create_graph"
         )
-    kept, ctx.kept = ctx.kept, None
+    kept = ctx.kept
+    ctx.kept = None
     if kept is None:
         raise RuntimeError(
             "backward was called twice through the same outputs of a network, which keeps what it needs for one backward "
@@ -196,7 +202,8 @@ class _Workspace:
         values, grads = (named_views(flat.numpy(), fields) for flat in (parameters, self._gradient))
         self._hidden = [Linear.stacked(names, values, grads) for names in zip(*trunks.hidden, strict=True)]
         self._heads = [Head(Linear.stacked([name], values, grads), network) for name, network in trunks.outputs]
-        self._relu, self._top = relu, make_top(values, grads)
+        self._relu = relu
+        self._top = make_top(values, grads)
         self._plans: dict[int, _MinibatchPlan] = {}
         self._arrays: list[Array] = []
         self._taken = 0
@@ -254,7 +261,8 @@ class _Workspace:
 
     def take(self, *shape: int) -> Array:
         """The next array, C-ordered, not initialized."""
-        size, number = math.prod(shape), self._taken
+        size = math.prod(shape)
+        number = self._taken
         self._taken += 1
         if number == len(self._arrays):
             self._arrays.append(np.empty(0, self._gradient.numpy().dtype))
@@ -331,7 +339,8 @@ class _Chunk:
         through = _activation_gradient(dy, y, relu)
         self.back_through_hidden[:0] = [through, *self._back(layer, self._h, dy, self._dh)]
         self.hidden_to_input[:0] = [through, _back_to_input(layer, dy, self.dx if self._dh is None else self._dh)]
-        self._h, self._dh = y, dy
+        self._h = y
+        self._dh = dy
 
     def add_head(self, layer: Linear, network: int, y: Array, dy: Array) -> None:
         """Add a head, after all hidden layers."""
@@ -377,7 +386,8 @@ def _activation(y: Array, relu: bool) -> MLPPass:
 
 def _activation_gradient(dy: Array, y: Array, relu: bool) -> MLPPass:
     """The call that replaces ∂L/∂output of the activation by ∂L/∂input, in place."""
-    gradient, output = torch.from_numpy(dy), torch.from_numpy(y)
+    gradient = torch.from_numpy(dy)
+    output = torch.from_numpy(y)
     if relu:
         return partial(torch.ops.aten.threshold_backward.grad_input, gradient, output, 0, grad_input=gradient)
     return partial(torch.ops.aten.tanh_backward.grad_input, gradient, output, grad_input=gradient)
@@ -404,6 +414,7 @@ def _product(a: Array, b: Array, out: Array) -> MLPPass:
 
 def _stacked_view(arrays: Sequence[Array]) -> Array:
     """One or two views of the same shape and the same array, as one view [S, *shape]."""
-    first, last = arrays[0], arrays[-1]
+    first = arrays[0]
+    last = arrays[-1]
     distance = last.__array_interface__["data"][0] - first.__array_interface__["data"][0]
     return as_strided(first, (len(arrays), *first.shape), (distance, *first.strides))

@@ -50,7 +50,9 @@ class SmallActorCritic(ActorCriticNetwork):
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
-        leaf, relu, actor = trainable(self.flat, self.flat_grad), spec.activation == "relu", hidden_names(spec)
+        leaf = trainable(self.flat, self.flat_grad)
+        relu = spec.activation == "relu"
+        actor = hidden_names(spec)
         trunks = [actor] if spec.shared_net else [actor, hidden_names(spec, "critic")]
 
         def evaluation(values: Mapping[str, Array], gradients: Mapping[str, Array]) -> EvaluatedActions:
@@ -58,7 +60,8 @@ class SmallActorCritic(ActorCriticNetwork):
                 distribution_kernel(spec.action, values.get("actor.log_std"), gradients.get("actor.log_std"))
             )
 
-        critic, value = ("critic.out", len(trunks) - 1), ("critic.out", 0)
+        critic = ("critic.out", len(trunks) - 1)
+        value = ("critic.out", 0)
         self._both = SmallMLP(leaf, self.fields, Trunks(trunks, [("actor.out", 0), critic]), relu, evaluation)
         self._critic_alone = SmallMLP(leaf, self.fields, Trunks(trunks[-1:], [value]), relu, lambda *_: Values())
 
@@ -98,11 +101,14 @@ class SmallActorAndCritics(ActorAndCritics):
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
-        relu, acting = spec.activation == "relu", self.fields[: self.acting_fields]
-        actor, leaf = Trunks([hidden_names(spec)], [("actor.out", 0)]), trainable(self.actor, self.actor.grad)
+        relu = spec.activation == "relu"
+        acting = self.fields[: self.acting_fields]
+        actor = Trunks([hidden_names(spec)], [("actor.out", 0)])
+        leaf = trainable(self.actor, self.actor.grad)
         self._sample = SmallMLP(leaf, acting, actor, relu, lambda *_: SquashedSample())
         self._output = SmallMLP(leaf, acting, actor, relu)
-        leaf, fields = trainable(self.critics, self.critics.grad), self.fields[self.acting_fields :]
+        leaf = trainable(self.critics, self.critics.grad)
+        fields = self.fields[self.acting_fields :]
 
         def critics(names: Sequence[str]) -> SmallMLP:
             outputs = [(f"{name}.out", i) for i, name in enumerate(names)]

@@ -97,7 +97,8 @@ class Continuous(OffPolicy):
     ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed)
         self.seed = seed
-        self.net, self.target = self.networks(device), self.networks(device)
+        self.net = self.networks(device)
+        self.target = self.networks(device)
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts

@@ -330,7 +330,8 @@ class ReplayBuffer:
         """Return to the state that was remembered last."""
         assert self._remembered is not None, "nothing was remembered"
         self._written, self._rows, self._highest, newest, generator = self._remembered
-        self._newest, self.generator.bit_generator.state = dict(newest), generator
+        self._newest = dict(newest)
+        self.generator.bit_generator.state = generator
         for old in reversed(self._overwritten):
             self._row[old.slots] = old.rows
             for leaf, before in zip(self._per_observation(), old.leaves, strict=False):

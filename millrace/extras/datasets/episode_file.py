@@ -38,7 +38,8 @@ def _append(path: Path, first: int, episodes: Sequence[Any]) -> None:
         with h5py.File(written, "r+" if first else "w", track_order=not first or None) as file:
             for number, episode in enumerate(episodes, first):
                 group = file.create_group(f"episode_{number}")
-                group.attrs["id"], group.attrs["total_steps"] = number, len(episode.rewards)
+                group.attrs["id"] = number
+                group.attrs["total_steps"] = len(episode.rewards)
                 if episode.seed is not None:
                     group.attrs["seed"] = episode.seed
                 _add(group, "observations", episode.observations)

@@ -123,14 +123,16 @@ class EpisodeAssembler:
         ended = rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
             if not valid[t]:  # the next row begins an episode; after the first row, only if it was to reset the copy
-                lane.running[n], start = [] if t else lane.running[n], t + 1
+                lane.running[n] = [] if t else lane.running[n]
+                start = t + 1
                 continue
             fragments = lane.running[n]
             if fragments is None:
                 self.left_out += t + 1 - start
             else:
                 done.append((t, _joined([*fragments, self._fragment(rollout, n, start, t + 1, last=True)])))
-            lane.running[n], start = [], t + 1
+            lane.running[n] = []
+            start = t + 1
         if start < steps:
             fragments = lane.running[n]
             if fragments is None:

@@ -43,7 +43,9 @@ class PlayedEpisodes:
         """`seeds`: the reset seed of each episode. `stochastic`: draw actions from the policy; otherwise take the most
         probable ones.
         """
-        self._player, self._seeds, self._stochastic = player, iter(seeds), stochastic
+        self._player = player
+        self._seeds = iter(seeds)
+        self._stochastic = stochastic
         self._to_env_action = action_converter_of(player.policy.spec)
         self._episodes = self._steps = self._bytes = 0  # played so far
 

@@ -164,7 +164,8 @@ class _VectorFiresAfterLives(VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        self._lives[:], self._fires[:] = info["lives"], False
+        self._lives[:] = info["lives"]
+        self._fires[:] = False
         return observation, info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

@@ -87,7 +87,8 @@ class Screen:
 
     def _rod(self, start: tuple[float, float], end: tuple[float, float], color: str) -> None:
         """A thick line whose ends are at right angles to it, which those of pygame's line are not."""
-        (x1, y1), (x2, y2) = start, end
+        (x1, y1) = start
+        (x2, y2) = end
         across = 8 / (math.hypot(x2 - x1, y2 - y1) or 1)
         dx = (y2 - y1) * across
         dy = (x1 - x2) * across

@@ -33,7 +33,8 @@ class EnvpoolCopies:
         self._facts = facts
         self.observation_space = pool.observation_space
         self.action_space = pool.action_space
-        self._pool, self._activity = pool, activity()
+        self._pool = pool
+        self._activity = activity()
         self._env: VectorEnv[Any, Any, Any] | None = None
         self._read = make_flatten(self.observation_space)
         self._truncated = np.zeros(copies, bool)  # [N] truncated here, which envpool does not know
@@ -81,7 +82,8 @@ class EnvpoolCopies:
 
         def merged(of_rest: Array, of_reset: Any = 0) -> Array:
             array = np.empty((len(actions), *of_rest.shape[1:]), of_rest.dtype)
-            array[rest], array[reset] = of_rest, of_reset
+            array[rest] = of_rest
+            array[reset] = of_reset
             return array
 
         leaves = [merged(stepped, started) for stepped, started in zip(result.leaves, first, strict=True)]

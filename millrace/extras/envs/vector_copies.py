@@ -43,7 +43,9 @@ class VectorCopies:
         Raises `UsageError` for another autoreset mode.
         """
         check_resets_next_step(env)
-        self._env, self._activity, self._facts = env, activity(), facts
+        self._env = env
+        self._activity = activity()
+        self._facts = facts
         self._per_copy = (env.num_envs,)
         self.note = ""
         self.observation_space = env.single_observation_space

@@ -19,8 +19,15 @@ class Meaning(NamedTuple):
     """what it is called, where its name does not say it"""
 
 
-STEPS, EPISODES, SECONDS, VERSIONS, TICKETS, TRANSITIONS = "env steps", "episodes", "s", "versions", "tickets", "env steps"
-REWARD, NONE, OWN = "reward", "–", "Your own"
+STEPS = "env steps"
+EPISODES = "episodes"
+SECONDS = "s"
+VERSIONS = "versions"
+TICKETS = "tickets"
+TRANSITIONS = "env steps"
+REWARD = "reward"
+NONE = "–"
+OWN = "Your own"
 
 METRICS: dict[str, dict[str, Meaning]] = {
     "Training episodes": {

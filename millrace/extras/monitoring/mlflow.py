@@ -34,7 +34,9 @@ class MlflowCallback(RowCallback):
         Raises `UsageError` if MLflow is not installed.
         """
         super().__init__("mlflow", every_s)
-        self._mlflow, self._experiment, self._uri = tool("mlflow"), experiment, tracking_uri
+        self._mlflow = tool("mlflow")
+        self._experiment = experiment
+        self._uri = tracking_uri
         self._client: Any = None
         self._run = ""
 

@@ -21,7 +21,8 @@ class RowFilter:
     """Chooses which rows are sent."""
 
     def __init__(self, every_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._every_s, self._clock = every_s, clock
+        self._every_s = every_s
+        self._clock = clock
         self._sent_s: float | None = None
         self._sent_update = -1
         self._logged_update = -1
@@ -47,7 +48,8 @@ class RowFilter:
     def _remember_logged(self, progress: Progress) -> None:
         """The run forgets these numbers when it has written the row; here it may not have been sent."""
         if progress.updates != self._logged_update:
-            self._logged_update, self._logged = progress.updates, {}
+            self._logged_update = progress.updates
+            self._logged = {}
         self._logged |= logged(progress)
 
 
@@ -59,7 +61,8 @@ class RowCallback(Callback):
 
     def __init__(self, tool: str, every_s: float) -> None:
         """`tool`: the module of this tool. `every_s`: least number of seconds between two rows."""
-        self._tool, self._rows = tool, RowFilter(every_s)
+        self._tool = tool
+        self._rows = RowFilter(every_s)
 
     def on_start(self, progress: Progress) -> None:
         """Begin a run of this folder's name, or go on with the one that is there. Log the numbers of cloning, if any."""

@@ -27,7 +27,8 @@ class WandbCallback(RowCallback):
         Raises `UsageError` if wandb is not installed.
         """
         super().__init__("wandb", every_s)
-        self._wandb, self._init = tool("wandb"), init
+        self._wandb = tool("wandb")
+        self._init = init
         self._run: Any = None
 
     def _begin(self, progress: Progress) -> None:

@@ -113,14 +113,17 @@ def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[by
 
     If the browser has the same already, or asked for the head only, it gets no body.
     """
-    headers, whole, status = dict(HEADERS), _stored(answer.body), answer.status
+    headers = dict(HEADERS)
+    whole = _stored(answer.body)
+    status = answer.status
     part = range(whole.size)
     if request is not None and status == 200:
         headers["ETag"] = tag = f'"{whole.tag}"'
         if request.headers.get("if-none-match") == tag:
             status = 304
         elif request.method == "GET" and (wanted := _wanted_part(request.headers, tag, whole.size)) is not None:
-            status, part = 206 if wanted else 416, wanted  # a film is played from the middle
+            status = 206 if wanted else 416  # a film is played from the middle
+            part = wanted
             headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{whole.size}"
     if status == 405:
         headers["Allow"] = "GET, HEAD"
@@ -128,7 +131,8 @@ def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[by
         headers |= {"Content-Type": answer.content_type, "Content-Length": str(len(part))}
     has_body = status != 304 and not (request is not None and request.method == "HEAD")
     lines = [f"HTTP/1.1 {status} {REASONS[status]}", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
-    first, end = "\r\n".join(lines).encode(), part.stop if has_body else part.start
+    first = "\r\n".join(lines).encode()
+    end = part.stop if has_body else part.start
     yield first + whole.read(part.start, min(part.start + PART_BYTES, end))
     for begin in range(part.start + PART_BYTES, end, PART_BYTES):
         yield whole.read(begin, min(begin + PART_BYTES, end))

@@ -27,7 +27,8 @@ from millrace.protocol.errors import UsageError
 
 CHANGES = ("", CONFIG_FILE, RUN_FILE, PROGRESS_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
 MOST_KEPT = 64  # runs whose rows are in memory
-MOST_LOGS, LOG_BYTES = 4, 4_096
+MOST_LOGS = 4
+LOG_BYTES = 4_096
 
 
 class RunContent(NamedTuple):
@@ -42,7 +43,8 @@ class KnownRuns:
 
     def __init__(self, folders: Sequence[Path], clock: Callable[[], float]) -> None:
         """`clock`: wall-clock time."""
-        self._folders, self._clock = folders, clock
+        self._folders = folders
+        self._clock = clock
         self._tails: dict[Path, MetricsTail] = {}
         self._read: dict[Path, tuple[object, RunContent]] = {}
         self._lines: dict[Path, tuple[object, RunLine]] = {}
@@ -64,7 +66,8 @@ class KnownRuns:
 
     def line(self, run: Path) -> RunLine:
         """What one line says about it."""
-        now, changed = self._clock(), _changes(run)
+        now = self._clock()
+        changed = _changes(run)
         before, line = self._lines.get(run, (None, None))
         if line is None or before != changed or line.owner is not None or (run / LOCK_FILE).exists():
             line = read_line(run, now)

@@ -27,7 +27,8 @@ from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 ASK_EVERY_S = 0.5
 LOOKED_AT_S = 10.0  # a page that is open asks each second
 FORGOTTEN_S = 300.0
-SILENT_S, PAUSE_S = 5.0, 10.0  # who sends a message without an end fills our memory until we close the connection
+SILENT_S = 5.0
+PAUSE_S = 10.0  # who sends a message without an end fills our memory until we close the connection
 SAMPLES = 400
 MOST_LANES = 64  # that are shown
 ANSWER_WITHIN_S = 0.5
@@ -108,7 +109,8 @@ class Lookout:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._watched: dict[Path, _Watched] = {}
-        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="dashboard-lookout", daemon=True)
 
     def __enter__(self) -> Self:
@@ -158,7 +160,8 @@ class Lookout:
         except UserFacingError as error:
             _close(watched)
             with self._lock:
-                watched.status, watched.problem = None, one_line(str(error))
+                watched.status = None
+                watched.problem = one_line(str(error))
 
     def _listen(self, watched: _Watched, timeout_s: float) -> None:
         if watched.link is None:
@@ -170,7 +173,9 @@ class Lookout:
         now = self._clock()
         with self._lock:
             if newest is not None:
-                watched.status, watched.answered_s, watched.problem = newest, now, ""
+                watched.status = newest
+                watched.answered_s = now
+                watched.problem = ""
                 watched.silent_since_s = now
                 watched.samples.append(sample(newest, now))
             elif now - watched.answered_s > LOOKED_AT_S:

@@ -39,7 +39,8 @@ from millrace.protocol.bounds import escaped
 from millrace.protocol.messages import Status, WorkerStatus
 
 WIDE = 1080, 360
-SHOWN_S, LEAST_SHOWN_S = 180.0, 30.0  # of who waits for whom
+SHOWN_S = 180.0  # of who waits for whom
+LEAST_SHOWN_S = 30.0
 COLORS = {
     "collecting": "b1",
     "updating": "b0",
@@ -107,7 +108,8 @@ def last_warning(log: Sequence[LoggedLine]) -> str:
     warnings = [line for line in log if line.level != "info"]
     if not warnings:
         return ""
-    newest, count = warnings[-1], f"newest of {len(warnings)} warnings" if len(warnings) > 1 else "warning"
+    newest = warnings[-1]
+    count = f"newest of {len(warnings)} warnings" if len(warnings) > 1 else "warning"
     said = escape(escaped(newest.message).partition("\n")[0])
     return f'<p class="warned"><a href="#history">{count.capitalize()}</a>, {clock_time(newest)}: {said}</p>'
 
@@ -249,11 +251,13 @@ def who_waits(seen: Seen) -> str:
 
 def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
     """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
-    end_s, found = samples[-1].at_s + 1.0, list[Segment]()
+    end_s = samples[-1].at_s + 1.0
+    found = list[Segment]()
     span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)
     for i, (at_s, kind) in enumerate(zip((each.at_s for each in samples), kinds, strict=True)):
         until_s = min(samples[i + 1].at_s if i + 1 < len(samples) else end_s, at_s + 2.0)
-        begin, share = 1 - (end_s - at_s) / span_s, (until_s - at_s) / span_s
+        begin = 1 - (end_s - at_s) / span_s
+        share = (until_s - at_s) / span_s
         if kind not in COLORS:
             continue
         if found and found[-1].tooltip == kind and math.isclose(found[-1].begin + found[-1].share, begin, abs_tol=1e-6):

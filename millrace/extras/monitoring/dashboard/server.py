@@ -31,7 +31,8 @@ class DashboardServer:
     """Listens, and answers whoever knows the token."""
 
     def __init__(self, make: MakePage, token: str = "") -> None:
-        self._make, self.token = make, token or secrets.token_urlsafe(24)
+        self._make = make
+        self.token = token or secrets.token_urlsafe(24)
         self._hosts: frozenset[str] = frozenset()
         self._pages = ThreadPoolExecutor(1, "dashboard-pages")
         self._open: dict[asyncio.Task[None], None] = {}  # connections, the oldest first
@@ -81,7 +82,8 @@ class DashboardServer:
             writer.writelines(answer_parts(request, refusal(status)))
             return
         assert request is not None
-        loop, parts = asyncio.get_running_loop(), self._made(request)
+        loop = asyncio.get_running_loop()
+        parts = self._made(request)
         while part := await loop.run_in_executor(self._pages, next, parts, b""):
             writer.write(part)
             await asyncio.wait_for(writer.drain(), PART_WITHIN_S)

@@ -43,23 +43,28 @@ class Site:
     """Makes the page that a request asks for."""
 
     def __init__(self, runs: KnownRuns, look: Look) -> None:
-        self._runs, self._look = runs, look
+        self._runs = runs
+        self._look = look
 
     def answer(self, request: PageRequest) -> PageAnswer:
         """The page, or part of it. The first part of the path, the token, is right."""
         home = f"/{quote(request.path[0])}/"
         match request.path[1:]:
             case ("",) if (run := self._runs.only) is not None:
-                title, main = run.name, self._run(run, request, home)
+                title = run.name
+                main = self._run(run, request, home)
             case ("",):
-                title, main = "Runs", all_runs([self._runs.line(run) for run in self._runs.find().values()], home)
+                title = "Runs"
+                main = all_runs([self._runs.line(run) for run in self._runs.find().values()], home)
             case ("run", key):
                 run = self._runs.find().get(key)
                 if run is None:
                     return refusal(404)
-                title, main = run.name, self._run(run, request, home)
+                title = run.name
+                main = self._run(run, request, home)
             case ("compare",):
-                title, main = "Comparison", self._compare(request.query.get("run", []), home)
+                title = "Comparison"
+                main = self._compare(request.query.get("run", []), home)
             case ("file", key, *parts):
                 return self._file(key, parts)
             case ("style.css",):
@@ -77,7 +82,8 @@ class Site:
         return PageAnswer(text.encode(errors="replace"))
 
     def _run(self, run: Path, request: PageRequest, home: str) -> str:
-        line, back = self._runs.line(run), "" if self._runs.only else home
+        line = self._runs.line(run)
+        back = "" if self._runs.only else home
         seen = self._look(run) if line.state == "training" else Seen()
         try:
             content = self._runs.content(run)
@@ -104,7 +110,8 @@ class Site:
         return "\n".join(filter(None, parts))
 
     def _compare(self, keys: Sequence[str], home: str) -> str:
-        found, problems = self._runs.find(), list[str]()
+        found = self._runs.find()
+        problems = list[str]()
         contents = []
         for key in list(dict.fromkeys(keys))[:MOST_COMPARED]:
             try:

@@ -16,7 +16,10 @@ from millrace.protocol.arrays import Doubles
 
 COLORS = 7  # number of colors in the style sheet
 DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14 5 4 5")  # with round ends
-LEFT, RIGHT, TOP, BOTTOM = 52, 14, 10, 40
+LEFT = 52
+RIGHT = 14
+TOP = 10
+BOTTOM = 40
 MOST_POINTS = 500
 LEAST_SPAN = 1e-300  # steps of less are no numbers
 ON_A_PHONE = 420, 300
@@ -43,7 +46,8 @@ def ticks(low: float, high: float, about: int) -> list[float]:
         return [low]
     power = 10.0 ** math.floor(math.log10(span / about))
     step = min((factor * power for factor in (1, 2, 5, 10)), key=lambda step: abs(span / step - about))
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
     return [i * step for i in range(first, last + 1)]
 
 
@@ -62,9 +66,13 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     low, high = (min(float(y.min()) for y in ys), max(float(y.max()) for y in ys)) if ys else (0.0, 1.0)
     if low == high:
         margin = max(1.0, 1e-9 * abs(low))  # beside a very large number, 1 is lost
-        low, high = low - margin, high + margin
-    low, high = (0.0 if 0 <= low < 0.4 * high else low - 0.05 * (high - low)), high + 0.05 * (high - low)
-    plot_w, plot_h = width - LEFT - RIGHT, height - TOP - BOTTOM
+        low = low - margin
+        high = high + margin
+    room = 0.05 * (high - low)
+    low = 0.0 if 0 <= low < 0.4 * high else low - room
+    high += room
+    plot_w = width - LEFT - RIGHT
+    plot_h = height - TOP - BOTTOM
 
     def x_pixels(x: Doubles | float) -> Doubles:
         return np.asarray(LEFT + np.asarray(x) / x_max * plot_w)
@@ -98,7 +106,8 @@ def chart_for_all_widths(all_series: Sequence[Series], wide: tuple[int, int], x_
 
 def key(color: int) -> str:
     """A piece of the line of this color, for legends."""
-    x, y = np.array([2.0, 32.0]), np.array([5.0, 5.0])
+    x = np.array([2.0, 32.0])
+    y = np.array([5.0, 5.0])
     return f'<svg class="key" width="34" height="10">{_svg(Series("line", color, x, y), x, y)}</svg>'
 
 

@@ -83,6 +83,7 @@ def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:
     Returns the env steps [G], which all curves cover, and the returns [curves, G]. Mean and band over them end where the
     shortest curve ends, so that no curve is extrapolated.
     """
-    first, last = max(curve.env_steps[0] for curve in curves), min(curve.env_steps[-1] for curve in curves)
+    first = max(curve.env_steps[0] for curve in curves)
+    last = min(curve.env_steps[-1] for curve in curves)
     grid = np.linspace(first, last, GRID_POINTS) if last > first else np.zeros(0)
     return grid, np.stack([np.interp(grid, curve.env_steps, curve.returns) for curve in curves])

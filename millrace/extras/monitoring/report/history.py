@@ -9,7 +9,8 @@ from millrace.extras.monitoring.report.reported_runs import ReportData
 from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.protocol.bounds import escaped
 
-MOST_HISTORY, AT_ONCE = 30, 8  # lines; those after the first are in a block that is closed at first
+MOST_HISTORY = 30  # lines
+AT_ONCE = 8  # of them; the others are in a block that is closed at first
 
 
 def history(report: ReportData) -> str:

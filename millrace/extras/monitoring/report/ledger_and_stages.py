@@ -67,9 +67,11 @@ def _bars(report: ReportData, process: str, name: str) -> str:
     for short, (group, _), seconds in zip(report.short_names(), report.runs, spent, strict=True):
         total = sum(seconds.values())
         shares = {kind: seconds[kind] / total for kind in kinds if total and seconds.get(kind)}
-        segments, end = list[Segment](), 0.0
+        segments = list[Segment]()
+        end = 0.0
         for kind, share in shares.items():
-            tooltip, text = f"{kind}: {seconds[kind]:,.1f} s, {100 * share:.1f} %", f"{100 * share:.0f} %"
+            tooltip = f"{kind}: {seconds[kind]:,.1f} s, {100 * share:.1f} %"
+            text = f"{100 * share:.0f} %"
             segments.append(Segment(end, share, color[kind], tooltip, text if share > 0.06 else ""))
             end += share
         rows.append(

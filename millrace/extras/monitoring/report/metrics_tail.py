@@ -30,7 +30,8 @@ class MetricsTail:
     """The rows of one run."""
 
     def __init__(self, run: Path, most: int = MOST_ROWS) -> None:
-        self._path, self._most = run / METRICS_FILE, most
+        self._path = run / METRICS_FILE
+        self._most = most
         self._seen: tuple[int, ...] = ()  # which file it was, its size and time
         self._newest: bytes | None = None
         self._begin_anew()
@@ -55,7 +56,8 @@ class MetricsTail:
             if self._seen[:1] != seen[:1] or found.st_size < self._offset:
                 self._begin_anew()
             file.seek(self._offset)
-            self._newest, rest = None, b""
+            self._newest = None
+            rest = b""
             while chunk := file.read(CHUNK_BYTES):
                 rest = self._add(rest + chunk)
         self._seen = seen
@@ -64,7 +66,8 @@ class MetricsTail:
     def _begin_anew(self) -> None:
         self._offset = 0  # where the newest whole row begins
         self._newest = None
-        self._all, self._evaluations = _Thinned(self._most), _Thinned(self._most)
+        self._all = _Thinned(self._most)
+        self._evaluations = _Thinned(self._most)
 
     def _add(self, text: bytes) -> bytes:
         """Add the lines of this text. Returns its end, from the newest whole line on, which may change."""
@@ -75,7 +78,8 @@ class MetricsTail:
         if not ends.size:
             return text
         self._newest = text[begins[-2] : ends[-1]]
-        first, spans = self._all.count, np.column_stack([begins[:-2], ends[:-1]])
+        first = self._all.count
+        spans = np.column_stack([begins[:-2], ends[:-1]])
         lines = np.unique(np.searchsorted(ends, [*_places(text, OF_AN_EVALUATION)]))
         self._evaluations.add(text, first, spans, lines[lines < len(spans)])
         self._all.add(text, first, spans, np.arange(len(spans)))
@@ -87,13 +91,15 @@ class _Thinned:
     """At most twice `most` of the lines that are added, at equal distances."""
 
     def __init__(self, most: int) -> None:
-        self._most, self._every = most, 1
+        self._most = most
+        self._every = 1
         self.count = 0  # lines that were added
         self.lines: dict[int, bytes] = {}  # by their numbers in the file
 
     def add(self, text: bytes, first: int, spans: Ints, which: Ints) -> None:
         """`which` of the lines at these places of the text. `first`: the number of its first line in the file."""
-        before, every = self.count, self._every
+        before = self.count
+        every = self._every
         self.count += len(which)
         while self.count > 2 * self._most * self._every:
             self._every *= 2

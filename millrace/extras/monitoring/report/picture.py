@@ -23,8 +23,11 @@ from millrace.extras.monitoring.report.reported_runs import ReportData, group_ru
 from millrace.learner.run_folder.atomic_write import write_file
 from millrace.protocol.errors import UsageError
 
-WIDTH, HEIGHT = 640, 380  # of a panel's axes
-MARGIN, HEAD, LINE = 28, 50, 20
+WIDTH = 640  # of a panel's axes
+HEIGHT = 380
+MARGIN = 28
+HEAD = 50
+LINE = 20
 LETTERS = 92  # as many as fit into WIDTH, or a little fewer
 ZOOM = 2  # pixels of the PNG for each of the SVG
 OWN_STYLE = (
@@ -94,7 +97,9 @@ def draw(runs: Sequence[Path]) -> Drawing:
 def _svg(report: ReportData) -> str:
     found = panels(report)
     columns = math.ceil(math.sqrt(len(found)))
-    width, bottom, parts = MARGIN + columns * (WIDTH + MARGIN), MARGIN, list[str]()
+    width = MARGIN + columns * (WIDTH + MARGIN)
+    bottom = MARGIN
+    parts = list[str]()
     for begin in range(0, len(found), columns):
         row = [_panel(panel) for panel in found[begin : begin + columns]]
         parts += [_at(MARGIN + i * (WIDTH + MARGIN), bottom, inner) for i, (inner, _) in enumerate(row)]

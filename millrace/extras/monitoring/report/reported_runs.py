@@ -115,7 +115,8 @@ class RunGroup:
 
     def legend(self) -> str:
         """Which runs a color of the learning curves stands for."""
-        label, curves = self.label, self.curves
+        label = self.label
+        curves = self.curves
         if not curves:
             return f"{label}: no episode has ended yet"
         one_each = len({curve.seed for curve in curves}) == len(curves)

@@ -19,8 +19,10 @@ from millrace.learner.run_folder.regular_files import read
 from millrace.learner.run_folder.results import FactMean
 from millrace.learner.run_folder.sentences import duration, per_second
 
-WIDE, NARROW = (1080, 360), (540, 320)
-MOST_BYTES_OF_ONE, MOST_BYTES_OF_ALL = 4 * 2**20, 24 * 2**20  # films or pictures
+WIDE = (1080, 360)
+NARROW = (540, 320)
+MOST_BYTES_OF_ONE = 4 * 2**20  # film or picture
+MOST_BYTES_OF_ALL = 24 * 2**20
 
 
 def title(report: ReportData) -> str:
@@ -55,7 +57,8 @@ def results(report: ReportData) -> str:
 def _rows_of_group(group: RunGroup) -> str:
     rows = []
     for run in group.runs:
-        progress, evaluation = run.progress, run.evaluation
+        progress = run.progress
+        evaluation = run.evaluation
         if evaluation is None:
             greedy = '<strong class="none">–</strong><small>not evaluated</small>'
         else:
@@ -126,7 +129,8 @@ AddressOf = Callable[[Path, str], str]
 
 def images(report: ReportData, address_of: AddressOf | None = None) -> str:
     """What the policy sees: of each environment with images, the picture of its first run that has one."""
-    figures, address_of = [], address_of or Embedded()
+    figures = []
+    address_of = address_of or Embedded()
     for env in report.envs:
         runs = [run for group, run in report.runs if group.env == env and run.images]
         for path in runs[0].images if runs else ():
@@ -143,7 +147,8 @@ def images(report: ReportData, address_of: AddressOf | None = None) -> str:
 
 def videos(report: ReportData, address_of: AddressOf | None = None) -> str:
     """The newest video of each run. Large ones are named instead of shown."""
-    figures, address_of = [], address_of or Embedded()
+    figures = []
+    address_of = address_of or Embedded()
     for name, (group, run) in zip(report.short_names(), report.runs, strict=True):
         if not run.videos:
             continue
