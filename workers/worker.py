@@ -1,4 +1,4 @@
-"""Runs a session: connects it with the link, the collector or stepper, and signals. All decisions are the session's.
+"""Runs a session: connects it with the link, with what steps env copies, and with signals. All decisions are the session's.
 
 Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
 while it works. Every failure of the environment is reported to the learner.
@@ -24,16 +24,13 @@ from typing import TypeGuard
 from millrace.protocol.bounds import Stages
 from millrace.protocol.env_spec import AllowedCode
 from millrace.protocol.errors import BadMessage, EnvironmentFailed, PolicyFailed, UsageError, UserFacingError, first_line
-from millrace.protocol.messages import Describe, Described, Stepped, ToLearner, Weights
-from millrace.protocol.policy.called_policy import CalledPolicy
-from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.messages import Describe, Described, EpisodeRows, Stepped, ToLearner
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker, encode
 from millrace.protocol.wire.shared_memory import InheritedDescriptors
-from millrace.protocol.wire.weight_dtypes import to_float32
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.workers.activity import PREPARING, WAITING, activity
-from millrace.workers.collect.collector import Collector
+from millrace.workers.actors import Actors, MakeActors, make_local_actors
 from millrace.workers.conversation.heartbeat_thread import HeartbeatThread
 from millrace.workers.conversation.session import (
     BeginRun,
@@ -54,7 +51,6 @@ from millrace.workers.conversation.session import (
 from millrace.workers.conversation.worker_states import WorkerState
 from millrace.workers.copy_slots import close_described
 from millrace.workers.described_copy import describe
-from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import NoSlot, slots
 from millrace.workers.shared_weights import SharedWeightsReader
@@ -67,14 +63,6 @@ PULSE_S = 0.05  # time between two looks for messages while environments are ste
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
 AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
-
-MakeActors = Callable[[RunSpec], tuple[Collector, Evaluator]]
-
-
-def make_local_actors(run: RunSpec) -> tuple[Collector, Evaluator]:
-    """A collector and an evaluator that have env copies of their own and share a policy."""
-    policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else CalledPolicy(run.policy, run.extras)
-    return Collector(run, policy), Evaluator(run, policy)
 
 
 class _Abandoned(Exception):
@@ -109,7 +97,7 @@ class WorkerOptions:
     exit_code: Callable[[int, str], int] = _same_exit_code
     """Exit code of the process, from that of the conversation and the reason for leaving."""
     make_actors: MakeActors = make_local_actors
-    """Makes the collector and the evaluator of a run, with the policy that acts."""
+    """Makes what acts in a run."""
 
 
 class Worker:
@@ -127,10 +115,8 @@ class Worker:
         self._clock = clock
         self._options = options or WorkerOptions()
         self._handled_stop_requests = 0
-        self._collector: Collector | None = None
-        self._evaluator: Evaluator | None = None
+        self._actors: Actors | None = None
         self._stepper: Stepper | None = None
-        self._loaded: Weights | None = None
         self._packing = link.packing
         if self._options.shared_weights is not None:
             link.watch(self._options.shared_weights.wake_fd)
@@ -187,25 +173,12 @@ class Worker:
         match work:
             case Describe():
                 return [self._describe(work)]
-            case RolloutTask(session, weights, assignments, held):
-                return self._loaded_collector(weights).collect(assignments, weights.version, session, pulse, held)
-            case EvaluationTask(weights, order, held):
-                self._loaded_collector(weights)
-                assert self._evaluator is not None
-                return [self._evaluator.play(order, lambda rows: self._do([SendMessage(rows)]), pulse, held)]
+            case RolloutTask() | EvaluationTask():
+                assert self._actors is not None
+                return self._actors.do(work, self._send_rows, pulse)
         assert self._stepper is not None
         with self._heartbeats.lock_released():
             return [self._stepper.execute(work, lambda: self._pulse_from_env_code(work))]
-
-    def _loaded_collector(self, weights: Weights) -> Collector:
-        """The collector, whose policy acts under these weights. The evaluator has the same policy."""
-        collector = self._collector
-        assert collector is not None
-        if self._loaded is not weights:
-            collector.load(to_float32(weights.parameters), weights.buffers)
-            collector.env_attributes = b"" if weights.env_attributes is None else weights.env_attributes.tobytes()
-            self._loaded = weights
-        return collector
 
     def _listen(self, timeout_s: float) -> None:
         """Handle signals, then all messages that have arrived."""
@@ -293,6 +266,9 @@ class Worker:
             with self._heartbeats.lock_reacquired():
                 self._pulse(work)
 
+    def _send_rows(self, rows: EpisodeRows) -> None:
+        self._do([SendMessage(rows)])
+
     def _send_from_env_code(self, answer: Stepped) -> None:
         with self._heartbeats.lock_reacquired():
             self._do([SendMessage(answer)])
@@ -326,16 +302,12 @@ class Worker:
 
     def _update_statistics(self) -> None:
         earlier = self._earlier.stages
-        source = self._collector or self._stepper
         stages: Stages = {**earlier, "wait": self._waited_s}
         steps = self._earlier.steps
-        if source is not None:
+        if (source := self._actors or self._stepper) is not None:
             stages |= {stage: earlier.get(stage, 0.0) + seconds for stage, seconds in source.stages.items()}
             steps += source.steps
-        if self._evaluator is not None and self._evaluator.steps:
-            stages["evaluate"] = earlier.get("evaluate", 0.0) + self._evaluator.seconds
-            steps += self._evaluator.steps
-        note = "" if self._collector is None else self._collector.note
+        note = "" if self._actors is None else self._actors.note
         self._statistics = Statistics(steps, stages, self._resident_bytes, note)
         self._session.update_statistics(self._statistics)
 
@@ -350,7 +322,7 @@ class Worker:
                 case BeginRun(run):
                     self._begin(run)
                 case CloseLanes(lanes):
-                    if (owner := self._collector or self._stepper) is not None:
+                    if (owner := self._actors or self._stepper) is not None:
                         owner.lanes.close([lane.lane for lane in lanes])
                 case Leave(exit_code, reason):
                     activity().leave(self._options.exit_code(exit_code, reason))
@@ -365,14 +337,13 @@ class Worker:
             self._link.send(frames)
 
     def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Make a new collector or stepper, unless the run has yet to begin. Those of the last session were closed."""
+        """Make what steps env copies in this run, unless it has yet to begin. Those of the last session were closed."""
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)
         self._options.feed_watchdog(self._clock())
         self._update_statistics()
         self._earlier = self._statistics
-        self._collector = self._evaluator = self._stepper = None
-        self._loaded = None
+        self._actors = self._stepper = None
         if isinstance(run, WaitSpec):
             return
         why = run.rejection_reason(self._options.code)
@@ -385,7 +356,7 @@ class Worker:
             match run:
                 case RunSpec():
                     with activity().during(PREPARING):  # it may import torch and the user's modules, which takes long
-                        self._collector, self._evaluator = self._options.make_actors(run)
+                        self._actors = self._options.make_actors(run)
                     self._packing = replace(self._link.packing, zstd=run.zstd and self._link.packing.zstd)
                 case StepSpec():
                     self._stepper = Stepper(
@@ -411,10 +382,8 @@ class Worker:
 
     def _close_all(self) -> None:
         close_described()
-        if (owner := self._collector or self._stepper) is not None:
-            owner.lanes.close_all()
-        if self._evaluator is not None:
-            self._evaluator.close()
+        if (owner := self._actors or self._stepper) is not None:
+            owner.close()
 
 
 def _resident_bytes() -> int:

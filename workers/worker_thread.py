@@ -14,10 +14,11 @@ from millrace.protocol.bounds import one_line
 from millrace.protocol.env_spec import AllowedCode
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.workers.activity import Activity, ActivityReader, share_activity
+from millrace.workers.actors import MakeActors, make_local_actors
 from millrace.workers.conversation.connection_rules import LEARNER_STARTED_IT_S, wait_limits_s
 from millrace.workers.conversation.session import Leave, Session
 from millrace.workers.supervise.ending import Ending
-from millrace.workers.worker import MakeActors, Worker, WorkerOptions, identity, make_local_actors
+from millrace.workers.worker import Worker, WorkerOptions, identity
 
 
 class WorkerThread:

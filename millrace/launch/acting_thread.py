@@ -19,6 +19,7 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.policy.policy import Policy, make_policy
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.protocol.wire.weight_dtypes import ActingDtype
+from millrace.workers.actors import Actors
 from millrace.workers.collect.collector import Collector
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.split_vector_env import SplitLane, SplitVectorEnv
@@ -45,13 +46,13 @@ def acting_thread(
 ) -> Supervisor:
     """Start the thread. `device`: that of the policy."""
 
-    def collector(spec: RunSpec) -> tuple[Collector, Evaluator]:
+    def actors(spec: RunSpec) -> Actors:
         policy = acting_policy(spec.policy, device(), spec.images_dtype)
         evaluator = Evaluator(spec, policy, lambda run, count, render_mode, pulse: evaluation_copies)
-        return Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator
+        return Actors(Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator)
 
     def start(name: str) -> WorkerThread:
-        return WorkerThread(endpoint.link.address, name, endpoint.context, collector)
+        return WorkerThread(endpoint.link.address, name, endpoint.context, actors)
 
     return Supervisor(start, 1, prefix="inference")
 

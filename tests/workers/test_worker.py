@@ -44,13 +44,12 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wir
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.workers import machine_slots as slot_file
 from millrace.workers.activity import ActivityReader, activity
-from millrace.workers.collect.collector import Collector
+from millrace.workers.actors import Actors, make_local_actors
 from millrace.workers.conversation.session import Leave, Session
-from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import Slots
 from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
-from millrace.workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_actors
+from millrace.workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
@@ -233,7 +232,7 @@ def test_calls_may_take_as_long_as_the_newest_run_lets_them_before_any_of_its_en
     limits, watched = list[CallTimeouts](), list[CallTimeouts]()
     page = ActivityReader(activity())
 
-    def note_limits(run: RunSpec) -> tuple[Collector, Evaluator]:
+    def note_limits(run: RunSpec) -> Actors:
         assert page.read(0.0).timeouts == watched[-1], "the watchdog does not know them yet"
         limits.append(watched[-1])
         return make_local_actors(run)
@@ -309,10 +308,10 @@ def test_only_the_time_in_which_a_joining_worker_listens_is_time_without_an_answ
         link.now += 100.0
         closed_at.append(link.now)
 
-    def slow_to_close(run: RunSpec) -> tuple[Collector, Evaluator]:
-        collector, evaluator = make_local_actors(run)
-        monkeypatch.setattr(collector.lanes, "close", close)
-        return collector, evaluator
+    def slow_to_close(run: RunSpec) -> Actors:
+        actors = make_local_actors(run)
+        monkeypatch.setattr(actors.lanes, "close", close)
+        return actors
 
     session = Session(replace(identity("w0"), process_nonce=0), 0.0, rejoin_timeout_s=150.0)
     Worker(cast(WorkerLink, link), session, WorkerOptions(make_actors=slow_to_close), clock=lambda: link.now).run()

@@ -134,6 +134,10 @@ class Stepper:
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True
 
+    def close(self) -> None:
+        """Close all env copies."""
+        self.lanes.close_all()
+
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> CopyInfos:
         began = perf_counter()
         # A copy of the actions, because an environment may keep its action, or change it.
