@@ -122,8 +122,9 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
     except TypeError as error:
         line = f"wrapper {name}: {first_line(error)}"
         if isinstance(wrapper, str) and "argument" in line:
-            module, qualname, _, _ = read_wrapper(wrapper)
-            raise UsageError(f'{line}; give its arguments, as in --wrappers "{module}:{qualname}(name=value)"') from error
+            read = read_wrapper(wrapper)
+            how = f'give its arguments, as in --wrappers "{read.module}:{read.qualname}(name=value)"'
+            raise UsageError(f"{line}; {how}") from error
         raise UsageError(line, traceback.format_exc()) from error
     except Exception as error:
         raise UsageError(f"wrapper {name}: {type(error).__name__}: {first_line(error)}", traceback.format_exc()) from error
@@ -137,6 +138,6 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
 
 def _found(text: str) -> Wrapper:
     """The wrapper of this name, imported, with its arguments. Raises `UsageError`."""
-    module_name, qualname, args, kwargs = read_wrapper(text)
-    found = own_callable(f"{module_name}:{qualname}", f"wrapper {text}", "gymnasium.wrappers:FlattenObservation")
-    return lambda env: found(env, *args, **kwargs)
+    read = read_wrapper(text)
+    found = own_callable(f"{read.module}:{read.qualname}", f"wrapper {text}", "gymnasium.wrappers:FlattenObservation")
+    return lambda env: found(env, *read.args, **read.kwargs)

@@ -32,9 +32,10 @@ class Expected(NamedTuple):
 
 def wrong_arrays(expected: Iterable[Expected], axes: Axes | None = STEP_AND_COPY) -> str:
     """What is wrong with the first of these arrays that is wrong. `axes` None: whatever values it has."""
-    for name, array, shape, dtype, space in expected:
-        if why := _misfit(array, shape, dtype) or (axes is not None and wrong_values(array, space, axes)):
-            return f"{name}: {why}"
+    for each in expected:
+        array = each.array
+        if why := _misfit(array, each.shape, each.dtype) or (axes is not None and wrong_values(array, each.space, axes)):
+            return f"{each.name}: {why}"
     return ""
 
 

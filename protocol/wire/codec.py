@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import reduce
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import msgpack
 import msgspec
@@ -149,25 +149,26 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
 
     def hook(wanted: type, value: object) -> object:
         nonlocal taken
-        dtype, shape, index, size, packings = _described(frames, value)
-        if index in used:
-            raise BadMessage(f"array frame {index} expected one array, got two")
-        used.add(index)
-        frame = frames[index]
-        if packings is not None:
+        array = _described(frames, value)
+        size = array.size
+        if array.frame_index in used:
+            raise BadMessage(f"array frame {array.frame_index} expected one array, got two")
+        used.add(array.frame_index)
+        frame = frames[array.frame_index]
+        if array.packings is not None:
             taken += size
             if taken > packed_bytes_limit or not packed_bytes_limit:
                 raise BadMessage(f"packed arrays expected at most {packed_bytes_limit} bytes together, got {taken}")
             if size > MAX_FRAME_BYTES:
                 raise BadMessage(f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {size}")
-            return unpack_array(frame, packings, dtype, shape)
+            return unpack_array(frame, array.packings, array.dtype, array.shape)
         if size != len(frame):
-            raise BadMessage(f"array {dtype.str}{shape} expected {size} bytes, got {len(frame)}")
+            raise BadMessage(f"array {array.dtype.str}{array.shape} expected {size} bytes, got {len(frame)}")
         if wanted is PickledCallable:
             if size > MAX_CALLABLE_BYTES:
                 raise BadMessage(f"callable expected at most {MAX_CALLABLE_BYTES} bytes, got {size}")
             return PickledCallable(bytes(frame))
-        return np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())
+        return np.ndarray(array.shape, array.dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())
 
     try:
         head = msgpack.unpackb(
@@ -206,8 +207,19 @@ def _explain_validation_error(error: str, head: object, kinds: Any) -> str:
     return error
 
 
-def _described(frames: Sequence[Buffer], value: object) -> tuple[np.dtype[Any], list[int], int, int, list[object] | None]:
-    """Dtype, shape, frame index, size in bytes and packings of an array: `[dtype, shape, index]`, perhaps with packings."""
+class _DescribedArray(NamedTuple):
+    """An array, as the head of its message describes it."""
+
+    dtype: np.dtype[Any]
+    shape: list[int]
+    frame_index: int
+    size: int
+    """bytes, once it is unpacked"""
+    packings: list[object] | None
+
+
+def _described(frames: Sequence[Buffer], value: object) -> _DescribedArray:
+    """The array that this part of a head describes: `[dtype, shape, index]`, perhaps with packings."""
     if not (type(value) is list and 3 <= len(value) <= 4):
         raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
     name, shape, index = value[:3]
@@ -226,4 +238,4 @@ def _described(frames: Sequence[Buffer], value: object) -> tuple[np.dtype[Any], 
     packings = value[3] if len(value) == 4 else None
     if packings is not None and type(packings) is not list:
         raise BadMessage(f"array packings expected a list of names, got {str(packings)[:80]}")
-    return dtype, shape, index, size, packings
+    return _DescribedArray(dtype, shape, index, size, packings)

@@ -62,28 +62,35 @@ class SeatedCopies(LoopedCopies):
     def _result(self, stepped: Sequence[int]) -> StepResult:
         """What the last step of these copies returned. The others show their last step; copies never reset are left out."""
         steps: list[SeatStep] = [step for step in self._observations if step is not None]
-        observations, infos, reward, terminated, truncated, complete, acts, outside = side_by_side(steps)
+        columns = side_by_side(steps)
+        observations = columns.observations
         leaves: Leaves = read_leaves(self._read, observations, self._names) if self._nested else (observations,)
         if self._masks is not None:
             for n in stepped:
                 for seat, name in enumerate(self._names):
                     column = n * self._seats + seat
-                    if not (acts[column] or complete[column]):
+                    if not (columns.acts[column] or columns.complete[column]):
                         continue
-                    over = not acts[column]
+                    over = not columns.acts[column]
+                    terminated = over and columns.terminated[column]
                     try:
                         self._allowed[column] = self._masks.read(
-                            n, observations[column], infos[column], over and terminated[column], over
+                            n, observations[column], columns.infos[column], terminated, over
                         )
                     except CopyFailed as error:
                         raise CopyFailed(n, error.doing, f"{name}, {error.line}") from error
             everything = self._masks.everything
-            allowed = self._allowed[: len(acts)]
+            allowed = self._allowed[: len(columns.acts)]
             leaves = (*leaves, [everything if mask is None else mask for mask in allowed])
         ended = np.array(self._loop.terminated[: len(steps)], bool)
-        self.columns = SeatColumns(np.array(complete, bool), np.array(acts, bool), np.array(outside, np.float64), ended)
+        self.columns = SeatColumns(
+            complete=np.array(columns.complete, bool),
+            acts=np.array(columns.acts, bool),
+            outside=np.array(columns.outside, np.float64),
+            over=ended,
+        )
         facts = {n: self._facts_of(steps[n]) for n in stepped if ended[n]} if self._facts else {}
-        return StepResult(leaves, reward, terminated, truncated, facts=facts, columns=self.columns)
+        return StepResult(leaves, columns.reward, columns.terminated, columns.truncated, facts=facts, columns=self.columns)
 
     def pending(self, copy: int) -> Array:
         """[A] rewards that the seats of this copy have got, and that none of its steps has returned."""

@@ -118,12 +118,16 @@ class SplitVectorEnv:
 
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""
-        assert self._result is not None
-        leaves, reward, terminated, truncated, lost, facts, _ = self._result
-        lost = None if lost is None else lost[copies]
-        own = {n - copies.start: facts[n] for n in range(copies.start, copies.stop) if n in facts} if facts else {}
+        whole = self._result
+        assert whole is not None
+        facts = whole.facts
         return StepResult(
-            [leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost, own
+            leaves=[leaf[copies] for leaf in whole.leaves],
+            reward=whole.reward[copies],
+            terminated=whole.terminated[copies],
+            truncated=whole.truncated[copies],
+            lost=None if whole.lost is None else whole.lost[copies],
+            facts={n - copies.start: facts[n] for n in range(copies.start, copies.stop) if n in facts} if facts else {},
         )
 
     def reset(self, copies: slice, seeds: Sequence[int], pulse: Pulse) -> Leaves:

@@ -328,10 +328,13 @@ class ReplayBuffer:
 
     def roll_back(self) -> None:
         """Return to the state that was remembered last."""
-        assert self._remembered is not None, "nothing was remembered"
-        self._written, self._rows, self._highest, newest, generator = self._remembered
-        self._newest = dict(newest)
-        self.generator.bit_generator.state = generator
+        remembered = self._remembered
+        assert remembered is not None, "nothing was remembered"
+        self._written = remembered.written
+        self._rows = remembered.rows
+        self._highest = remembered.highest
+        self._newest = dict(remembered.newest)
+        self.generator.bit_generator.state = remembered.generator
         for old in reversed(self._overwritten):
             self._row[old.slots] = old.rows
             for leaf, before in zip(self._per_observation(), old.leaves, strict=False):

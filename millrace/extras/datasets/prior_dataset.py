@@ -51,14 +51,14 @@ class PriorDataset(PriorData):
     def batches(self) -> Iterator[Batch]:
         """One batch for each episode, in the order of the dataset. Raises `UsageError` if an episode cannot be used."""
         to_stored = stored_actions_of(self._policy)
-        for number, obs, action, reward, terminated, truncated in self._files.read_episodes():
+        for episode in self._files.read_episodes():
             yield self._batch(
-                number,
-                tuple(leaf[:, None] for leaf in obs),
-                to_stored(action)[:, None],
-                reward[:, None],
-                terminated[:, None],
-                truncated[:, None],
+                episode.number,
+                tuple(leaf[:, None] for leaf in episode.obs),
+                to_stored(episode.action)[:, None],
+                episode.reward[:, None],
+                episode.terminated[:, None],
+                episode.truncated[:, None],
             )
 
     def _batch(

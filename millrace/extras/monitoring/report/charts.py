@@ -130,12 +130,13 @@ class Segment(NamedTuple):
 def bar(segments: Iterable[Segment]) -> str:
     """A bar of colored segments, as wide as the page allows. Its sizes are attributes, not styles, which pages forbid."""
     parts = []
-    for begin, share, css, tooltip, text in segments:
-        rect = f'<rect class="{css}" x="{100 * begin:.2f}%" width="{100 * share:.2f}%" height="100%">'
-        parts.append(f"{rect}<title>{escape(tooltip)}</title></rect>")
-        if text:
-            of_wait = " on-wait" if css == "wait" else ""
-            parts.append(f'<text class="on-bar{of_wait}" x="{100 * begin:.2f}%" dx="7" y="50%" dy="4">{escape(text)}</text>')
+    for each in segments:
+        x = f"{100 * each.begin:.2f}%"
+        rect = f'<rect class="{each.css}" x="{x}" width="{100 * each.share:.2f}%" height="100%">'
+        parts.append(f"{rect}<title>{escape(each.tooltip)}</title></rect>")
+        if each.text:
+            of_wait = " on-wait" if each.css == "wait" else ""
+            parts.append(f'<text class="on-bar{of_wait}" x="{x}" dx="7" y="50%" dy="4">{escape(each.text)}</text>')
     return f'<svg class="bar">{"".join(parts)}</svg>'
 
 
