@@ -68,7 +68,7 @@ Outgoing = tuple[bytes, ToWorker]
 """A message and the routing id of the worker that it is sent to."""
 
 
-@dataclass
+@dataclass(eq=False)
 class SharingSupervisor:
     """A supervisor whose workers share the weights that it gets, as the learner sees it. Its workers' members keep it."""
 
@@ -79,8 +79,6 @@ class SharingSupervisor:
     """Number of heartbeat replies that were sent to it."""
     received: int = 0
     """Number of the last one that it has received: what was sent before it has arrived, or is lost."""
-    versions: dict[int, int] = field(default_factory=dict)
-    """Versions of the weights that were sent to it; for each, `replies` when it was sent."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import msgspec
 
@@ -14,8 +14,6 @@ from millrace.protocol.messages import Heartbeat, WorkerStatus
 class CollectingMember(Member):
     """A worker that collects rollouts and plays evaluations."""
 
-    versions: dict[int, int] = field(default_factory=dict)
-    """Versions that were sent to the worker, unless it is known to lack them; for each, `replies` when it was sent last."""
     strikes: int = 0
     """Number of the worker's rollouts and messages that could not be used."""
     ended_steps: int = 0

@@ -32,6 +32,6 @@ class Rounds:
         """The version that acts in this round, which is open."""
         return self._versions[number]
 
-    def acts(self, version: int) -> bool:
-        """Whether this version acts in a round that is open."""
-        return version in self._versions.values()
+    def acting(self) -> set[int]:
+        """The versions that act in rounds that are open."""
+        return set(self._versions.values())

@@ -1,9 +1,9 @@
-"""The weights that orders name, and which workers hold them. Pure.
+"""The weights that orders name, and who holds which of them. Pure.
 
-Rule: weights are kept while they are the newest, act in a round that is open, or are evaluated. They are sent to a worker
-after the first order that names them, and again if its Heartbeat shows that they were lost on the way. A worker drops none
-by itself: every order lists those that it is to keep, which are those that its outstanding tickets name. So the learner
-knows which the worker holds, whatever is on its way between them.
+Rule: weights are kept while they are the newest, act in a round that is open, are evaluated, or are an opponent. They are
+sent to a worker after the first order that names them, and again if its Heartbeat shows that they were lost on the way. A
+worker drops none by itself: every order lists those that it is to keep, which are those that its outstanding tickets name.
+So the learner knows which the worker holds, whatever is on its way between them.
 
 Where a supervisor shares weights among its workers, it gets them once, in place of the first of its workers that needs
 them. For all of these they are on the way until the supervisor's word shows that they have reached it, or are lost. From
@@ -12,20 +12,95 @@ then on a worker has as long to take them as if they had just been sent to it; w
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Set
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
-import msgspec
-
-from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.membership import Outgoing, SharingSupervisor
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.protocol.alive import SHARED_VERSIONS
 from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 
-TO_SUPERVISOR = sys.maxsize  # in place of a number of replies: on the way to the supervisor, as far as is known
 
-Named = Callable[[Collection[int]], set[int]]
-"""Returns the versions that these tickets name."""
+@dataclass(frozen=True)
+class Sent:
+    """They were sent, after so many heartbeat replies. Who has received a later reply has them, or they are lost."""
+
+    replies: int
+
+
+@dataclass(frozen=True)
+class FromSupervisor:
+    """The worker gets them from its supervisor, to which they may still be on the way."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """The worker has said that it holds them."""
+
+
+Standing = Sent | FromSupervisor | Held
+"""What the learner knows of some weights and a worker. It knows nothing of those that the worker lacks."""
+
+
+class WeightsHeld:
+    """Which weights each worker and each supervisor holds or is about to get. The only record of it."""
+
+    def __init__(self) -> None:
+        self.by_worker: dict[bytes, dict[int, Standing]] = {}
+        """by routing id and version"""
+        self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, Sent]]()
+        """by version, the newest last; it ends with the last member that has this supervisor"""
+
+    def versions(self, peer: bytes) -> Set[int]:
+        """The versions that this worker holds or is about to get."""
+        return self.by_worker.get(peer, {}).keys()
+
+    def give(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> bytes | None:
+        """The worker gets these weights, from this supervisor if there is one. Returns whom to send them; None: nobody."""
+        mine = self.by_worker.setdefault(member.peer, {})
+        if supervisor is None:
+            mine[version] = Sent(member.replies)
+            return member.peer
+        mine[version] = FromSupervisor()
+        shared = self.by_supervisor.setdefault(supervisor, {})
+        if version in shared:
+            return None
+        shared[version] = Sent(supervisor.replies)
+        for oldest in list(shared)[:-SHARED_VERSIONS]:
+            del shared[oldest]
+        return supervisor.peer
+
+    def keep_only(self, peer: bytes, versions: Collection[int]) -> None:
+        """The worker is told to drop all others."""
+        mine = self.by_worker.get(peer, {})
+        self.by_worker[peer] = {version: standing for version, standing in mine.items() if version in versions}
+
+    def hear(self, member: CollectingMember, heartbeat: Heartbeat) -> None:
+        """The worker lists what it holds. It lacks the rest, unless that may still be on its way."""
+        mine = self.by_worker.get(member.peer, {})
+        after: dict[int, Standing] = {}
+        for version, standing in mine.items():
+            match standing:
+                case FromSupervisor():
+                    under_way = self._may_be_under_way(version, member.shared_by)
+                    after[version] = standing if under_way else Sent(member.replies)
+                case Sent(replies) if replies >= heartbeat.replies:
+                    after[version] = standing
+                case _ if version in heartbeat.versions:
+                    after[version] = Held()
+        self.by_worker[member.peer] = after
+
+    def forget(self, peer: bytes) -> None:
+        """The session of this worker has ended."""
+        self.by_worker.pop(peer, None)
+
+    def _may_be_under_way(self, version: int, supervisor: SharingSupervisor | None) -> bool:
+        """Whether these weights may not have reached the supervisor yet. False if it shares no more."""
+        if supervisor is None:
+            return False
+        sent = self.by_supervisor.get(supervisor, {}).get(version)
+        return sent is not None and sent.replies >= supervisor.received
 
 
 class SentWeights:
@@ -34,49 +109,32 @@ class SentWeights:
     def __init__(self) -> None:
         self.kept: dict[int, Weights] = {}
         """by version"""
+        self.held = WeightsHeld()
 
-    def publish(self, weights: Weights, acts: Callable[[int], bool]) -> None:
-        """Set the newest weights. `acts`: whether a version acts in an open round or is evaluated; others are dropped."""
-        self.kept = {version: each for version, each in self.kept.items() if acts(version)}
-        self.kept[weights.version] = weights
+    def keep(self, newest: Weights, needed: Collection[int]) -> None:
+        """Keep the newest weights and, of those before them, the versions that are still needed."""
+        self.kept = {version: weights for version, weights in self.kept.items() if version in needed}
+        self.kept[newest.version] = newest
 
-    def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember], named: Named) -> list[Outgoing]:
-        """These messages; after all of them, the weights of the versions that they name and their workers do not hold."""
+    def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
+        """The weights that these orders name and their workers lack. They are sent after the orders."""
         out = list[Outgoing]()
-        weights = list[Outgoing]()
-        for peer, message in orders:
-            if isinstance(message, Collect | Evaluate):
+        for peer, order in orders:
+            if isinstance(order, Collect | Evaluate):
                 member = members[peer]
-                keep = named(members[peer].tickets)
-                for version in sorted(message.versions - member.versions.keys()):
-                    weights += self._sent(member, version, acts=version == message.version)
-                member.versions = {version: sent_at for version, sent_at in member.versions.items() if version in keep}
-                message = msgspec.structs.replace(message, keep=tuple(sorted(keep)))
-            out.append((peer, message))
-        return out + weights
+                for version in sorted(order.versions - self.held.versions(peer)):
+                    # Opponents differ from worker to worker, so theirs are not shared.
+                    supervisor = member.shared_by if version == order.version else None
+                    out += self._send(member, version, supervisor)
+                self.held.keep_only(peer, order.keep)
+        return out
 
-    def _sent(self, member: CollectingMember, version: int, *, acts: bool) -> list[Outgoing]:
-        """What gives the worker these weights. Opponents differ from worker to worker, so theirs are not shared."""
-        supervisor = member.shared_by if acts else None
-        member.versions[version] = member.replies if supervisor is None else TO_SUPERVISOR
-        if supervisor is None:
-            return [(member.peer, self.kept[version])]
-        if version in supervisor.versions:
-            return []
-        last = list(supervisor.versions.items())[1 - SHARED_VERSIONS :]
-        supervisor.versions = {**dict(last), version: supervisor.replies}
-        return [(supervisor.peer, self.kept[version])]
+    def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
+        """Of these versions, which the worker's unfinished tickets name, those that were lost, as its heartbeat shows."""
+        self.held.hear(member, heartbeat)
+        lost = sorted(set(named) - self.held.versions(member.peer))
+        return [message for version in lost for message in self._send(member, version, None)]
 
-    def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Named) -> list[Outgoing]:
-        """Those that the worker's unfinished tickets name and that were lost on the way to it, as its heartbeat shows."""
-        supervisor = member.shared_by
-        for version, sent_at in member.versions.items():
-            on_its_way = supervisor is not None and supervisor.versions.get(version, -1) >= supervisor.received
-            if sent_at == TO_SUPERVISOR and not on_its_way:
-                member.versions[version] = member.replies
-        sent = member.versions.items()
-        # What it does not list was dropped or lost, unless it may still be on its way.
-        held = {version: at for version, at in sent if version in heartbeat.versions or at >= heartbeat.replies}
-        lost = sorted(named(heartbeat.tickets) - held.keys())
-        member.versions = held | dict.fromkeys(lost, member.replies)
-        return [(member.peer, self.kept[version]) for version in lost]
+    def _send(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> list[Outgoing]:
+        receiver = self.held.give(member, version, supervisor)
+        return [] if receiver is None else [(receiver, self.kept[version])]

@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 
+import msgspec
+
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import EnvironmentNoted, Failed, PolicyRaised
 from millrace.learner.members.lane_placement import LanePlacement, is_spare
@@ -28,7 +30,9 @@ from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.protocol.messages import (
     Array,
+    Collect,
     EpisodeRows,
+    Evaluate,
     Evaluated,
     Failure,
     Heartbeat,
@@ -115,7 +119,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         if self.rollouts.opponents is not None and env_steps is not None:
             self.rollouts.opponents.made(version, env_steps)
         self.version = version
-        self.weights.publish(Weights(version, parameters, buffers, env_attributes), self._is_needed)
+        self.weights.keep(Weights(version, parameters, buffers, env_attributes), self._needed())
 
     def begin_update(self) -> list[Outgoing]:
         """The next update begins, unless it has begun, with the newest weights: deal the rounds that it opens."""
@@ -138,7 +142,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def share_evaluation(self) -> list[Outgoing]:
         """No answer of the evaluation has come for long: a second worker plays the oldest ticket as well, if one is free."""
-        return self.weights.after(self.evaluation.share(self.membership.active()), self.members, self._named)
+        return self._with_weights(self.evaluation.share(self.membership.active()))
 
     def collected(self) -> int:
         """Env steps of the next update's rollouts: of those that have come, and of those under way, as workers report."""
@@ -163,18 +167,31 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             out += self.evaluation.deal(self.membership.active())
         if self.evaluation.beside or not self.evaluation.pending:
             out += self.rollouts.deal(self.members)
-        return self.weights.after(out, self.members, self._named)
+        return self._with_weights(out)
 
-    def _is_needed(self, version: int) -> bool:
-        """Whether these weights are needed, although they are not the newest."""
-        opponents = self.rollouts.opponents
-        if opponents is not None and version in opponents.versions:
-            return True
-        return self.rollouts.rounds.acts(version) or (self.evaluation.pending and version == self.evaluation.version)
+    def _with_weights(self, orders: list[Outgoing]) -> list[Outgoing]:
+        """These orders, which list the versions that their workers are to keep, and the weights that these workers lack."""
+        out = list[Outgoing]()
+        for peer, order in orders:
+            if isinstance(order, Collect | Evaluate):
+                keep = tuple(sorted(self._named(self.members[peer].tickets)))
+                order = msgspec.structs.replace(order, keep=keep)
+            out.append((peer, order))
+        return out + self.weights.after(out, self.members)
 
     def _named(self, tickets: Collection[int]) -> set[int]:
         """The versions that these tickets name."""
         return self.rollouts.versions(tickets) | self.evaluation.versions(tickets)
+
+    def _needed(self) -> set[int]:
+        """The versions that orders may name, beside the newest."""
+        opponents = self.rollouts.opponents
+        needed = self.rollouts.rounds.acting()
+        if self.evaluation.pending:
+            needed.add(self.evaluation.version)
+        if opponents is not None:
+            needed.update(opponents.versions)
+        return needed
 
     def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
         held = len(member.tickets)
@@ -208,9 +225,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        out = self.weights.again(member, heartbeat, self._named)
+        out = self.weights.again(member, heartbeat, self._named(heartbeat.tickets))
         orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
-        return out + self.weights.after(orders, self.members, self._named)
+        return out + self._with_weights(orders)
 
     def _received(self, member: CollectingMember) -> tuple[Received, ...]:
         return self.rollouts.received(member)
@@ -225,6 +242,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation
             dealer.lose(member, number)
         self._placement.removed(member)
+        self.weights.held.forget(member.peer)
 
     def _unusable(self, member: CollectingMember, why: str) -> list[Outgoing]:
         """Count what could not be used; after too much of it the worker is refused."""

@@ -15,7 +15,7 @@ from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
-from millrace.learner.rollouts.sent_weights import SentWeights
+from millrace.learner.rollouts.sent_weights import Held, Sent, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.messages import ToLearner, WorkerExit
 from tests.model import membership_part
@@ -39,9 +39,10 @@ from tests.support.conversation.rules import check_tickets, waiting_rollouts
 SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},
     RolloutDealer: {"lanes", "ledger", "held", "ready", "rounds", "_to_deal"},
-    SentWeights: {"kept"},
+    SentWeights: {"kept", "held"},
+    WeightsHeld: {"by_worker"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
-    CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "versions"}
+    CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
     | {"strikes", "takeovers", "welcomed"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order"},
@@ -54,6 +55,7 @@ NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes"},
     RolloutDealer: {"_absent", "opponents"},
     SentWeights: set(),
+    WeightsHeld: {"by_supervisor"},
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare", "has_policy_code"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
@@ -287,7 +289,7 @@ def saved(learner: Learner, now: float) -> Content:
         coordinator._placement._settled,
         None if waiting_for is None else (session(waiting_for.session), tuple(sorted(waiting_for.lanes))),
         tuple(sorted(coordinator.rollouts._to_deal)),
-        tuple(sorted(coordinator.weights.kept)),
+        (tuple(sorted(coordinator.weights.kept)), _held(coordinator)),
         learner.updating,
         tuple(learner.checkpoints),
         tuple(name(Kind.OLD_TICKET, number) for number in sorted(learner.used)),
@@ -301,6 +303,24 @@ def saved(learner: Learner, now: float) -> Content:
         ),
         learner.lag,
     )
+
+
+def _held(coordinator: TicketCoordinator) -> Content:
+    """Which weights each member holds, in the order in which they joined, and what of it is not known for sure."""
+    members = sorted(coordinator.members.values(), key=lambda each: each.join_number)
+    by_worker = coordinator.weights.held.by_worker
+    assert by_worker.keys() <= coordinator.members.keys(), "weights count as held by a worker that is gone"
+    return tuple(
+        tuple(
+            (version, name(Kind.REPLIES, standing.replies, member.session) if isinstance(standing, Sent) else None)
+            for version, standing in sorted(by_worker.get(member.peer, {}).items())
+        )
+        for member in members
+    )
+
+
+def _standing(sent_at: Name | None) -> Standing:
+    return Held() if sent_at is None else Sent(sent_at.value)
 
 
 def _snapshots(coordinator: TicketCoordinator) -> list[int]:
@@ -345,7 +365,7 @@ def without_checkpoints(content: Content) -> Content:
 def loaded(content: Content, settings: Settings) -> Learner:
     """A learner at the time 0 with this content."""
     issued, used, version, versions, lanes, tickets, ready, members, *rest = content
-    unplaced, settled, waiting_for, to_deal, held, *mine = rest
+    unplaced, settled, waiting_for, to_deal, (kept, held), *mine = rest
     coordinator = TicketCoordinator(
         settings.run,
         max_lag=settings.max_lag,
@@ -358,7 +378,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
     coordinator.rollouts.ledger.transitions_received = len(ready)
     coordinator.rollouts.rounds._versions = dict(enumerate(versions))
     coordinator.rollouts._to_deal = set(to_deal)
-    coordinator.weights.kept = {each: weights(each) for each in held}
+    coordinator.weights.kept = {each: weights(each) for each in kept}
     for of_round, fields, number in ready:
         arrived = AcceptedRollout(rollout_of(fields), number.value)
         coordinator.rollouts.ready.setdefault(of_round, {})[arrived.rollout.lane] = arrived
@@ -373,6 +393,9 @@ def loaded(content: Content, settings: Settings) -> Learner:
         coordinator.rollouts.held[number.value] = each
         coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
     membership_part.load(coordinator.membership, members, CollectingMember)
+    for peer, by_version in zip(coordinator.members, held, strict=True):  # in the order in which they joined
+        standings = {version: _standing(sent_at) for version, sent_at in by_version}
+        coordinator.weights.held.by_worker[peer] = standings
     placement = coordinator._placement
     placement._unplaced, placement._settled = set(unplaced), settled
     if waiting_for is not None:

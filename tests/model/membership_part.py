@@ -44,11 +44,7 @@ def _member(member: Member, now: float) -> Content:
         replies(member.replies),
         replies(member.welcomed),
         member.takeovers,
-        (
-            (tuple((version, replies(sent_at)) for version, sent_at in sorted(member.versions.items())), member.strikes)
-            if isinstance(member, CollectingMember)
-            else ()
-        ),
+        member.strikes if isinstance(member, CollectingMember) else None,
     )
 
 
@@ -57,14 +53,14 @@ def load(membership: Membership[M], content: Content, kind: type[M]) -> None:
     members, _, none_silent, refused = content
     for join_number, fields in enumerate(members):
         worker, nonce, attempt, evaluates, number, heard, lanes, tickets, *more = fields
-        replies, welcomed, takeovers, collecting = more
+        replies, welcomed, takeovers, strikes = more
         said = hello(worker.value, nonce.value, attempt.value, evaluates=evaluates)
         member = kind(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
         member.replies, member.welcomed, member.takeovers = replies.value, welcomed.value, takeovers
         if isinstance(member, CollectingMember):
-            member.versions, member.strikes = {version: sent_at.value for version, sent_at in collecting[0]}, collecting[1]
+            member.strikes = strikes
         membership.members[member.peer] = member
         membership._of_process[said.worker, said.process_nonce] = member
     membership._joins, membership._none_silent_before_s = len(members), none_silent

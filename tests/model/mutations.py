@@ -95,32 +95,39 @@ MUTATIONS = {
         COORDINATOR, "self.rollouts.send(member, lost) + self.evaluation", "self.evaluation"
     ),
     "lost weights are not sent again": Mutation(
-        WEIGHTS, "return [(member.peer, self.kept[version]) for version in lost]", "return []"
+        WEIGHTS, "for version in lost for message in", "for version in lost[:0] for message in"
     ),
     "weights that may be under way are sent again": Mutation(
-        WEIGHTS, "or at >= heartbeat.replies}", "or at > heartbeat.replies}"
+        WEIGHTS, "if replies >= heartbeat.replies:", "if replies > heartbeat.replies:"
     ),
-    "weights that are sent again are not noted": Mutation(WEIGHTS, "held | dict.fromkeys(lost, member.replies)", "held"),
+    "weights that are sent again are not noted": Mutation(
+        WEIGHTS,
+        "for message in self._send(member, version, None)]",
+        "for message in [(member.peer, self.kept[version])]]",
+    ),
     "weights that a heartbeat does not list count as held": Mutation(
-        WEIGHTS, " if version in heartbeat.versions or at >= heartbeat.replies}", "}"
+        WEIGHTS, "case _ if version in heartbeat.versions:", "case _:"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
-        COORDINATOR, "out + self.weights.after(orders, self.members, self._named)", "out + orders"
+        COORDINATOR, "out + self._with_weights(orders)", "out + orders"
     ),
-    "weights are never sent": Mutation(WEIGHTS, "in sorted(message.versions - member.versions.keys()):", "in ():"),
+    "weights are never sent": Mutation(WEIGHTS, "in sorted(order.versions - self.held.versions(peer)):", "in ():"),
     "weights are sent with every order": Mutation(
-        WEIGHTS, "sorted(message.versions - member.versions.keys())", "sorted(message.versions)"
+        WEIGHTS, "sorted(order.versions - self.held.versions(peer))", "sorted(order.versions)"
     ),
-    "weights are sent before the order that names them": Mutation(WEIGHTS, "return out + weights", "return weights + out"),
+    "weights are sent before the order that names them": Mutation(
+        COORDINATOR,
+        "return out + self.weights.after(out, self.members)",
+        "return self.weights.after(out, self.members) + out",
+    ),
     "the newest weights are sent to whoever holds a ticket": Mutation(
-        WEIGHTS,
-        "return [(member.peer, self.kept[version])]\n        if",
-        "return [(member.peer, self.kept[max(self.kept)])]\n        if",
+        WEIGHTS, "[(receiver, self.kept[version])]", "[(receiver, self.kept[max(self.kept)])]"
     ),
-    "the learner keeps only the newest weights": Mutation(WEIGHTS, "if acts(version)}", "if False}"),
-    "the learner keeps all weights": Mutation(WEIGHTS, "if acts(version)}", "if True}"),
+    "the learner keeps only the newest weights": Mutation(WEIGHTS, "if version in needed}", "if False}"),
+    "the learner keeps all weights": Mutation(WEIGHTS, "if version in needed}", "if True}"),
     "heartbeats are answered with the same number": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
     "tickets of a lost worker are kept": Mutation(COORDINATOR, "for number in list(member.tickets):", "for number in ():"),
+    "what a lost worker held counts as held": Mutation(COORDINATOR, "self.weights.held.forget(member.peer)", "pass"),
     "two tickets of a lane have one sequence number": Mutation(LANES, "self.dealt += 1", "self.dealt = 1"),
     "sequence numbers go on in the next incarnation": Mutation(
         LANES,
@@ -199,14 +206,16 @@ MUTATIONS = {
         "return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}",
         "return {asked.version for lane in self._lanes.values() for asked in lane.asked.values()}",
     ),
-    "an order does not list the weights that its worker keeps": Mutation(WEIGHTS, "keep=tuple(sorted(keep))", "keep=()"),
+    "an order does not list the weights that its worker keeps": Mutation(
+        COORDINATOR, "replace(order, keep=keep)", "replace(order, keep=())"
+    ),
     "only the weights that act are sent after an order": Mutation(
-        WEIGHTS, "sorted(message.versions -", "sorted({message.version} -"
+        WEIGHTS, "sorted(order.versions -", "sorted({order.version} -"
     ),
     "the weights of opponents do not count as named": Mutation(
         ROLLOUTS, "for version in versions_of(ticket.version, [ticket.opponent])}", "for version in [ticket.version]}"
     ),
-    "the weights of opponents are dropped": Mutation(COORDINATOR, "and version in opponents.versions:", "and False:"),
+    "the weights of opponents are dropped": Mutation(COORDINATOR, "needed.update(opponents.versions)", "pass"),
     "an opponent is forgotten while a version can meet it": Mutation(
         POOL, " - settings.window - settings.max_lag", " - settings.window"
     ),

@@ -19,7 +19,7 @@ from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
-from millrace.learner.rollouts.sent_weights import SentWeights
+from millrace.learner.rollouts.sent_weights import SentWeights, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
 from millrace.workers.conversation.held import (
@@ -113,6 +113,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         CollectingMember(b"w0", hello(0, 1, 1), 0, 0, 0.0),
         coordinator.rollouts,
         coordinator.weights,
+        coordinator.weights.held,
         coordinator.rollouts.lanes[0],
         Ticket(0, 0, 0, 0, 0, 0, b"w0"),
         coordinator._placement,
@@ -122,8 +123,9 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         session._current.rollouts,
         RolloutLane(0),
     ]
-    types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, TicketedLane, Ticket, LanePlacement
-    assert [type(each) for each in objects] == [*types, Rounds, Session, _SessionState, HeldRollouts, RolloutLane]
+    types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, WeightsHeld, TicketedLane, Ticket
+    more = LanePlacement, Rounds, Session, _SessionState, HeldRollouts, RolloutLane
+    assert [type(each) for each in objects] == [*types, *more]
     assert {type(each): set(vars(each)) for each in objects} == known
     wait = DescribeCoordinator(WAIT, 0, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
     assert set(vars(wait)) == of_describing.SAVED | of_describing.NOT_SAVED

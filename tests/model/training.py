@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.sent_weights import Sent
 from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 from tests.model import learner_part, process_part, worker_part
 from tests.model.conversation import Content, Event, Facts
@@ -13,6 +14,9 @@ from tests.model.learner_part import Learner, first_learner
 from tests.model.message_content import content_of, message_of, worker_of
 from tests.model.settings import TICK_S, Settings
 from tests.model.worker_part import Worker
+
+ARRIVED = -1
+"""In place of the number of replies after which weights were sent: the worker has said that it holds them."""
 
 
 class Training(Settings):
@@ -57,13 +61,13 @@ L = TypeVar("L", bound=Learner)
 def learner_event(learner: L, event: Event, message: Content | None, now: float) -> tuple[L, list[Outgoing]]:
     """The learner after this event, which may be another one, and what it sends."""
     heard = None if message is None else message_of(message, event[1], learner.settings.run)
-    sent = Sent(learner, heard)
+    rule = WeightsRule(learner, heard)
     after, out = _after(learner, event, heard, now)
-    sent.check(after, out)
+    rule.check(after, out)
     return after, out
 
 
-class Sent:
+class WeightsRule:
     """Rule: weights are sent after an order that names them, and again only if a Heartbeat shows that they were lost.
 
     Nothing is lost without faults. Then no order waits for weights that the learner takes to be held.
@@ -74,27 +78,26 @@ class Sent:
         self._learner, self._heard = learner, heard
         self._named = {(member.session, version) for member, version in learner.named()}
         self._sent_at = {
-            (member.session, version): replies
-            for member in learner.coordinator.members.values()
-            for version, replies in member.versions.items()
+            (member.session, version): standing.replies if isinstance(standing, Sent) else ARRIVED
+            for peer, member in learner.coordinator.members.items()
+            for version, standing in learner.coordinator.weights.held.by_worker.get(peer, {}).items()
         }
 
     def check(self, after: Learner, out: Iterable[Outgoing]) -> None:
         """After it, with what the learner sends."""
         named, sent_at = (self._named, self._sent_at) if after is self._learner else (set(), {})
         out = list(out)
+        held = after.coordinator.weights.held
         for peer, message in out:
             if isinstance(message, Collect | Evaluate):
-                assert set(message.keep) == after.coordinator.members[peer].versions.keys(), (
-                    "an order lists other weights than count as held"
-                )
+                assert set(message.keep) == held.versions(peer), "an order lists other weights than count as held"
                 versions = {message.version}
                 for each in message.permits if isinstance(message, Collect) else ():
                     opponent = after.coordinator.rollouts.held[each.ticket].opponent
                     assert each.opponent == opponent, "an order names another opponent than its ticket"
                     versions |= set() if opponent is None else {opponent}
                 named |= {(message.session, version) for version in versions}
-                assert versions <= after.coordinator.members[peer].versions.keys(), "an order is sent without its weights"
+                assert versions <= held.versions(peer), "an order is sent without its weights"
             if isinstance(message, Weights):
                 member = after.coordinator.members[peer]
                 which = member.session, message.version
@@ -104,15 +107,18 @@ class Sent:
                     shown = isinstance(self._heard, Heartbeat) and message.version not in self._heard.versions
                     assert shown, "weights are sent again although they were not lost"
                     assert sent_at[which] < self._heard.replies, "weights are sent again although they may be under way"
-                sent_at[which] = member.versions[message.version]
-                assert sent_at[which] >= member.replies - isinstance(self._heard, Heartbeat), (
+                standing = held.by_worker.get(peer, {}).get(message.version)
+                assert isinstance(standing, Sent), "weights are sent and not noted"
+                assert standing.replies >= member.replies - isinstance(self._heard, Heartbeat), (
                     "weights are sent and not noted"
                 )
+                sent_at[which] = standing.replies
         heard = self._heard
-        for member in after.coordinator.members.values():
+        for peer, member in after.coordinator.members.items():
             if isinstance(heard, Heartbeat) and member.session == heard.session:
-                held = {version for version, at in member.versions.items() if at < heard.replies}
-                assert held.issubset(heard.versions), "weights that a worker lacks count as held"
+                for version, standing in held.by_worker.get(peer, {}).items():
+                    under_way = isinstance(standing, Sent) and standing.replies >= heard.replies
+                    assert under_way or version in heard.versions, "weights that a worker lacks count as held"
 
 
 def _after(learner: L, event: Event, heard: Any, now: float) -> tuple[L, list[Outgoing]]:

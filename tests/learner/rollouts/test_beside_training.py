@@ -124,7 +124,7 @@ def test_weights_are_sent_again_to_a_worker_that_has_dropped_them() -> None:
     learner.update()
     assert [weights.version for weights in of(learner.ends(E), Weights)] == []
     assert [weights.version for weights in of(learner.awaits(), Weights, A)] == [0]
-    assert learner.coordinator.members[A].versions.keys() == {0, 1}
+    assert learner.holds(A) == {0, 1}
 
 
 def test_with_a_limit_of_copies_one_other_worker_plays() -> None:

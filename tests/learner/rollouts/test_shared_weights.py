@@ -51,10 +51,10 @@ def test_a_worker_that_needs_later_what_its_supervisor_got_finds_it_there() -> N
     learner = shared(b"ab", lanes=1)
     holder, spare = (A, B) if learner.coordinator.members[A].lanes else (B, A)
     assert receivers(learner.publish(1)) == [SUPERVISOR]
-    assert learner.coordinator.members[spare].versions == {}
+    assert learner.holds(spare) == set()
     outs = learner.balanced(process_ends(learner.coordinator, holder.decode()))
     assert [type(message) for _, message in outs] == [Collect]
-    assert 1 in learner.coordinator.members[spare].versions
+    assert 1 in learner.holds(spare)
 
 
 def test_the_weights_of_an_opponent_are_not_shared() -> None:
@@ -142,6 +142,8 @@ def test_what_is_kept_of_a_supervisor_ends_with_its_workers() -> None:
         process_ends(learner.coordinator, peer.decode())
     gc.collect()
     assert gone() is None
+    assert not learner.coordinator.weights.held.by_supervisor
+    assert not learner.coordinator.weights.held.by_worker
 
 
 def test_a_version_that_the_supervisor_keeps_no_more_is_sent_to_it_again() -> None:
@@ -153,4 +155,4 @@ def test_a_version_that_the_supervisor_keeps_no_more_is_sent_to_it_again() -> No
         learner.take()
     (supervisor, _) = (member.supervisor for member in learner.coordinator.members.values())
     assert supervisor is not None
-    assert set(supervisor.versions) == set(range(2, 2 + SHARED_VERSIONS))
+    assert set(learner.coordinator.weights.held.by_supervisor[supervisor]) == set(range(2, 2 + SHARED_VERSIONS))

@@ -27,8 +27,8 @@ MUTATIONS = {
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
-        "return self.weights.after(out, self.members, self._named)",
-        "return out if self.evaluation.pending else self.weights.after(out, self.members, self._named)",
+        "return self._with_weights(out)",
+        "return out if self.evaluation.pending else self._with_weights(out)",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
         COORDINATOR,
@@ -76,16 +76,14 @@ MUTATIONS = {
     "all play an evaluation although a worker is there that only evaluates": Mutation(
         COORDINATOR, "if any(member.hello.evaluates for member in self.membership.active()):", "if False:"
     ),
-    "the weights of a pending evaluation are not kept": Mutation(
-        COORDINATOR, "(self.evaluation.pending and version == self.evaluation.version)", "False"
-    ),
+    "the weights of a pending evaluation are not kept": Mutation(COORDINATOR, "needed.add(self.evaluation.version)", "pass"),
     "what a worker has dropped counts as held": Mutation(
         WEIGHTS,
-        "for version, sent_at in member.versions.items() if version in keep}",
-        "for version, sent_at in member.versions.items()}",
+        "for version, standing in mine.items() if version in versions}",
+        "for version, standing in mine.items()}",
     ),
     "weights that a ticket names count as dropped": Mutation(
-        WEIGHTS, "if version in keep}", "if version in message.versions}"
+        WEIGHTS, "self.held.keep_only(peer, order.keep)", "self.held.keep_only(peer, order.versions)"
     ),
     "a worker drops weights that an evaluation names": Mutation(
         SESSION, "self.rollouts.versions() | self.evaluations.versions()", "self.rollouts.versions()"
