@@ -1,11 +1,11 @@
 """The learner's half of every conversation, as far as all are alike. Pure: messages and `now` in, messages out.
 
-Rule: who waits for the run when it begins is a member from then on, in the same session. What a member sends in its session
-goes to the part that knows what it means; what belongs to an ended session is answered by Rejoin. A membership ends by
-Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with its key. Then what the member held is
-taken back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the way is sent again, before the reply.
+Rule: who waits for the run when it begins is a member from then on, in the same session. What is not sent in a member's
+session is answered by the membership (`Membership.hear`); the rest goes to the part that knows what it means. A membership
+ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with its key. Then what the member held
+is taken back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the way is sent again, before the reply.
 
-A subclass says what differs: what an answer means, what is dealt, what a loss means, and what becomes of a wrong answer.
+A subclass says what differs: what messages mean, what is dealt, what a loss means, and what becomes of a wrong answer.
 """
 
 from __future__ import annotations
@@ -14,19 +14,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic
 
-from millrace.learner.members.events import EnvironmentRaised, Event, Failed, WorkerNotStarted
+from millrace.learner.members.events import Event, WorkerNotStarted
 from millrace.learner.members.member_states import MemberState, SentUnusable
 from millrace.learner.members.membership import M, Member, Membership, Outgoing
 from millrace.protocol.alive import StartFailed
 from millrace.protocol.bounds import one_line
 from millrace.protocol.messages import (
-    Alive,
     Drain,
-    Failure,
-    Goodbye,
     Heartbeat,
     HeartbeatReply,
-    Hello,
     Received,
     Refuse,
     ToLearner,
@@ -53,35 +49,13 @@ class Coordinator(ABC, Generic[M]):
 
     # ---------------------------------------------------------------- in
 
+    @abstractmethod
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message."""
-        if isinstance(message, Hello):
-            welcome, joined = self.membership.join(peer, message, now)
-            return welcome if joined is None else welcome + self._joined()
-        if isinstance(message, Alive):
-            answer, exits = self.membership.hear_supervisor(peer, message, now)
-            return [*answer, *(self._deal() if exits else [])]
-        member = self.membership.member_of_session(peer, message, now)
-        if member is None:
-            self._late(message)
-            return self.membership.answer_ended_session(peer, message)
-        match message:
-            case Heartbeat():
-                return self._heartbeat(member, message)
-            case Goodbye(_, reason):
-                return self._goodbye(member, reason)
-            case Failure(_, error, traceback, lane):
-                spare = self.membership.is_spare(member)
-                failed = member.failed(self._kind(message), error, traceback, lane=lane, spare=spare)
-                self.events.append(failed)
-                self.membership.remove(member, Failure, "failed")
-                self._failed(failed)
-                return self._deal()
-        return self._answer(member, message)
+        """Answer a message. `Membership.hear` says whose it is."""
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
         """The run begins for the workers that wait for it. Call it first."""
-        return self.membership.take_over(waiting, now) + self._joined()
+        return self.membership.take_over(waiting, now) + self._deal()
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Answer a message that could not be read."""
@@ -117,20 +91,9 @@ class Coordinator(ABC, Generic[M]):
 
     # ---------------------------------------------------------------- what differs
 
-    @abstractmethod
-    def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
-        """Take what a member sent beside heartbeats and its last words."""
-
     def _deal(self) -> list[Outgoing]:
         """Give out what no worker has. Called after each event that may have changed who can take it."""
         return []
-
-    def _joined(self) -> list[Outgoing]:
-        """A worker has joined."""
-        return self._deal()
-
-    def _late(self, message: ToLearner) -> None:
-        """Count what belongs to an ended session."""
 
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         """What this heartbeat shows to be lost on the way. `lost`: among the tickets that the member holds."""
@@ -144,25 +107,14 @@ class Coordinator(ABC, Generic[M]):
         """A member sent what could not be used."""
         return self.membership.refuse(member, SentUnusable, why)
 
-    def _goodbye(self, member: M, reason: str) -> list[Outgoing]:
-        """A member leaves."""
-        self.membership.remove(member, Goodbye, f"left: {reason}")
-        return self._deal()
-
-    def _kind(self, failure: Failure) -> type[Failed]:
-        """Whose fault a failure is."""
-        return EnvironmentRaised
-
-    def _failed(self, failed: Failed) -> None:
-        """A member has failed, and was removed."""
-
     # ---------------------------------------------------------------- inside
 
     def _heartbeat(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
+        """What was lost on the way, then the reply."""
         lost = member.record_heartbeat(heartbeat)
         if member.state is MemberState.DRAINING:
             return [(member.peer, Drain(one_line(self.membership.draining or "")))]
         out = self.membership.welcome_again(member, heartbeat)
         out += self._again(member, heartbeat, lost)
         member.replies += 1
-        return [*out, (member.peer, HeartbeatReply(member.session, member.replies, self._received(member))), *self._deal()]
+        return [*out, (member.peer, HeartbeatReply(member.session, member.replies, self._received(member)))]

@@ -15,12 +15,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.membership import MAX_MEMBERS, Member, Membership, Outgoing
+from millrace.learner.members.membership import MAX_MEMBERS, Answered, Member, Membership, Outgoing
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, UsageError
-from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodbye, Heartbeat, Status, ToLearner
+from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Failure, Goodbye, Heartbeat, Status, ToLearner
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 
@@ -60,6 +60,13 @@ class DescribeCoordinator(Coordinator[Member]):
         self._tickets = FIRST_TICKET
         self._decliners_to_end = decliners_to_end
         self._decliners: set[str] = set()
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message."""
+        heard = self.membership.hear(peer, message, now)
+        if isinstance(heard, Answered):
+            return heard.out + (self._deal() if heard.changed else [])
+        return self._answer(heard, message) + self._deal()
 
     def ask(self, unknown: Unknown) -> list[Outgoing]:
         """Have a worker describe this environment. `described` is what it says, until the next call."""
@@ -108,7 +115,20 @@ class DescribeCoordinator(Coordinator[Member]):
         return [self._order(member)] if lost else []
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
-        if not isinstance(message, Described) or member.tickets.pop(message.ticket, None) is None:
+        """The answer to what a member sent in its session."""
+        match message:
+            case Heartbeat():
+                return self._heartbeat(member, message)
+            case Described():
+                return self._take_description(member, message)
+            case Goodbye(_, reason):
+                return self._goodbye(member, reason)
+            case Failure():
+                self.membership.fail(member, message)
+        return []
+
+    def _take_description(self, member: Member, message: Described) -> list[Outgoing]:
+        if member.tickets.pop(message.ticket, None) is None:
             return []  # of an earlier environment, or it has come before
         if self.described is not None or self._unknown is None:
             return []
@@ -124,7 +144,8 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def _goodbye(self, member: Member, reason: str) -> list[Outgoing]:
         if reason == TOLD_TO_STOP or reason.startswith(NO_SLOT) or self.described is not None:
-            return super()._goodbye(member, reason)
+            self.membership.leave(member, reason)
+            return []
         return self._unsuitable(member, Goodbye, reason)
 
     def _unsuitable(self, member: Member, event: type, reason: str) -> list[Outgoing]:
@@ -135,7 +156,7 @@ class DescribeCoordinator(Coordinator[Member]):
             if len(self._decliners) >= self._decliners_to_end:
                 self.membership.take_events()  # the reason is the error's text, and need not be logged too
                 self.unsuitable = UsageError(reason)
-        return refusal + self._deal()
+        return refusal
 
 
 def _may_have_lanes_first(member: Member) -> tuple[bool, int]:

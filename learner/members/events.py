@@ -1,6 +1,7 @@
 """Events of workers, for the log and for the hub, which decides whether the run can go on. Plain data.
 
-`json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change.
+`json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change. Events without
+such a name are no events of the log.
 """
 
 from __future__ import annotations
@@ -130,7 +131,32 @@ class EnvironmentNoted:
     note: str
 
 
-Event = (
+@dataclass(frozen=True)
+class RolloutRejected:
+    """A member sent a rollout that cannot be used."""
+
+    peer: bytes
+    """Routing id of the worker."""
+    why: str
+
+
+@dataclass(frozen=True)
+class RolloutArrived:
+    """A rollout was accepted."""
+
+    worker: str
+    lane: int
+    version: int
+
+
+@dataclass(frozen=True)
+class EpisodesArrived:
+    """Episodes of an evaluation were accepted."""
+
+    worker: str
+
+
+LoggedEvent = (
     WorkerJoined
     | WorkerLeft
     | WorkerRefused
@@ -140,9 +166,11 @@ Event = (
     | RejoinRequested
     | EnvironmentNoted
 )
+Arrival = RolloutArrived | EpisodesArrived
+Event = LoggedEvent | RolloutRejected | Arrival
 
 
-def describe(event: Event) -> str:
+def describe(event: LoggedEvent) -> str:
     """Text for the log: one line, and below it the traceback or the last lines if there are any, indented, so that none of
     them looks like a line of the log. Whatever a peer has named is shown without control characters.
     """
@@ -154,7 +182,7 @@ def describe(event: Event) -> str:
             return line
 
 
-def _line(event: Event) -> str:
+def _line(event: LoggedEvent) -> str:
     match event:
         case WorkerJoined(worker, host, pid):
             return f"worker {worker} ({host}, pid {pid}) joined"

@@ -15,12 +15,13 @@ from dataclasses import dataclass
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event
 from millrace.learner.members.failure_count import FailureCount
-from millrace.learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Member, Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import Stalled
 from millrace.protocol.logs.long_wait import LongWait
+from millrace.protocol.messages import Status
 from millrace.protocol.specs import WaitSpec
 from millrace.protocol.wire.learner_link import LearnerLink
 
@@ -68,13 +69,8 @@ class Lobby:
             worker_timeout_s=settings.worker_timeout_s,
             decliners_to_end=1 if processes.expected else settings.launched_workers,
         )
-        failures = self._failures = FailureCount(settings.max_env_failures, began_s=clock())
-
-        def count(event: Event) -> None:
-            failures.count(event, clock())  # none comes after env steps, so there is no line to log
-
-        callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), count)
-        self._server = MemberServer(link, coordinator, callbacks, processes, ServerSettings(log_joins=False), clock)
+        self._failures = FailureCount(settings.max_env_failures, began_s=clock())
+        self._server = MemberServer(link, coordinator, self, processes, ServerSettings(log_joins=False), clock)
 
     def describe(self, unknown: Unknown, check_interrupt: Callable[[], None] = _never) -> DescribedEnv:
         """The environment as the first worker describes it whose description is accepted.
@@ -107,6 +103,17 @@ class Lobby:
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), server.what_workers_do())
                 server.send(coordinator.ask_more())
         return coordinator.described
+
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`."""
+        return self._coordinator.status(self._settings.steps, now)
+
+    def happened(self, event: Event) -> None:
+        """Count failures. None comes after env steps, so there is no line to log."""
+        self._failures.count(event, self._clock())
+
+    def sent(self, peer: bytes) -> None:
+        """Nothing is to be done when a message was sent."""
 
     def listen(self) -> None:
         """Answer the workers, while the learner prepares the run."""

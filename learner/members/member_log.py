@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from millrace.learner.members.events import Event, RejoinRequested
+from millrace.learner.members.events import LoggedEvent, RejoinRequested
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
 from millrace.protocol.wire.learner_link import LearnerLink
@@ -38,7 +38,7 @@ class MemberLog:
         if (kept_back := self._limit.due(self._link.name_for_log(peer), self._clock())) is not None:
             self._write(logging.WARNING, [self._budget_of_key(peer)], one_line(line), suppressed_note(kept_back))
 
-    def log_event(self, level: int, event: Event, lines: str, cause: bytes | None) -> None:
+    def log_event(self, level: int, event: LoggedEvent, lines: str, cause: bytes | None) -> None:
         """Log an event. Lines after the first are a traceback. It is left out if it is too long, or the same as the newest.
 
         `cause` is the peer whose message caused the event; None if no message did. Requests to join again are limited
@@ -53,7 +53,7 @@ class MemberLog:
         budgets = [self._budget_of_worker(source, event.worker), self._budget_of_key(cause)]
         self._write(level, budgets, lines, suppressed_note(kept_back), event)
 
-    def _write(self, level: int, budgets: list[LogBudget], lines: str, note: str, event: Event | None = None) -> None:
+    def _write(self, level: int, budgets: list[LogBudget], lines: str, note: str, event: LoggedEvent | None = None) -> None:
         now = self._clock()
         first, _, more = lines.partition("\n")
         if more and not all(budget.covers(_size(lines), now) for budget in budgets):

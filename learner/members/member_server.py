@@ -15,18 +15,22 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import (
     EnvironmentRaised,
+    EpisodesArrived,
     Event,
     Failed,
+    LoggedEvent,
     NamelessHello,
     PolicyRaised,
     RejoinRequested,
+    RolloutArrived,
+    RolloutRejected,
     WorkerJoined,
     WorkerLeft,
     WorkerNotStarted,
@@ -60,18 +64,17 @@ LAST_MESSAGES_TURNS = 10  # such waits, at most: other workers go on sending
 STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
 
 
-@dataclass(frozen=True)
-class ServerCallbacks:
-    """The functions of a hub that the server calls."""
+class ServedHub(Protocol):
+    """Whom a server serves: what listens to the workers. It waits in the server, and hears from it what has happened."""
 
-    message: Callable[[bytes, ToLearner, float], Sequence[Outgoing]]
-    """Answers a message; called with (sender, message, now)."""
-    status: Callable[[float], Status]
-    """Answers `millrace status`."""
-    event: Callable[[Event], None]
-    """Called with each event, after it was logged."""
-    sent: Callable[[bytes], None] = lambda peer: None
-    """Called with the receiver of each message that was sent."""
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`."""
+
+    def happened(self, event: Event) -> None:
+        """Called with each event, after it was logged."""
+
+    def sent(self, peer: bytes) -> None:
+        """Called with the receiver of each message that was sent."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ class MemberServer:
         self,
         link: LearnerLink,
         coordinator: Coordinator[Any],
-        callbacks: ServerCallbacks,
+        hub: ServedHub,
         processes: ProcessCallbacks,
         settings: ServerSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -103,7 +106,7 @@ class MemberServer:
         """Time at which the server last listened."""
         self._link = link
         self._coordinator = coordinator
-        self._callbacks = callbacks
+        self._hub = hub
         self._processes = processes
         self._membership = coordinator.membership
         self._settings = settings or ServerSettings()
@@ -159,7 +162,7 @@ class MemberServer:
         """Send these messages, then log what has happened. `cause`: the peer whose message made it happen, if one did."""
         for peer, message in messages:
             self._link.send(peer, self._frames(message))  # if it fails, the worker is soon removed as silent
-            self._callbacks.sent(peer)
+            self._hub.sent(peer)
         if self._membership.events:
             self._log_events(cause)
 
@@ -219,7 +222,7 @@ class MemberServer:
         """Forget the hub. The hub refers to this server, so else both would wait for the garbage collector, and so would
         the file descriptors of what they hold.
         """
-        del self._callbacks, self._processes
+        del self._hub, self._processes
 
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
         """The error when fewer than `workers` have joined within `timeout_s`: it says how to start one."""
@@ -262,7 +265,7 @@ class MemberServer:
                 case Hello() if not self._joins.admits(self._link.source(peer), now):
                     return ()  # it says Hello again
                 case _:
-                    return self._callbacks.message(peer, message, now)
+                    return self._coordinator.receive(peer, message, now)
         except Exception as error:
             return self._refuse_after_error(peer, type(message).__name__, error)
 
@@ -278,7 +281,7 @@ class MemberServer:
     def _status_frames(self, now: float) -> Sequence[Buffer]:
         """Frames of a status. It is made anew after `STATUS_SHARE` times as long as it took to make."""
         if now >= self._status[0]:
-            frames = status_frames(self._callbacks.status(now))
+            frames = status_frames(self._hub.status(now))
             took_s = self._clock() - now
             self._status = (now + STATUS_SHARE * took_s, frames)
         return self._status[1]
@@ -316,27 +319,38 @@ class MemberServer:
     def _log_events(self, cause: bytes | None) -> None:
         told = ""  # the worker of whose failure the log has just told
         for event in self._membership.take_events():
-            line = describe(event)
-            expected = isinstance(event, WorkerJoined | RejoinRequested | NamelessHello)
             match event:
-                case WorkerRefused(_, why) | NamelessHello(_, why):
-                    self._last_turned_away = f"was refused: {one_line(why)}"
-                case WorkerNotStarted(_, why):
-                    self._last_turned_away = why
-                case WorkerLeft(worker, why, _, on_purpose):
-                    expected = on_purpose and self._membership.draining is not None
-                    self._last_turned_away = self._last_turned_away if expected else why
-                    expected = expected or worker == told
-                case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
-                    line = line.partition("\n")[0]
-                    expected = True
-                case Failed(worker):
-                    told = worker
-                case _:
+                case RolloutArrived() | EpisodesArrived():
                     pass
-            if self._settings.log_joins or not isinstance(event, WorkerJoined):
-                self.member_log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
-            self._callbacks.event(event)
+                case RolloutRejected(peer, why):
+                    self.member_log.warn_limited(peer, f"worker {name_for_people(peer)}: {why}")
+                case _:
+                    told = self._log_event(event, cause, told)
+            self._hub.happened(event)
+
+    def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
+        """Log an event. `told`: the worker of whose failure the log has just told. Returns who that is now."""
+        line = describe(event)
+        expected = isinstance(event, WorkerJoined | RejoinRequested | NamelessHello)
+        match event:
+            case WorkerRefused(_, why) | NamelessHello(_, why):
+                self._last_turned_away = f"was refused: {one_line(why)}"
+            case WorkerNotStarted(_, why):
+                self._last_turned_away = why
+            case WorkerLeft(worker, why, _, on_purpose):
+                expected = on_purpose and self._membership.draining is not None
+                self._last_turned_away = self._last_turned_away if expected else why
+                expected = expected or worker == told
+            case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
+                line = line.partition("\n")[0]
+                expected = True
+            case Failed(worker):
+                told = worker
+            case _:
+                pass
+        if self._settings.log_joins or not isinstance(event, WorkerJoined):
+            self.member_log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
+        return told
 
 
 def status_frames(status: Status) -> Sequence[Buffer]:

@@ -21,6 +21,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from millrace.learner.members.events import (
+    EnvironmentRaised,
     Event,
     Failed,
     NamelessHello,
@@ -255,6 +256,16 @@ class Member:
         )
 
 
+@dataclass(frozen=True)
+class Answered:
+    """What became of a message that no member sent in its session: the membership has answered it."""
+
+    out: list[Outgoing]
+    """The answer."""
+    changed: bool = False
+    """Whether a worker has joined by it, or members were removed."""
+
+
 M = TypeVar("M", bound=Member)
 K = TypeVar("K")
 V = TypeVar("V")
@@ -317,6 +328,17 @@ class Membership(Generic[M]):
         """Return and clear the events since the last call."""
         events, self.events = self.events, []
         return events
+
+    def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
+        """The member that sent this message in its session. To any other message, the answer."""
+        match message:
+            case Hello():
+                out, joined = self.join(peer, message, now)
+                return Answered(out, joined is not None)
+            case Alive():
+                out, exits = self.hear_supervisor(peer, message, now)
+                return Answered(out, bool(exits))
+        return self.member_of_session(peer, message, now) or Answered(self.answer_ended_session(peer, message))
 
     def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
         """The member that sent this message in its current session, or None. Also records when the member was heard."""
@@ -397,6 +419,19 @@ class Membership(Generic[M]):
         """The Welcome that brings the run, if this heartbeat shows that it was lost on the way."""
         lost = heartbeat.waits and not isinstance(self._run, WaitSpec) and heartbeat.replies > member.welcomed
         return [self._welcome(member)] if lost else []
+
+    def leave(self, member: M, reason: str) -> None:
+        """A member says Goodbye: remove it."""
+        self.remove(member, Goodbye, f"left: {reason}")
+
+    def fail(self, member: M, failure: Failure) -> Failed:
+        """A member says that code of the user has failed: remove it. Returns the event."""
+        kind = PolicyRaised if failure.of_policy and self.has_policy_code else EnvironmentRaised
+        spare = self.is_spare(member)
+        failed = member.failed(kind, failure.error, failure.traceback, lane=failure.lane, spare=spare)
+        self.events.append(failed)
+        self.remove(member, Failure, "failed")
+        return failed
 
     def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
         """Remove a member; its process must not come back."""

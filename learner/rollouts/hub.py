@@ -14,11 +14,11 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from millrace.learner.members.events import Event
+from millrace.learner.members.events import EpisodesArrived, Event, RolloutArrived
 from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.held_up import LONG_S
-from millrace.learner.members.member_server import MemberServer, ServerCallbacks
-from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.learner.members.member_server import MemberServer
+from millrace.learner.members.membership import Member, Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
@@ -29,15 +29,13 @@ from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstil
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.rollouts.waiting import LearnerTime
 from millrace.learner.run_folder.progress import Progress
-from millrace.protocol.address import name_for_people, worker_name
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.bounds import Stages, one_line
-from millrace.protocol.errors import BadRollout, Stalled
+from millrace.protocol.errors import Stalled
 from millrace.protocol.logs.long_wait import LongWait
-from millrace.protocol.messages import Evaluated, Rollout, Status, ToLearner, Weights
+from millrace.protocol.messages import Status, Weights
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import rollout_bytes
-from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 
@@ -134,8 +132,7 @@ class Hub:
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, run.call_timeouts)
-        callbacks = ServerCallbacks(self._answer, self.status, self._count_failure)
-        self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
+        self._server = MemberServer(link, coordinator, self, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)
 
     def take_over(self, waiting: Membership[Member]) -> None:
@@ -298,6 +295,10 @@ class Hub:
         """How far the run is: as it was reported last, with what the hub knows better now."""
         return progress_now(self.coordinator, self._progress, self.waiting(self._clock()), self._time.phase)
 
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`."""
+        return status(self.coordinator, self.progress(), now)
+
     @property
     def workers_expected(self) -> int:
         """Number of worker processes that the user asked for; 0: any number."""
@@ -334,6 +335,22 @@ class Hub:
             refused_messages=link.refused_messages,
             refused_handshakes=link.refused,
         )
+
+    # ---------------------------------------------------------------- what the server tells
+
+    def happened(self, event: Event) -> None:
+        """Count what has arrived, and what has failed."""
+        match event:
+            case RolloutArrived(worker, lane, version):
+                self.lag_statistics.arrived(worker, version, self._clock())
+                self._failures.collected(lane)
+            case EpisodesArrived(worker):
+                self._failures.evaluated(worker if self.coordinator.evaluation.beside else None)
+            case _:
+                self._count_failure(event)
+
+    def sent(self, peer: bytes) -> None:
+        """Nothing is to be done when a message was sent."""
 
     # ---------------------------------------------------------------- inside
 
@@ -390,37 +407,3 @@ class Hub:
     def _listen(self, timeout_s: float, short: bool = False) -> None:
         self._server.listen(timeout_s, short)
         self._observer(self)
-
-    def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        match message:
-            case Rollout():
-                return self._take_rollout(peer, message, now)
-            case Evaluated():
-                return self._take_evaluated(peer, message, now)
-        return self.coordinator.receive(peer, message, now)
-
-    def _take_evaluated(self, peer: bytes, message: Evaluated, now: float) -> list[Outgoing]:
-        evaluation = self.coordinator.evaluation
-        before = evaluation.episodes_played
-        out = self.coordinator.receive(peer, message, now)
-        if evaluation.episodes_played > before:  # of a ticket that this worker played
-            self._failures.evaluated(worker_name(peer).decode() if evaluation.beside else None)
-        return out
-
-    def _take_rollout(self, peer: bytes, message: Rollout, now: float) -> list[Outgoing]:
-        try:
-            validate(message, self.coordinator.run)
-        except BadRollout as error:
-            why = f"worker {name_for_people(peer)}: rollout of ticket {message.ticket}: {error}"
-            self._server.member_log.warn_limited(peer, why)
-            return self.coordinator.reject_rollout(peer, message, why, now)
-        waiting = self.coordinator.rollouts.waiting()
-        out = self.coordinator.receive(peer, message, now)
-        if self.coordinator.rollouts.waiting() > waiting:  # of a ticket that this worker held
-            self.lag_statistics.arrived(name_for_people(peer), message.version, now)
-            self._failures.collected(message.lane)
-        return out
-
-    def status(self, now: float) -> Status:
-        """The answer to `millrace status`."""
-        return status(self.coordinator, self.progress(), now)

@@ -16,6 +16,7 @@ from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import Collect, Permit, Received, Rollout, versions_of
 
 
@@ -132,40 +133,38 @@ class RolloutDealer:
 
     # ---------------------------------------------------------------- in
 
-    def take_in(self, member: Member, rollout: Rollout) -> str:
-        """Take a rollout that has come, unless it came before. Returns what is wrong with it, or nothing.
+    def take_in(self, member: Member, rollout: Rollout) -> bool:
+        """Accept a rollout that has come. False if it came before.
 
-        What is wrong is not counted: see `invalid` and `reject`.
+        Raises `BadRollout` if its ticket is not for it. That is not counted: see `reject`.
         """
         ticket = self.held.get(rollout.ticket)
         if ticket is None:
             self.ledger.transitions_received += rollout.env_steps
             self.ledger.transitions_duplicate += rollout.env_steps
-            return ""
+            return False
         expected = ticket.peer, ticket.lane, ticket.version, ticket.sequence
         if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:
             expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
             got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
-            return f"ticket {ticket.number}: expected {expects}, got {got}"
+            raise BadRollout(f"expected {expects}, got {got}")
         self.ledger.transitions_received += rollout.env_steps
         self._end(member, ticket).arrived(rollout.sequence)
         member.has_stepped()
         self.ready.setdefault(ticket.round, {})[ticket.lane] = AcceptedRollout(rollout, ticket.incarnation)
-        return ""
+        return True
 
     def late(self, rollout: Rollout) -> None:
-        """Count a rollout of a session that has ended."""
+        """Count a rollout of a session that has ended. Nobody has checked it."""
         self.ledger.transitions_received += rollout.env_steps
         self.ledger.transitions_late += rollout.env_steps
 
-    def invalid(self, rollout: Rollout) -> None:
-        """Count a rollout that cannot be used."""
+    def reject(self, member: Member, rollout: Rollout) -> None:
+        """Count a rollout that cannot be used. Its ticket, if this member holds it, is lost."""
+        number = rollout.ticket
         steps = rollout.env_steps if rollout.valid.dtype == bool else 0
         self.ledger.transitions_received += steps
         self.ledger.transitions_invalid += steps
-
-    def reject(self, member: Member, number: int) -> None:
-        """What came for this ticket cannot be used. The ticket, if this member holds it, is lost."""
         if number in self.held and number in member.tickets:
             ticket = self.held[number]
             self.lanes[ticket.lane].arrived(ticket.sequence)  # so that its worker drops it

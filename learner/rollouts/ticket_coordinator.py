@@ -13,21 +13,22 @@ only evaluate play it, whatever the others do.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import msgspec
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.events import EnvironmentNoted, Failed, PolicyRaised
+from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, RolloutArrived, RolloutRejected
 from millrace.learner.members.lane_placement import LanePlacement, is_spare
 from millrace.learner.members.member_states import SentUnusable
-from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.learner.members.membership import Answered, Member, Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights
+from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import (
     Array,
     Collect,
@@ -35,25 +36,26 @@ from millrace.protocol.messages import (
     Evaluate,
     Evaluated,
     Failure,
+    Goodbye,
     Heartbeat,
+    Hello,
     Received,
-    Rejoin,
     Rollout,
     ToLearner,
     Weights,
 )
+from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import RunSpec
+
+CheckRows = Callable[[Rollout, RunSpec], None]
+"""Raises `BadRollout` if the rows of a rollout break the row format, or are not those of the run."""
 
 MOST_NOTES = 10  # of all workers together
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
 
 class TicketCoordinator(Coordinator[CollectingMember]):
-    """Members, their lanes, and what they are asked for.
-
-    A rollout that `receive` is given must have passed `millrace.protocol.rows.rollout_checks.validate`; else call
-    `reject_rollout`.
-    """
+    """Members, their lanes, and what they are asked for."""
 
     def __init__(
         self,
@@ -65,8 +67,12 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
         opponents: OpponentPool | None = None,
+        check_rows: CheckRows = validate,
     ) -> None:
-        """`ledger` and `incarnations` come from a checkpoint. `opponents`: those of a run with teams."""
+        """`ledger` and `incarnations` come from a checkpoint. `opponents`: those of a run with teams.
+
+        `check_rows`: of each rollout, before it is accepted.
+        """
         self.rollouts = RolloutDealer(run.lanes, max_lag, ledger, incarnations, opponents)
         self.evaluation = EvaluationDealer(run)
         lanes = self.rollouts.lanes
@@ -77,25 +83,26 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self._placement = LanePlacement(lanes, _by_joining)
         self.weights = SentWeights()
         self._notes = set[str]()  # of workers; all that step one environment see the same
+        self._check_rows = check_rows
 
     # ---------------------------------------------------------------- in
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message."""
+        heard = self.membership.hear(peer, message, now)
+        if not isinstance(heard, Answered):
+            return self._answer(heard, message) + self._deal()
+        match message:
+            case Hello() if heard.changed:
+                self._placement.joined()
+            case Rollout():
+                self.rollouts.late(message)
+        return heard.out + (self._deal() if heard.changed else [])
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Count a message that could not be read, and answer it."""
         self.rollouts.ledger.messages_bad += 1
         return super().reject_message(peer, why, now)
-
-    def reject_rollout(self, peer: bytes, rollout: Rollout, why: str, now: float) -> list[Outgoing]:
-        """Count a rollout that cannot be used. Its ticket is lost."""
-        self.rollouts.invalid(rollout)
-        member = self.members.get(peer)
-        if member is None or member.session != rollout.session:
-            return [(peer, Rejoin(rollout.session))]
-        member.heard_s = now
-        out = self._unusable(member, why)
-        self.rollouts.reject(member, rollout.ticket)
-        self._placement.ticket_ended(member)
-        return out + self._deal()
 
     def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
         """Refuse a worker that holds tickets and does nothing with them: they are dealt again."""
@@ -194,27 +201,53 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return needed
 
     def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
-        held = len(member.tickets)
+        """The answer to what a member sent in its session."""
         match message:
+            case Heartbeat():
+                return self._heartbeat(member, message)
             case Rollout():
-                if why := self.rollouts.take_in(member, message):
-                    return self.reject_rollout(member.peer, message, why, member.heard_s)
-                member.ended_steps += message.env_steps if len(member.tickets) < held else 0  # 0: it came before
-                self._placement.ticket_ended(member)
-                return self._deal()
+                return self._take_rollout(member, message)
             case Evaluated():
-                why = self.evaluation.take_in(member, message)
-                made = sum(episode.length for episode in message.episodes)
-                member.ended_steps += made if len(member.tickets) < held else 0
+                return self._take_evaluated(member, message)
             case EpisodeRows():
                 why = self.evaluation.take_rows(member, message)
-            case _:
-                return []  # answers to orders that a run does not give
-        return (self._unusable(member, why) if why else []) + self._deal()
+                return self._unusable(member, why) if why else []
+            case Goodbye(_, reason):
+                self.membership.leave(member, reason)
+            case Failure():
+                self.membership.fail(member, message)
+        return []  # also to answers to orders that a run does not give
 
-    def _late(self, message: ToLearner) -> None:
-        if isinstance(message, Rollout):
-            self.rollouts.late(message)
+    def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
+        """Accept a rollout, unless it came before. One that cannot be used is counted, and its ticket is lost."""
+        try:
+            self._check_rows(rollout, self.run)
+            accepted = self.rollouts.take_in(member, rollout)
+        except BadRollout as error:
+            return self._reject(member, rollout, f"rollout of ticket {rollout.ticket}: {error}")
+        self._placement.ticket_ended(member)
+        if accepted:
+            member.ended_steps += rollout.env_steps
+            self.events.append(RolloutArrived(member.hello.worker, rollout.lane, rollout.version))
+        return []
+
+    def _reject(self, member: CollectingMember, rollout: Rollout, why: str) -> list[Outgoing]:
+        self.events.append(RolloutRejected(member.peer, why))
+        out = self._unusable(member, why)
+        self.rollouts.reject(member, rollout)
+        self._placement.ticket_ended(member)
+        return out
+
+    def _take_evaluated(self, member: CollectingMember, answer: Evaluated) -> list[Outgoing]:
+        """Accept episodes of an evaluation, unless they came before."""
+        held = len(member.tickets)
+        played = self.evaluation.episodes_played
+        why = self.evaluation.take_in(member, answer)
+        if len(member.tickets) < held:
+            member.ended_steps += sum(episode.length for episode in answer.episodes)
+        if self.evaluation.episodes_played > played:
+            self.events.append(EpisodesArrived(member.hello.worker))
+        return self._unusable(member, why) if why else []
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         self.rollouts.ledger.late_actions += member.new_late_actions(heartbeat)
@@ -232,10 +265,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def _received(self, member: CollectingMember) -> tuple[Received, ...]:
         return self.rollouts.received(member)
 
-    def _joined(self) -> list[Outgoing]:
-        self._placement.joined()
-        return self._deal()
-
     def _removed(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
         for number in list(member.tickets):
@@ -248,9 +277,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         """Count what could not be used; after too much of it the worker is refused."""
         member.strikes += 1
         return super()._unusable(member, why) if member.strikes >= STRIKES else []
-
-    def _kind(self, failure: Failure) -> type[Failed]:
-        return PolicyRaised if failure.of_policy and self.membership.has_policy_code else super()._kind(failure)
 
 
 def _by_joining(member: Member) -> int:

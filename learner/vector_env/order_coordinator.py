@@ -16,12 +16,14 @@ from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import Failed
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from millrace.learner.members.member_states import TimedOut
-from millrace.learner.members.membership import Member, Membership, Outgoing
+from millrace.learner.members.membership import Answered, Member, Membership, Outgoing
 from millrace.protocol.errors import BadMessage, EnvironmentFailed
 from millrace.protocol.messages import (
     Answer,
     Call,
     Described,
+    Failure,
+    Goodbye,
     Heartbeat,
     LaneIncarnation,
     Order,
@@ -74,6 +76,11 @@ class OrderCoordinator(Coordinator[Member]):
         """Errors of environments that raised."""
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message."""
+        heard = self.membership.hear(peer, message, now)
+        return heard.out if isinstance(heard, Answered) else self._answer(heard, message)
 
     def give_up(self, member: Member, why: str) -> list[Outgoing]:
         """Remove this worker, for which the learner waits no longer, and no other of its name: keys may share names."""
@@ -134,10 +141,25 @@ class OrderCoordinator(Coordinator[Member]):
     # ---------------------------------------------------------------- inside
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
-        if isinstance(message, Described):
-            return []  # it was asked before the vector environment began
-        if not isinstance(message, Stepped | Returned):
-            return self._unusable(member, f"it sent {type(message).__name__}, which a vector environment does not ask for")
+        """The answer to what a member sent in its session."""
+        match message:
+            case Heartbeat():
+                return self._heartbeat(member, message)
+            case Stepped() | Returned():
+                return self._take_answer(member, message)
+            case Described():
+                return []  # it was asked before the vector environment began
+            case Goodbye(_, reason):
+                self.membership.leave(member, reason)
+                return []
+            case Failure():
+                failed = self.membership.fail(member, message)
+                if not failed.spare:
+                    self.failures.append(failed)
+                return []
+        return self._unusable(member, f"it sent {type(message).__name__}, which a vector environment does not ask for")
+
+    def _take_answer(self, member: Member, message: Answer) -> list[Outgoing]:
         if message.ticket < 0:
             return self._long_infos(member, message)
         order = self.orders.get(message.ticket)
@@ -166,10 +188,6 @@ class OrderCoordinator(Coordinator[Member]):
 
     def _received(self, member: Member) -> tuple[Received, ...]:
         return tuple(Received(lane, self.lanes[lane].incarnation, 0) for lane in sorted(member.lanes))
-
-    def _failed(self, failed: Failed) -> None:
-        if not failed.spare:
-            self.failures.append(failed)
 
     def _removed(self, member: Member, why: str) -> None:
         for ticket in member.tickets:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from millrace.learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
-from millrace.learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Member, Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
@@ -93,13 +93,7 @@ class StepHub:
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
-        callbacks = ServerCallbacks(
-            self.coordinator.receive,
-            lambda now: status(self.coordinator, now, self.status_of_run),
-            self._on_event,
-            (lambda peer: None) if shared is None else shared.wake_for_message,
-        )
-        self._server = MemberServer(link, self.coordinator, callbacks, processes or ProcessCallbacks(), settings, clock)
+        self._server = MemberServer(link, self.coordinator, self, processes or ProcessCallbacks(), settings, clock)
 
     def take_over(self, waiting: Membership[Member]) -> None:
         """The vector environment begins for the workers that wait for it."""
@@ -246,6 +240,26 @@ class StepHub:
         self._local_workers.stop(max(0.0, deadline_s - self.now()))
         self._server.close()
 
+    # ---------------------------------------------------------------- what the server asks and tells
+
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`."""
+        return status(self.coordinator, now, self.status_of_run)
+
+    def happened(self, event: Event) -> None:
+        """A worker may have left: its lanes have no worker."""
+        if isinstance(event, WorkerProcessFailed) and not event.spare:
+            self.on_death(event)
+        if isinstance(event, WorkerLeft | WorkerRefused) and self.shared is not None:
+            for lane in self.coordinator.lanes:
+                if lane.owner is None:
+                    self.shared.worker_left(lane.number)
+
+    def sent(self, peer: bytes) -> None:
+        """A worker that waits for steps through shared memory must be woken to read a message."""
+        if self.shared is not None:
+            self.shared.wake_for_message(peer)
+
     # ---------------------------------------------------------------- inside
 
     def _turn(self, timeout_s: float) -> None:
@@ -273,12 +287,3 @@ class StepHub:
                     assert isinstance(order, Order)
                     self._newest_tickets[lane] = order.ticket
                 self._server.send(sent)
-
-    def _on_event(self, event: Event) -> None:
-        """A worker may have left: its lanes have no worker."""
-        if isinstance(event, WorkerProcessFailed) and not event.spare:
-            self.on_death(event)
-        if isinstance(event, WorkerLeft | WorkerRefused) and self.shared is not None:
-            for lane in self.coordinator.lanes:
-                if lane.owner is None:
-                    self.shared.worker_left(lane.number)

@@ -33,7 +33,7 @@ from tests.model.message_content import (
 )
 from tests.model.names import Kind, Name, name
 from tests.model.settings import TIMEOUT_S, Settings
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, any_rows
 from tests.support.conversation.rules import check_tickets, waiting_rollouts
 
 SAVED: dict[type, set[str]] = {
@@ -52,7 +52,7 @@ SAVED: dict[type, set[str]] = {
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes"},
+    TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes", "_check_rows"},
     RolloutDealer: {"_absent", "opponents"},
     SentWeights: set(),
     WeightsHeld: {"by_supervisor"},
@@ -134,6 +134,7 @@ class Learner:
             ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used),
             incarnations=[number.value for number in incarnations],
             opponents=settings.pool(version - 1),
+            check_rows=any_rows,
         )
         coordinator.weights.kept = {each: weights(each) for each in _snapshots(coordinator)}
         learner = type(self)(settings, coordinator)
@@ -373,6 +374,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
         first_session=members[1].value,
         ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
         opponents=settings.pool(version),
+        check_rows=any_rows,
     )
     coordinator.version = version
     coordinator.rollouts.ledger.transitions_received = len(ready)
@@ -432,6 +434,7 @@ def first_learner(settings: Settings, kind: type[L]) -> tuple[L, list[Outgoing]]
             max_lag=settings.max_lag,
             worker_timeout_s=TIMEOUT_S,
             first_session=0,
+            check_rows=any_rows,
         ),
     )
     none = tuple(incarnation(lane, 0) for lane in range(settings.lanes))

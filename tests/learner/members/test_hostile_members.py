@@ -267,14 +267,14 @@ def test_a_flood_is_read_for_a_limited_time_and_an_honest_worker_is_not_taken_fo
 def test_questions_take_a_limited_part_of_the_time() -> None:
     noisy = Noisy()
     made = []
-    status = noisy.hub._server._callbacks.status
+    status = noisy.hub.status
 
     def slowly(now: float) -> Status:
         made.append(now)
         noisy.link.now += 0.1
         return status(now)
 
-    object.__setattr__(noisy.hub._server._callbacks, "status", slowly)
+    noisy.hub.status = slowly  # type: ignore[method-assign]
     noisy.link.sent.clear()
     noisy.hears("asks", *[Inquire()] * 50)
     assert len(noisy.link.sent) == 50
@@ -501,7 +501,7 @@ def test_rollouts_with_any_resets_are_counted_and_lead_to_no_error(seats: tuple[
             continue
         assert isinstance(message, Rollout)
         rollouts.late(message)  # neither of them may trust it
-        rollouts.invalid(message)
+        rollouts.reject(noisy.coordinator.members[b"spare"], message)
         noisy.hears("spare", message)
         noisy.hears("honest", Heartbeat(1, 0, (0,), (0,), 0, {}, 0))
         session = noisy.joins("spare", number + 2)

@@ -10,6 +10,7 @@ from typing import cast
 
 import pytest
 
+from millrace.learner.members.events import Event
 from millrace.learner.members.member_server import (
     ASK_PROCESSES_S,
     AWAY_S,
@@ -17,7 +18,6 @@ from millrace.learner.members.member_server import (
     SHORT_TURN_S,
     TURN_S,
     MemberServer,
-    ServerCallbacks,
     ServerSettings,
 )
 from millrace.learner.members.process_callbacks import ProcessCallbacks
@@ -26,7 +26,7 @@ from millrace.learner.vector_env.step_hub import StepHub
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.errors import NoWorkers
-from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, ToLearner
+from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Status, ToLearner
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.conversation.fake_link import FakeLink
@@ -45,12 +45,20 @@ class Served:
         self.running: list[WorkerActivity] = []
         self.asked = 0
         self.coordinator = OrderCoordinator(SPEC, 1, TIMEOUT_S)
-        callbacks = ServerCallbacks(self.coordinator.receive, lambda now: status(self.coordinator, now), lambda event: None)
         link = cast(LearnerLink, self.link)
         processes = ProcessCallbacks(self._ended, self._running, left=self._left)
-        self.server = MemberServer(link, self.coordinator, callbacks, processes, settings, lambda: self.link.now)
+        self.server = MemberServer(link, self.coordinator, self, processes, settings, lambda: self.link.now)
         self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
         self.server.listen(POLL_S)
+
+    def status(self, now: float) -> Status:
+        return status(self.coordinator, now)
+
+    def happened(self, event: Event) -> None:
+        pass
+
+    def sent(self, peer: bytes) -> None:
+        pass
 
     def _left(self, collecting: bool) -> float:
         return self.left["collecting" if collecting else "all"]

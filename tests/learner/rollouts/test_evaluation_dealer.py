@@ -17,7 +17,7 @@ from millrace.protocol.bounds import LARGEST
 from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
 from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of, permits
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows, process_ends
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows, process_ends, spoiled
 
 A, B = b"a", b"b"
 
@@ -187,7 +187,7 @@ def test_a_rollout_on_a_ticket_of_an_evaluation_costs_the_evaluation_nothing() -
     learner = learner_with(A)
     (order,) = orders(learner.coordinator.begin_evaluation(plan(1, 2)))
     rollout = fake_rollout(order.session, 0, order.ticket, 0, 0)
-    learner.balanced(learner.coordinator.reject_rollout(A, rollout, "broken", 0.0))
+    learner.says(A, spoiled(rollout))
     learner.says(A, rollout)
     assert learner.coordinator.members[A].strikes == 1
     learner.says(A, answer(order))

@@ -20,7 +20,7 @@ from millrace.protocol.call_timeouts import OUR_CODE, CallTimeouts, Doing
 from millrace.protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec, spoiled
 from tests.support.conversation.fake_link import FakeLink
 
 A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
@@ -295,7 +295,7 @@ def test_the_oldest_ticket_of_a_worker_counts() -> None:
     made, run = watch(learner), learner.coordinator.run
     learner.now += 2 * run.copies * (2 * STEP_S + run.rollout_steps * STEP_S) - 1
     assert made.check(learner.now, "progress") is None
-    learner.coordinator.reject_rollout(A, learner.rollout_of(1), "broken", learner.now)  # the other lane's; dealt again
+    learner.says(A, spoiled(learner.rollout_of(1)))  # the other lane's; dealt again
     assert made.check(learner.now, "more progress") is None
     assert made.check(learner.now + 2, "still more") is not None
 

@@ -16,6 +16,8 @@ from millrace.learner.members.events import (
     Failed,
     NamelessHello,
     PolicyRaised,
+    RolloutArrived,
+    RolloutRejected,
     WorkerJoined,
     WorkerLeft,
     WorkerRefused,
@@ -54,11 +56,12 @@ from millrace.protocol.messages import (
 from millrace.protocol.specs import OwnPolicySpec
 from millrace.protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec, spoiled
 from tests.support.conversation.rules import check_ledger
 
 M = TypeVar("M")
 A, B, C = b"a", b"b", b"c"
+NOT_FINITE = "reward: expected finite values, got nan at step 0, copy 0"  # so are rollouts spoiled
 TIMEOUT_S = 5.0
 
 
@@ -356,7 +359,7 @@ def test_the_round_of_a_lost_ticket_is_dealt_again_under_its_version() -> None:
     learner.take()
     learner.publish(1)
     lost = next(ticket for ticket in learner.coordinator.rollouts.held.values() if ticket.round == 1 and ticket.lane == 0)
-    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(lost.number), "broken", 0.0))
+    outs = learner.says(A, spoiled(learner.rollout_of(lost.number)))
     (permit,) = permits(outs)
     again = learner.coordinator.rollouts.held[permit.ticket]
     assert (again.lane, again.round, again.version, again.sequence) == (0, 1, 0, 3)  # two and one of round 2 were dealt
@@ -404,14 +407,14 @@ def test_a_lane_that_is_to_move_moves_when_its_last_rollout_is_bad() -> None:
     learner.joins(B)
     (moving,) = [lane.number for lane in learner.coordinator.rollouts.lanes if lane.moving]
     (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == moving]
-    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(last), "broken", 0.0))
+    outs = learner.says(A, spoiled(learner.rollout_of(last)))
     assert [permit.lane for permit in permits(outs, B)] == [moving]
 
 
 def test_rounds_of_lost_tickets_are_dealt_again_in_their_order() -> None:
     learner = Learner(lanes=1, max_lag=2)
     learner.joins(A)
-    learner.coordinator.reject_rollout(A, learner.rollout_of(0), "broken", 0.0)  # its round has the last ticket now
+    learner.says(A, spoiled(learner.rollout_of(0)))  # its round has the last ticket now
     process_ends(learner.coordinator, "a", "killed")
     learner.joins(B)
     held = learner.coordinator.rollouts.held
@@ -781,7 +784,7 @@ def test_a_reply_leaves_out_lanes_that_live_elsewhere() -> None:
 def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0))
+    outs = learner.says(A, spoiled(learner.rollout_of(0)))
     assert permits(outs) == [Permit(1, 0, 0, 1)]
     ledger = learner.coordinator.rollouts.ledger
     assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
@@ -790,7 +793,7 @@ def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
 def test_a_bad_rollout_is_let_go_by_its_worker() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    (collect,) = of(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0), Collect)
+    (collect,) = of(learner.says(A, spoiled(learner.rollout_of(0))), Collect)
     assert collect.received == (Received(0, 0, 1, ()),)
 
 
@@ -803,14 +806,34 @@ def test_a_worker_that_keeps_sending_rubbish_is_refused_and_what_it_held_is_deal
         assert A in learner.coordinator.members, strike
         if kind == "rollout":
             rollout = learner.rollout_of(learner.tickets()[0])
-            outs = learner.balanced(learner.coordinator.reject_rollout(A, rollout, "not understood", 0.0))
+            outs = learner.says(A, spoiled(rollout))
         else:
             outs = learner.balanced(learner.coordinator.reject_message(A, "not understood", 0.0))
-    assert outs == [(A, Refuse("not understood"))]
+    why = "not understood" if kind == "message" else f"rollout of ticket {STRIKES - 1}: {NOT_FINITE}"
+    assert outs == [(A, Refuse(why))]
     assert A not in learner.coordinator.members
     assert learner.coordinator.rollouts.ledger.outstanding == 0
     assert learner.coordinator.rollouts.ledger.messages_bad == (STRIKES if kind == "message" else 0)
-    assert learner.coordinator.events[1:] == [WorkerRefused("a", "not understood", 1)]  # the one line about its end
+    ends = [event for event in learner.coordinator.events[1:] if not isinstance(event, RolloutRejected)]
+    assert ends == [WorkerRefused("a", why, 1)]  # the one line about its end
+
+
+def test_what_becomes_of_each_rollout_is_an_event() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.coordinator.events.clear()
+    rollout = learner.rollout_of(0)
+    for each in (rollout, rollout):  # it is told once that it has come
+        learner.says(A, each)
+    learner.take()
+    learner.publish(1)
+    learner.says(A, spoiled(learner.rollout_of(1)))
+    learner.says(A, learner.rollout_of(2, sequence=0))
+    assert learner.coordinator.events == [
+        RolloutArrived("a", 0, 0),
+        RolloutRejected(A, f"rollout of ticket 1: {NOT_FINITE}"),
+        RolloutRejected(A, "rollout of ticket 2: expected lane 0, version 1, sequence 2, got lane 0, version 1, sequence 0"),
+    ]
 
 
 @pytest.mark.parametrize("how", ["rubbish", "revoked", "silent"])
@@ -850,7 +873,7 @@ def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raisi
     learner = Learner(lanes=1)
     learner.joins(A)
     bad = msgspec.structs.replace(learner.rollout_of(0), valid=np.full((1, 1), 9.0, np.float32))
-    learner.balanced(learner.coordinator.reject_rollout(A, bad, "valid expected bool", 0.0))
+    learner.says(A, bad)
     assert learner.coordinator.rollouts.ledger.transitions_invalid == 0
 
 
@@ -859,7 +882,7 @@ def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the
     learner = Learner(lanes=1)
     learner.joins(A)
     late = fake_rollout(session=5, lane=0, ticket=0, version=0, sequence=3)
-    learner.balanced(learner.coordinator.reject_rollout(A, late, "obs are NaN", 0.0))
+    learner.says(A, spoiled(late))
     assert learner.tickets(A) == [0]
     assert learner.coordinator.rollouts.lanes[0].out_of_order == set()
 
@@ -979,7 +1002,7 @@ def test_any_message_of_the_session_is_a_sign_of_life(kind: str) -> None:
         case "rollout":
             learner.delivers(0)
         case "bad rollout":
-            learner.coordinator.reject_rollout(A, learner.rollout_of(0), "broken", learner.now)
+            learner.says(A, spoiled(learner.rollout_of(0)))
         case _:
             learner.coordinator.reject_message(A, "rubbish", learner.now)
     learner.coordinator.remove_silent(4.0 + TIMEOUT_S)
@@ -1049,7 +1072,7 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
     learner.says(A, rollout)  # duplicate
     learner.take()
     learner.publish(1)
-    learner.coordinator.reject_rollout(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
+    learner.says(A, spoiled(learner.rollout_of(1)))  # invalid
     learner.says(A, msgspec.structs.replace(rollout, session=5))  # late
     counts = learner.coordinator.rollouts.ledger.counts()
     named = ("used", "duplicate", "invalid", "late")
@@ -1138,7 +1161,7 @@ def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -
     learner.delivers(first)
     learner.delivers(second)
     # The third round is collected again, after the fourth.
-    learner.coordinator.reject_rollout(A, learner.rollout_of(third), "broken", 0.0)
+    learner.says(A, spoiled(learner.rollout_of(third)))
     learner.deliver_all()
     used = [arrived for _ in range(4) for arrived in learner.coordinator.rollouts.take() or []]
     assert [(arrived.rollout.sequence, arrived.fresh) for arrived in used] == [(0, True), (1, False), (4, True), (3, True)]

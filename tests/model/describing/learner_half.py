@@ -21,6 +21,7 @@ from tests.model.learner_part import Learner
 from tests.model.message_content import ENV, WAIT, message_of, peer_of
 from tests.model.settings import TIMEOUT_S
 from tests.model.training import learner_event
+from tests.support.conversation.fake_ends import any_rows
 
 if TYPE_CHECKING:
     from tests.model.describing.describing import Describing
@@ -79,7 +80,9 @@ def _in_lobby(coordinator: DescribeCoordinator, event: Event, message: Content |
 
 def _taken_over(coordinator: DescribeCoordinator, settings: Describing, now: float) -> tuple[Learner, list[Outgoing]]:
     """The hub is made: it has the workers, and no weights yet."""
-    made = TicketCoordinator(settings.run, max_lag=settings.max_lag, worker_timeout_s=TIMEOUT_S, first_session=0)
+    made = TicketCoordinator(
+        settings.run, max_lag=settings.max_lag, worker_timeout_s=TIMEOUT_S, first_session=0, check_rows=any_rows
+    )
     out = made.take_over(coordinator.membership, now)
     before = {peer: member.session for peer, member in coordinator.members.items()}
     assert {peer: member.session for peer, member in made.members.items()} == before, "a worker has lost its session"

@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from millrace.learner.rollouts.ledger import Ledger
-from millrace.protocol.messages import Alive, Hello, Rollout
+from millrace.protocol.messages import Alive, Hello
 from millrace.workers.conversation.session import Session
 from tests.model.traces.record import SUFFIX, Record, Said, SaidRollout, SaidWeights, read
 from tests.model.traces.replay import NotAccepted, Replay
@@ -154,16 +154,16 @@ def _follow(record: Record, given: list[Any], learner: LearnerTrace, accepted: A
     match record.method:
         case "receive":
             peer, message = given[0], given[1]
-            if isinstance(message, Alive):
+            said = record.arguments[1]
+            if isinstance(said, SaidRollout) and said.wrong:
+                learner.heard.append((peer, None, Moment(record.at_s, "a rollout that is rejected", b"")))
+            elif isinstance(message, Alive):
                 accepted.counts["messages of supervisors"] += 1
             else:
                 which = message.process_nonce if isinstance(message, Hello) else message.session
-                learner.heard.append((peer, which, _moment(record.at_s, record.arguments[1])))
+                learner.heard.append((peer, which, _moment(record.at_s, said)))
         case "reject_message":
             learner.heard.append((given[0], None, Moment(record.at_s, "what cannot be read", b"")))
-        case "reject_rollout":
-            assert isinstance(given[1], Rollout)
-            learner.heard.append((given[0], None, Moment(record.at_s, "a rollout that is rejected", b"")))
     for peer, (kind, digest) in _sent_by_coordinator(record.result):
         learner.said.append((peer, Moment(record.at_s, kind, digest)))
 

@@ -67,6 +67,8 @@ class SaidRollout(NamedTuple):
     env_steps: int
     is_bool: bool
     """whether `valid` has the right dtype"""
+    wrong: str = ""
+    """what is wrong with its rows, if the learner found something"""
 
 
 class SaidWeights(NamedTuple):

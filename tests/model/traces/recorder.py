@@ -27,7 +27,7 @@ COMMON = ("receive", "reject_message", "revoke", "process_ended", "remove_silent
 METHODS = {
     "TicketCoordinator": (
         *COMMON,
-        *("reject_rollout", "refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation"),
+        *("refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation"),
         *("share_evaluation", "drain", "take_over"),
     ),
     "RolloutDealer": ("take", "not_used", "incarnations"),
@@ -69,6 +69,8 @@ class Recorder:
         keywords = {name: argument(each) for name, each in named.items()}
         if method == "publish":
             arguments = self._published(given[1:])
+        if part == "TicketCoordinator" and method == "receive":
+            arguments = self._checked(given[0], given[2], arguments)
         self.inside = True
         try:
             result = function(*given, **named)
@@ -95,6 +97,21 @@ class Recorder:
         digest = digest_of(Weights(version, parameters, buffers))
         self.digests.published(version, digest)
         return version, digest
+
+    @staticmethod
+    def _checked(coordinator: Any, message: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        """With what is wrong with the rows of a rollout: a replay does not have them."""
+        from millrace.protocol.errors import BadRollout
+        from millrace.protocol.messages import Rollout
+
+        if not isinstance(message, Rollout):
+            return arguments
+        peer, said, now = arguments
+        try:
+            coordinator._check_rows(message, coordinator.run)
+        except BadRollout as error:
+            said = said._replace(wrong=str(error))
+        return peer, said, now
 
     @staticmethod
     def _snapshot(rollouts: Any, incarnations: list[int]) -> tuple[Any, ...]:

@@ -15,9 +15,12 @@ import numpy as np
 from millrace.learner.members.describe_coordinator import DescribeCoordinator
 from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.errors import BadRollout
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import RunSpec
 from millrace.workers.conversation.session import Session
 from tests.model import learner_part
-from tests.model.traces.record import Digests, Record, SaidMember, SaidWaiting, message_of
+from tests.model.traces.record import Digests, Record, SaidMember, SaidRollout, SaidWaiting, message_of
 from tests.support.conversation.rules import waiting_rollouts
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
@@ -87,6 +90,7 @@ class Replay:
         self.parts: dict[str, Any] = {}
         """what was called, by class"""
         self._digests = Digests()
+        self._wrong_rows: dict[bytes, str] = {}  # by digest of a rollout, what was wrong with its rows
         self._rules: Rules | None = None
         self._taken: list[AcceptedRollout] = []
 
@@ -116,14 +120,23 @@ class Replay:
     def _made(self, said: Any, *, to_learner: bool) -> Any:
         if isinstance(said, SaidWaiting):
             return self.parts["DescribeCoordinator"].membership
+        if isinstance(said, SaidRollout) and said.wrong:
+            self._wrong_rows[said.digest] = said.wrong
         if isinstance(said, list):
             return [self._made(each, to_learner=to_learner) for each in said]
         return message_of(said, self._digests, to_learner=to_learner)
 
     def _begin(self, part: str, given: list[Any], named: dict[str, Any], used: set[int]) -> None:
+        if part == "TicketCoordinator":
+            named["check_rows"] = self._check_rows
         made = self.parts[part] = CLASSES[part](*given, **named)
         if part == "TicketCoordinator":
             self._rules = Rules(made, named["max_lag"], {each for each in used if each < made.rollouts.ledger.issued})
+
+    def _check_rows(self, rollout: Rollout, run: RunSpec) -> None:
+        """As the learner found them."""
+        if why := self._wrong_rows.get(self._digests.of(rollout)):
+            raise BadRollout(why)
 
     def _call(self, record: Record, given: list[Any], named: dict[str, Any]) -> None:
         coordinator: Any = self.parts.get("TicketCoordinator", self.parts.get("DescribeCoordinator"))
