@@ -22,7 +22,7 @@ from millrace.learner.algorithms.algorithm import acting_weights, numbers
 from millrace.learner.between_updates.between_updates import BetweenUpdates
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.rollouts.hub import Hub
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.progress import Row
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import RunError

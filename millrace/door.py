@@ -18,7 +18,7 @@ from __future__ import annotations
 from millrace.flags.fields import Flag
 from millrace.flags.parse import parse_flags
 from millrace.learner.algorithms.prior_data import PriorData
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.results import read_summary
 from millrace.learner.run_lines import RunLine, find_runs, read_line

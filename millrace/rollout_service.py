@@ -33,8 +33,8 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import convert_rollout_settings
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.episode_window import EpisodeWindow
 from millrace.learner.run_folder.progress import Progress, steps_per_second
 from millrace.learner.run_folder.results import Evaluation

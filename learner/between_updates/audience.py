@@ -17,7 +17,7 @@ from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.rollouts.hub import HubSnapshot
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.progress import Progress, Row, named, steps_per_second
 from millrace.protocol.arrays import Array

@@ -22,8 +22,8 @@ from millrace.learner.members.membership import Member, Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
-from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.run_status import progress_now, status
 from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator

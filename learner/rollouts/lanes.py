@@ -1,4 +1,4 @@
-"""The coordinator's records of lanes, tickets and accepted rollouts. Pure.
+"""The coordinator's records of lanes and tickets. Pure.
 
 Rule: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
 from 0 again.
@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from millrace.learner.members.lane_placement import PlacedLane
-from millrace.protocol.rollout import Rollout
 
 
 @dataclass
@@ -80,15 +79,3 @@ class Ticket:
     peer: bytes
     opponent: int | None = None
     """As in a `Permit`."""
-
-
-@dataclass(frozen=True, slots=True)
-class AcceptedRollout:
-    """A rollout that was accepted, with what the learner knows about it and its message does not carry."""
-
-    rollout: Rollout
-    incarnation: int
-    """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
-    fresh: bool = True
-    """Whether nothing carries over to it from an earlier rollout: it does not continue the one of its lane that was used
-    last, because the lane was started anew, the learner was, or the rollout between the two was rejected."""

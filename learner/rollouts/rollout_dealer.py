@@ -9,15 +9,27 @@ from __future__ import annotations
 
 from bisect import insort
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from millrace.learner.members.membership import Member, Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
-from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
+from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import Collect, Permit, Received, Rollout, versions_of
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptedRollout:
+    """A rollout that was accepted, with what the learner knows about it and its message does not carry."""
+
+    rollout: Rollout
+    incarnation: int
+    """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
+    fresh: bool = True
+    """Whether nothing carries over to it from an earlier rollout: it does not continue the one of its lane that was used
+    last, because the lane was started anew, the learner was, or the rollout between the two was rejected."""
 
 
 class RolloutDealer:

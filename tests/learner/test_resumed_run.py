@@ -16,9 +16,9 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.config.layers import resolve
 from millrace.learner.resume_checks import unless_finished
-from millrace.learner.rollouts.lanes import AcceptedRollout
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import PoolState, Snapshot
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, Summary
 from millrace.learner.run_folder.run_folder import RunFolder

@@ -12,9 +12,9 @@ from millrace.learner.members.lane_placement import LanePlacement
 from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.lag_rule import Rounds
-from millrace.learner.rollouts.lanes import AcceptedRollout, Ticket, TicketedLane
+from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
-from millrace.learner.rollouts.rollout_dealer import RolloutDealer
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.sent_weights import Held, Sent, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.messages import ToLearner, WorkerExit

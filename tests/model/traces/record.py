@@ -17,7 +17,7 @@ import numpy as np
 
 from millrace.learner.members.describe_coordinator import Unknown, accept_any
 from millrace.learner.members.membership import Member, Membership
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import Rollout, ToLearner, ToWorker, Weights
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.rollout import Rollout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE
-from millrace.learner.rollouts.lanes import AcceptedRollout
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 
 
