@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from typing import Generic
 
 from millrace.learner.members.events import Event, WorkerNotStarted
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import MemberState, SentUnusable
-from millrace.learner.members.membership import M, Member, Membership, Outgoing
+from millrace.learner.members.membership import M, Membership, Outgoing
 from millrace.protocol.alive import StartFailed
 from millrace.protocol.bounds import one_line
 from millrace.protocol.messages import (

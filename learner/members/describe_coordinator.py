@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.membership import MAX_MEMBERS, Answered, Member, Membership, Outgoing
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import MAX_MEMBERS, Answered, Membership, Outgoing
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description

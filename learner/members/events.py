@@ -1,7 +1,7 @@
 """Events of workers, for the log and for the hub, which decides whether the run can go on. Plain data.
 
-`json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change. Events without
-such a name are no events of the log.
+`json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change. An event without
+such a name is not logged as one.
 """
 
 from __future__ import annotations
@@ -166,8 +166,7 @@ LoggedEvent = (
     | RejoinRequested
     | EnvironmentNoted
 )
-Arrival = RolloutArrived | EpisodesArrived
-Event = LoggedEvent | RolloutRejected | Arrival
+Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
 
 
 def describe(event: LoggedEvent) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.protocol.messages import WorkerActivity
 
 DOING = {

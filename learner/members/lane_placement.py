@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Outgoing
 from millrace.protocol.messages import LaneIncarnation, Release
 
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event
 from millrace.learner.members.failure_count import FailureCount
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
-from millrace.learner.members.membership import Member, Membership
+from millrace.learner.members.membership import Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import Stalled

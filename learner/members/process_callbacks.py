@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from millrace.learner.members.events import Failed
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 
 

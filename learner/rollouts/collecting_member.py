@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.protocol.messages import Heartbeat, WorkerStatus
 
 

@@ -23,7 +23,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Outgoing
 from millrace.learner.run_folder.results import Evaluation, fact_means
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, versions_of

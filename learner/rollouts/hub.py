@@ -17,8 +17,9 @@ import numpy as np
 from millrace.learner.members.events import EpisodesArrived, Event, RolloutArrived
 from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.held_up import LONG_S
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer
-from millrace.learner.members.membership import Member, Membership
+from millrace.learner.members.membership import Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics

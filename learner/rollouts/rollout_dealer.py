@@ -11,7 +11,8 @@ from bisect import insort
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger

@@ -16,14 +16,15 @@ from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
-from millrace.learner.members.membership import Outgoing, SharingSupervisor
+from millrace.learner.members.member import SharingSupervisor
+from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.protocol.alive import SHARED_VERSIONS
 from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 
 
 @dataclass(frozen=True)
-class Sent:
+class SentAfter:
     """They were sent, after so many heartbeat replies. Who has received a later reply has them, or they are lost."""
 
     replies: int
@@ -35,11 +36,11 @@ class FromSupervisor:
 
 
 @dataclass(frozen=True)
-class Held:
+class Confirmed:
     """The worker has said that it holds them."""
 
 
-Standing = Sent | FromSupervisor | Held
+Standing = SentAfter | FromSupervisor | Confirmed
 """What the learner knows of some weights and a worker. It knows nothing of those that the worker lacks."""
 
 
@@ -49,7 +50,7 @@ class WeightsHeld:
     def __init__(self) -> None:
         self.by_worker: dict[bytes, dict[int, Standing]] = {}
         """by routing id and version"""
-        self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, Sent]]()
+        self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
         """by version, the newest last; it ends with the last member that has this supervisor"""
 
     def versions(self, peer: bytes) -> Set[int]:
@@ -60,13 +61,13 @@ class WeightsHeld:
         """The worker gets these weights, from this supervisor if there is one. Returns whom to send them; None: nobody."""
         mine = self.by_worker.setdefault(member.peer, {})
         if supervisor is None:
-            mine[version] = Sent(member.replies)
+            mine[version] = SentAfter(member.replies)
             return member.peer
         mine[version] = FromSupervisor()
         shared = self.by_supervisor.setdefault(supervisor, {})
         if version in shared:
             return None
-        shared[version] = Sent(supervisor.replies)
+        shared[version] = SentAfter(supervisor.replies)
         for oldest in list(shared)[:-SHARED_VERSIONS]:
             del shared[oldest]
         return supervisor.peer
@@ -84,11 +85,11 @@ class WeightsHeld:
             match standing:
                 case FromSupervisor():
                     under_way = self._may_be_under_way(version, member.shared_by)
-                    after[version] = standing if under_way else Sent(member.replies)
-                case Sent(replies) if replies >= heartbeat.replies:
+                    after[version] = standing if under_way else SentAfter(member.replies)
+                case SentAfter(replies) if replies >= heartbeat.replies:
                     after[version] = standing
                 case _ if version in heartbeat.versions:
-                    after[version] = Held()
+                    after[version] = Confirmed()
         self.by_worker[member.peer] = after
 
     def forget(self, peer: bytes) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.call_timeouts import CallTimeouts

@@ -20,8 +20,9 @@ import msgspec
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, RolloutArrived, RolloutRejected
 from millrace.learner.members.lane_placement import LanePlacement, is_spare
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import SentUnusable
-from millrace.learner.members.membership import Answered, Member, Membership, Outgoing
+from millrace.learner.members.membership import Answered, Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from millrace.learner.rollouts.ledger import Ledger

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 from millrace.learner.members.held_up import LONG_S, held_up
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.bounds import one_line

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import Failed
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import TimedOut
-from millrace.learner.members.membership import Answered, Member, Membership, Outgoing
+from millrace.learner.members.membership import Answered, Membership, Outgoing
 from millrace.protocol.errors import BadMessage, EnvironmentFailed
 from millrace.protocol.messages import (
     Answer,

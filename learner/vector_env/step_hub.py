@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from millrace.learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
-from millrace.learner.members.membership import Member, Membership
+from millrace.learner.members.membership import Membership
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from millrace.learner.vector_env.shared_steps import SharedSteps

@@ -11,7 +11,7 @@ from functools import partial
 from time import monotonic
 
 from millrace.launch.endpoint import Endpoint
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
 from millrace.protocol.alive import StartFailed, WorkerExit

@@ -15,7 +15,7 @@ from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
-from millrace.learner.rollouts.sent_weights import Held, Sent, SentWeights, Standing, WeightsHeld
+from millrace.learner.rollouts.sent_weights import Confirmed, SentAfter, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.messages import ToLearner, WorkerExit
 from tests.model import membership_part
@@ -313,7 +313,7 @@ def _held(coordinator: TicketCoordinator) -> Content:
     assert by_worker.keys() <= coordinator.members.keys(), "weights count as held by a worker that is gone"
     return tuple(
         tuple(
-            (version, name(Kind.REPLIES, standing.replies, member.session) if isinstance(standing, Sent) else None)
+            (version, name(Kind.REPLIES, standing.replies, member.session) if isinstance(standing, SentAfter) else None)
             for version, standing in sorted(by_worker.get(member.peer, {}).items())
         )
         for member in members
@@ -321,7 +321,7 @@ def _held(coordinator: TicketCoordinator) -> Content:
 
 
 def _standing(sent_at: Name | None) -> Standing:
-    return Held() if sent_at is None else Sent(sent_at.value)
+    return Confirmed() if sent_at is None else SentAfter(sent_at.value)
 
 
 def _snapshots(coordinator: TicketCoordinator) -> list[int]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from millrace.learner.members.membership import Member, Membership
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
 from tests.model.conversation import Content

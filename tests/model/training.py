@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.rollouts.sent_weights import Sent
+from millrace.learner.rollouts.sent_weights import SentAfter
 from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 from tests.model import learner_part, process_part, worker_part
 from tests.model.conversation import Content, Event, Facts
@@ -78,7 +78,7 @@ class WeightsRule:
         self._learner, self._heard = learner, heard
         self._named = {(member.session, version) for member, version in learner.named()}
         self._sent_at = {
-            (member.session, version): standing.replies if isinstance(standing, Sent) else ARRIVED
+            (member.session, version): standing.replies if isinstance(standing, SentAfter) else ARRIVED
             for peer, member in learner.coordinator.members.items()
             for version, standing in learner.coordinator.weights.held.by_worker.get(peer, {}).items()
         }
@@ -108,7 +108,7 @@ class WeightsRule:
                     assert shown, "weights are sent again although they were not lost"
                     assert sent_at[which] < self._heard.replies, "weights are sent again although they may be under way"
                 standing = held.by_worker.get(peer, {}).get(message.version)
-                assert isinstance(standing, Sent), "weights are sent and not noted"
+                assert isinstance(standing, SentAfter), "weights are sent and not noted"
                 assert standing.replies >= member.replies - isinstance(self._heard, Heartbeat), (
                     "weights are sent and not noted"
                 )
@@ -117,7 +117,7 @@ class WeightsRule:
         for peer, member in after.coordinator.members.items():
             if isinstance(heard, Heartbeat) and member.session == heard.session:
                 for version, standing in held.by_worker.get(peer, {}).items():
-                    under_way = isinstance(standing, Sent) and standing.replies >= heard.replies
+                    under_way = isinstance(standing, SentAfter) and standing.replies >= heard.replies
                     assert under_way or version in heard.versions, "weights that a worker lacks count as held"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from millrace.learner.members.held_up import LONG_S
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings

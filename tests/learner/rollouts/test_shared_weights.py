@@ -7,7 +7,8 @@ import weakref
 
 import pytest
 
-from millrace.learner.members.membership import SUPERVISOR_WORD_S, Outgoing
+from millrace.learner.members.member import SUPERVISOR_WORD_S
+from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings
 from millrace.protocol.alive import SHARED_VERSIONS, Alive, WorkerActivity
 from millrace.protocol.messages import PROTOCOL_VERSION, Collect, HeartbeatReply, Hello, Weights

@@ -14,7 +14,7 @@ import zmq
 
 from millrace.cli.status import as_table, ask, in_json, observer_name
 from millrace.learner.members.events import LoggedEvent, RejoinRequested, WorkerLeft, describe
-from millrace.learner.members.membership import MAX_LATE_ACTIONS
+from millrace.learner.members.member import MAX_LATE_ACTIONS
 from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.run_status import progress_now, status
 from millrace.learner.run_folder.json_log import JsonLines, progress_line

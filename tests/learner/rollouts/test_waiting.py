@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from millrace.learner.members.held_up import LONG_S
-from millrace.learner.members.membership import Member
+from millrace.learner.members.member import Member
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
 from millrace.protocol.alive import Alive, WorkerActivity

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from gymnasium import spaces
 
 from millrace.learner.members.describe_coordinator import FIRST_TICKET, DescribeCoordinator, Unknown
-from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.messages import Rejoin, WorkerExit

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from millrace.learner.members.describe_coordinator import Unknown, accept_any
-from millrace.learner.members.membership import Member, Membership
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import Rollout, ToLearner, ToWorker, Weights

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from millrace.learner.members.membership import Member, Outgoing
+from millrace.learner.members.member import Member
+from millrace.learner.members.membership import Outgoing
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from millrace.protocol.messages import ToLearner, WorkerExit

@@ -1,0 +1,209 @@
+"""A worker as the learner sees it: what it has said of itself, and what it was given. Plain data, and figures made of it.
+
+Rule: a worker may claim anything, so no figure is more than it can be: seconds are bounded by the session, late actions by a
+number that no loop reaches, and of a list of tickets nothing is kept.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import msgspec
+
+from millrace.learner.members.events import Failed
+from millrace.learner.members.member_states import MemberState
+from millrace.protocol.bounds import Stages, escaped
+from millrace.protocol.call_timeouts import OUR_CODE
+from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
+
+MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by: several may be read at once
+MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
+SUPERVISOR_WORD_S = 5.0  # what a supervisor said holds for this long
+
+
+@dataclass(eq=False)
+class SharingSupervisor:
+    """A supervisor whose workers share the weights that it gets, as the learner sees it. Its workers' members keep it."""
+
+    peer: bytes
+    heard_s: float = 0.0
+    """Time of its last word."""
+    replies: int = 0
+    """Number of heartbeat replies that were sent to it."""
+    received: int = 0
+    """Number of the last one that it has received: what was sent before it has arrived, or is lost."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast a worker steps. A step may take minutes, and a client may count those of a rollout when that is complete.
+
+    So the speed is that between the last two heartbeats with more steps, until the next one is overdue.
+    """
+
+    steps: int
+    """Env steps in the heartbeat by which it was last measured."""
+    at_s: float
+    """Time when that arrived."""
+    gained: int = 0
+    """By how many env steps these were more than when it was measured before."""
+    seconds: float = 1.0
+    """Between the two."""
+
+    def after(self, steps: int, now: float) -> Speed:
+        """As measured by a later heartbeat."""
+        return Speed(steps, now, steps - self.steps, now - self.at_s)
+
+    def steps_per_s(self, now: float) -> float:
+        """Env steps per second."""
+        return self.gained / max(self.seconds, now - self.at_s)
+
+
+@dataclass
+class Member:
+    """A worker as the learner sees it."""
+
+    peer: bytes
+    """Routing id of the worker."""
+    hello: Hello
+    session: int
+    join_number: int
+    """Number of this member in the order of joining."""
+    heard_s: float
+    """Time of the worker's last message."""
+    joined_s: float = 0.0
+    """Time when it joined."""
+    takeovers: int = 0
+    """How often processes have taken this name from each other, without a time in which nobody had it."""
+    state: MemberState = MemberState.ACTIVE
+    lanes: set[int] = field(default_factory=set)
+    tickets: dict[int, int] = field(default_factory=dict)
+    """Tickets that the worker holds; for each, the value of `replies` when the ticket was last sent."""
+    replies: int = 0
+    """Number of heartbeat replies that were sent."""
+    welcomed: int = 0
+    """`replies` when the run was sent to it."""
+    heartbeat: Heartbeat | None = None
+    """Newest heartbeat."""
+    stages_before: Stages = field(default_factory=dict)
+    """Seconds in each stage of the worker's process before this session."""
+    speed: Speed | None = None
+    """Measured by its heartbeats; None: there was none."""
+    first_step_s: float | None = None
+    """Time since which its process is known to make env steps: it has reported one, or sent a rollout."""
+    activity: WorkerActivity | None = None
+    """What the worker does, as its supervisor said last."""
+    activity_s: float = 0.0
+    """Time when the supervisor said that."""
+    in_env_code_s: float = -math.inf
+    """Time when the supervisor said last that the worker is in the user's code: until then the worker was not silent."""
+    supervisor: SharingSupervisor | None = None
+    """Its supervisor, if it shares weights."""
+
+    @property
+    def shared_by(self) -> SharingSupervisor | None:
+        """The supervisor that shares weights with the worker, unless it has fallen silent."""
+        found = self.supervisor
+        return found if found is not None and self.heard_s - found.heard_s < SUPERVISOR_WORD_S else None
+
+    @property
+    def role(self) -> str:
+        """What it is to the run: draining, evaluating (it does only that), active, or spare (it has no lane)."""
+        if self.state is MemberState.DRAINING:
+            return "draining"
+        return "evaluating" if self.hello.evaluates else "active" if self.lanes else "spare"
+
+    @property
+    def has_counted(self) -> bool:
+        """Whether what its process counts began before its part in this run, as of the next heartbeat."""
+        return not self.hello.is_first_attempt if self.heartbeat is None else self.heartbeat.waits
+
+    @property
+    def alive_s(self) -> float:
+        """Time at which the worker was last known to be alive and well."""
+        return max(self.heard_s, self.in_env_code_s)
+
+    def failed(
+        self, kind: type[Failed], error: str, traceback: str = "", *, lane: int | None = None, spare: bool = False
+    ) -> Failed:
+        """The event that says that the worker failed, in this lane if it is known."""
+        lanes = (lane,) if lane in self.lanes else tuple(sorted(self.lanes))
+        worked_s = None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
+        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, worked_s, spare)
+
+    def has_stepped(self) -> None:
+        """Its process is known to have made an env step."""
+        if self.first_step_s is None:
+            self.first_step_s = self.heard_s
+
+    def record_activity(self, activity: WorkerActivity, now: float) -> bool:
+        """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
+        before, self.activity, self.activity_s = self.activity, activity, now
+        if activity.doing not in OUR_CODE:
+            self.in_env_code_s = now
+        return activity.env_calls > (0 if before is None else before.env_calls)
+
+    def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
+        """Keep the heartbeat. Returns the tickets that were lost on the way.
+
+        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
+        """
+        if self.has_counted:
+            self.stages_before = heartbeat.stages
+        self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
+        if heartbeat.steps:
+            self.has_stepped()
+        if self.speed is None:
+            self.speed = Speed(heartbeat.steps, self.heard_s)
+        elif heartbeat.steps != self.speed.steps and self.heard_s - self.speed.at_s >= MEASURE_S:
+            self.speed = self.speed.after(heartbeat.steps, self.heard_s)
+        held = set(heartbeat.tickets)
+        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
+
+    def new_late_actions(self, heartbeat: Heartbeat) -> int:
+        """The late actions since the last heartbeat. Those before this session belong to an earlier one.
+
+        A number that no loop can reach between two heartbeats is not counted.
+        """
+        if self.heartbeat is not None:
+            before = self.heartbeat.late_actions
+        else:
+            before = 0 if self.hello.is_first_attempt else heartbeat.late_actions
+        more = heartbeat.late_actions - before
+        return more if 0 <= more <= MAX_LATE_ACTIONS else 0
+
+    def stages(self) -> Stages:
+        """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session.
+
+        A member that only evaluates waits for nothing that training could give it, so that is not counted.
+        """
+        lasted_s = self.heard_s - self.joined_s
+        return {
+            stage: max(0.0, min(seconds - self.stages_before.get(stage, 0.0), lasted_s))
+            for stage, seconds in (self.heartbeat.stages if self.heartbeat is not None else {}).items()
+            if not (self.hello.evaluates and stage == "wait")
+        }
+
+    def status(self, now: float) -> WorkerStatus:
+        """The worker's row of `millrace status`."""
+        heartbeat = self.heartbeat
+        said_s = now - self.activity_s
+        activity = self.activity if said_s < SUPERVISOR_WORD_S else None
+        return WorkerStatus(
+            worker=self.hello.worker,
+            host=self.hello.host,
+            pid=self.hello.pid,
+            state=self.role,
+            lanes=tuple(sorted(self.lanes)),
+            tickets=len(self.tickets),
+            steps=heartbeat.steps if heartbeat else 0,
+            steps_per_s=0.0 if self.speed is None else self.speed.steps_per_s(now),
+            version=-1,
+            silent_s=max(0.0, now - self.heard_s),
+            resident_bytes=heartbeat.resident_bytes if heartbeat else 0,
+            strikes=0,
+            doing=activity.doing if activity else "",
+            doing_s=activity.for_s + max(0.0, said_s) if activity else 0.0,
+            late_actions=heartbeat.late_actions if heartbeat else 0,
+        )
