@@ -1,8 +1,7 @@
 """What a learner says to its workers, made from its settings: before the run, and in it.
 
 A run's specification is what `Welcome` brings, for our training and for a user's own loop.
-Who starts worker processes is not known here: the launchers in `millrace` pass them in as `ProcessCallbacks`. Imports no
-torch.
+Who starts worker processes is not known here: the launchers in `millrace` pass in `WorkerProcesses`. Imports no torch.
 """
 
 from __future__ import annotations

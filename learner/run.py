@@ -27,8 +27,9 @@ from millrace.learner.config.costs import large_observations, minibatch_rows
 from millrace.learner.config.validation import unused_setting
 from millrace.learner.conversations import open_hub
 from millrace.learner.extras import started_by
+from millrace.learner.members.bound import Bound
 from millrace.learner.members.lobby import Lobby
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from millrace.learner.run_folder.lease import Closed, Listens
@@ -42,7 +43,6 @@ from millrace.learner.train import train
 from millrace.protocol.address import advertised_address, own_address
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
-from millrace.protocol.keys.key_folder import Keyring
 from millrace.protocol.logs.notices import log_notice
 from millrace.protocol.machine.waiting_threads import SPIN, VARIABLE
 from millrace.protocol.policy.flattened_images import flattened_images
@@ -66,8 +66,10 @@ class OpenRun:
     prior: PriorData | None
     """The data that the run learns from besides its own, if there are any."""
 
-    def announce(self, address: str, advertise: str, keyring: Keyring | None) -> None:
+    def announce(self, bound: Bound, advertise: str) -> None:
         """Say in the lock of the run folder that `millrace status` may ask at this address; or why it cannot."""
+        address = bound.link.address
+        keyring = bound.keyring
         lock = self.setup.folder.lock
         if lock is None:
             return
@@ -189,7 +191,6 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
     if setup.resumed:
         log_notice(log, between.files.continues())
     folder.keep()
-    run.announce(lobby.link.address, config.advertise, lobby.link.keyring)
     return run
 
 
@@ -209,7 +210,7 @@ def _opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentP
     return OpponentPool(settings, state)
 
 
-def _use_threads(setup: RunSetup, policy: PolicySpec, processes: ProcessCallbacks) -> RunSetup:
+def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses) -> RunSetup:
     """Let PyTorch use the run's number of threads. Returns the setup with that number."""
     config = setup.config
     if config.torch_threads is None:

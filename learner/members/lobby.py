@@ -18,7 +18,7 @@ from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Membership
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import Stalled
 from millrace.protocol.logs.long_wait import LongWait
@@ -54,7 +54,7 @@ class Lobby:
     def __init__(
         self,
         link: LearnerLink,
-        processes: ProcessCallbacks,
+        processes: WorkerProcesses,
         settings: LobbySettings,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:

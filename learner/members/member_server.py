@@ -43,7 +43,7 @@ from millrace.learner.members.key_revocation import KeyRevocation
 from millrace.learner.members.member_log import MemberLog
 from millrace.learner.members.member_states import SentUnusable
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.protocol.address import advertised_address, name_for_people
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import BadMessage, NoWorkers
@@ -97,7 +97,7 @@ class MemberServer:
         link: LearnerLink,
         coordinator: Coordinator[Any],
         hub: ServedHub,
-        processes: ProcessCallbacks,
+        processes: WorkerProcesses,
         settings: ServerSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -203,7 +203,7 @@ class MemberServer:
 
     def check_left(self, workers: int, *, collecting: bool) -> None:
         """Raise `NoWorkers` if this program has started the workers, nobody else can join, and fewer than these are left."""
-        left = self._processes.left(collecting)
+        left = self._processes.left(collecting=collecting)
         if left >= workers:
             return
         why = f": the last one {self._last_turned_away}" if self._last_turned_away else ""
@@ -237,7 +237,7 @@ class MemberServer:
         """What the workers do, those that are held up longest first, and what is awaited if there are none."""
         members = self._membership.members.values()
         processes = self._processes
-        doing, wrote = what_they_do(members, processes.running(), processes.said(), self._clock())
+        doing, wrote = what_they_do(members, processes.activities(), processes.last_lines(), self._clock())
         return "; ".join([doing or f"waiting for {self.awaited()}", *wrote])
 
     def awaited(self) -> str:
@@ -305,7 +305,7 @@ class MemberServer:
         """Record what the workers do that this program started."""
         if now >= self._ask_processes_s:
             self._ask_processes_s = now + ASK_PROCESSES_S
-            for activity in self._processes.running():
+            for activity in self._processes.activities():
                 self._membership.record_activity(activity, now)
 
     def _frames(self, message: ToWorker) -> Sequence[Buffer]:

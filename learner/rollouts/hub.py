@@ -20,7 +20,7 @@ from millrace.learner.members.held_up import LONG_S
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer
 from millrace.learner.members.membership import Membership
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
 from millrace.learner.rollouts.ledger import Ledger
@@ -113,7 +113,7 @@ class Hub:
         link: LearnerLink,
         coordinator: TicketCoordinator,
         settings: HubSettings,
-        processes: ProcessCallbacks | None = None,
+        processes: WorkerProcesses | None = None,
         check_interrupt: Callable[[], None] = lambda: None,
         observer: HubObserver = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
@@ -123,7 +123,7 @@ class Hub:
         self.coordinator = coordinator
         self.settings = settings
         link.packed_bytes_limit = rollout_bytes(coordinator.run)
-        self._processes = processes or ProcessCallbacks()
+        self._processes = processes or WorkerProcesses()
         self._check_interrupt = check_interrupt
         self._observer = observer
         self._clock = clock
@@ -134,7 +134,7 @@ class Hub:
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, run.call_timeouts)
         self._server = MemberServer(link, coordinator, self, self._processes, clock=clock)
-        self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)
+        self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes)
 
     def take_over(self, waiting: Membership[Member]) -> None:
         """The run begins for the workers that wait for it."""
@@ -306,9 +306,9 @@ class Hub:
         return self._processes.expected
 
     def workers_alive(self) -> int:
-        """Number of processes that step the environment."""
-        count = self._processes.count
-        return len(self.coordinator.members) if count is None else count()
+        """Number of workers that step the environment."""
+        stepping = self._processes.stepping()
+        return len(self.coordinator.members if stepping is None else stepping)
 
     def snapshot(self) -> HubSnapshot:
         """A snapshot of the current state."""
@@ -396,8 +396,8 @@ class Hub:
         """One turn of waiting: listen, then check whether the run can go on."""
         self._listen(timeout_s)
         self._check_interrupt()
-        while self._processes.failed:
-            self._count_failure(self._processes.failed.pop(0))
+        for failed in self._processes.take_failures():
+            self._count_failure(failed)
         self._failures.check()
         self._server.check_members(self.settings.no_workers_timeout_s, collecting=not self._time.evaluating)
 

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 from millrace.learner.members.held_up import LONG_S, held_up
 from millrace.learner.members.member import Member
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.bounds import one_line
@@ -27,9 +28,9 @@ class LearnerTime:
     """What the learner does, since when, and how it has spent its time."""
 
     def __init__(
-        self, coordinator: TicketCoordinator, now: float, no_worker: Callable[[], str], stepping: Callable[[], list[Member]]
+        self, coordinator: TicketCoordinator, now: float, no_worker: Callable[[], str], processes: WorkerProcesses
     ) -> None:
-        """`no_worker` returns what is awaited if there is no member; `stepping`, who steps if the members do not."""
+        """`no_worker` returns what is awaited if there is no member."""
         self.phase: Phase = "starting"
         self.since_s = now
         self._last = ""  # who waited last; empty if the last wait for rollouts was short
@@ -37,7 +38,7 @@ class LearnerTime:
         """seconds of the phases that have ended"""
         self._coordinator = coordinator
         self._no_worker = no_worker
-        self._stepping = stepping
+        self._processes = processes
 
     @property
     def evaluating(self) -> bool:
@@ -127,7 +128,7 @@ class LearnerTime:
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
         """Who that is of the workers that step for these members, or of the members."""
-        return max((held_up(member, now) for member in self._stepping() or members), default=("nobody plays",))[-1]
+        return max((held_up(member, now) for member in self._processes.stepping() or members), default=("nobody plays",))[-1]
 
 
 def _in_words(seconds: float) -> str:

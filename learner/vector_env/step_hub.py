@@ -11,13 +11,12 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
 
 from millrace.learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Membership
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from millrace.learner.vector_env.shared_steps import SharedSteps
 from millrace.learner.vector_env.vector_env_status import status
@@ -35,23 +34,6 @@ PATIENCE_S = 10.0  # how long a lost lane waits for a restarted worker (at most 
 BUSY_S = 1.0  # how long closing waits for a step under way: the step may hang, and its result is not used
 
 
-class LocalWorkers(Protocol):
-    """The worker processes that this program started."""
-
-    def kill(self, name: str) -> bool:
-        """Kill the process of this name. False if this program did not start it."""
-        ...
-
-    @property
-    def count(self) -> int:
-        """Number of processes that run or will be restarted."""
-        ...
-
-    def stop(self, timeout_s: float) -> None:
-        """Stop all processes within `timeout_s`."""
-        ...
-
-
 class StepHub:
     """What a vector environment has to do with workers: it asks lanes, and looks what has come of that."""
 
@@ -61,8 +43,7 @@ class StepHub:
         spec: StepSpec,
         *,
         first_session: int,
-        local_workers: LocalWorkers,
-        processes: ProcessCallbacks | None = None,
+        processes: WorkerProcesses,
         shared: SharedSteps | None = None,
         worker_timeout_s: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
@@ -84,7 +65,7 @@ class StepHub:
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
         if shared is not None:
             self._under_way = self.coordinator.shared_orders = shared.under_way
-        self._local_workers = local_workers
+        self._processes = processes
         self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
         self._waiting_since_s: dict[int, float] = {}  # of these lanes
         self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
@@ -94,7 +75,7 @@ class StepHub:
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
-        self._server = MemberServer(link, self.coordinator, self, processes or ProcessCallbacks(), settings, clock)
+        self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 
     def take_over(self, waiting: Membership[Member]) -> None:
         """The vector environment begins for the workers that wait for it."""
@@ -204,7 +185,7 @@ class StepHub:
         member = self.coordinator.owner(lane)
         if member is not None:
             why = f"did not answer within {timeout_s:g} s"
-            killed = self._local_workers.kill(member.hello.worker)
+            killed = self._processes.kill(member.hello.worker)
             self._server.send(self.coordinator.give_up(member, f"{why}, and was killed" if killed else why))
 
     # ---------------------------------------------------------------- lanes and workers
@@ -238,7 +219,7 @@ class StepHub:
         if self.shared is not None:
             self.shared.wake_all()
         self._server.wait_until_all_left(deadline_s, POLL_S)
-        self._local_workers.stop(max(0.0, deadline_s - self.now()))
+        self._processes.stop(max(0.0, deadline_s - self.now()))
         self._server.close()
 
     # ---------------------------------------------------------------- what the server asks and tells
@@ -278,7 +259,8 @@ class StepHub:
     def _send_waiting_orders(self) -> None:
         if not self._waiting_orders:
             return
-        awaited = len(self.coordinator.membership.active()) < self._local_workers.count  # one of ours has yet to join
+        ours = min(self._processes.expected, self._processes.left(collecting=False))
+        awaited = len(self.coordinator.membership.active()) < ours  # one of ours has yet to join
         now = self.now()
         for lane, make in list(self._waiting_orders.items()):
             if self.coordinator.place(lane, awaited and now - self._waiting_since_s[lane] < self._patience_s):

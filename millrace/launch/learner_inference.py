@@ -1,93 +1,91 @@
-"""Run with `--inference learner`: workers only step env copies; the policy acts in this process, for all copies at once.
+"""A pool whose workers only step env copies: the policy acts in this process, for all copies at once.
 
 The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
 vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors are those of every run, and
-a lane gets the same seeds and random numbers as with `--inference workers`.
-
-Rule: whatever happens, no worker, thread, socket file or folder of ours is left behind.
+a lane gets the same seeds and random numbers as in a worker that acts itself.
 """
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from time import monotonic
 
-from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
-from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import worker_flags
-from millrace.launch.vector import listen
-from millrace.learner.callbacks.callbacks import Watch
+from millrace.launch.crew import Crew
+from millrace.launch.vector import VectorEnvPool, open_vector_env_pool
+from millrace.launch.worker_pool import AT_ONCE_S, ActingPool, open_worker_pool
 from millrace.learner.config.config import Config
-from millrace.learner.config.validation import workers_to_wait_for
-from millrace.learner.conversations import lobby_settings
-from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.lobby import Lobby
+from millrace.learner.members.bound import Bound
+from millrace.learner.members.events import Failed
+from millrace.learner.members.lobby import Lobby, LobbySettings
+from millrace.learner.members.member import Member
 from millrace.learner.members.who_may_connect import BindSettings
-from millrace.learner.resume_checks import Resumption
-from millrace.learner.run_setup import RunSetup, known_environment, prometheus_observer, run_folder
-from millrace.learner.torch_setup import one_thread, torch_device
+from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.learner.torch_setup import torch_device
+from millrace.learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
-from millrace.workers.supervise.supervisor import STOP_WITHIN_S
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.messages import Status
+from millrace.protocol.policy.policy import Policy, make_policy
+from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.wire.weight_dtypes import ActingDtype
+from millrace.workers.actors import Actors
+from millrace.workers.collect.collector import Collector
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.split_vector_env import SplitVectorEnv
+from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.supervise.supervisor import Supervisor
+from millrace.workers.worker_thread import WorkerThread
+
+NEVER_S = 1e9  # the timeout of an order that may take any time
 
 
-def train(
-    config: Config,
-    resume: Resumption | None,
-    watch: Watch,
-    env_spec: EnvSpec,
-    *,
-    elsewhere: bool = False,
-) -> Path:
-    """Train until the run is done. Returns the run folder.
+@dataclass(frozen=True)
+class ActingSettings:
+    """What acts in this process, and on which env copies."""
 
-    `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
-    the user stopped the run.
-    """
-    workers = workers_to_wait_for(config, None if elsewhere else min(config.workers, config.envs))
-    with ExitStack() as stack:
-        endpoint = open_endpoint(BindSettings(), "inproc", stack)
-        listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
-        observer = stack.enter_context(prometheus_observer(config))
-        folder = stack.enter_context(run_folder(config, resume))
-        started = listening.start(worker_flags(config, folder.path), lobby_settings(config, config.steps))
-        known = known_environment(config, env_spec, resume, started.lobby)
-        env = started.vector_env(known.described)
-        stack.callback(env.close)
-        masked, timeout_s = known.spaces.masked, config.no_workers_timeout_s
-        lanes = lanes_of(env, config.lanes, config.info_keys, workers, timeout_s, masked=masked)
-        thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(config.eval_copies), lambda: torch_device(config))
-        interrupts = Interrupts(config.grace_s)
-        stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
-        stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once
-        processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
-        from millrace.learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
-
-        with interrupts, one_thread():
-            setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
-            lobby = Lobby(endpoint.link, processes, lobby_settings(config, config.steps))
-            run = open_run(setup, lobby, watch, observer)
-            # The learner's own endpoint is inproc: `millrace status` asks where the workers join.
-            env.hub.status_of_run = run.hub.status
-            run.announce(env.address, config.advertise, listening.endpoint.keyring)
-            run.train(1)
-        return folder.shown
+    copies: VectorEnvSettings
+    lanes: int
+    """number of lanes for rollouts, whose copies come first"""
+    evaluation_copies: int
+    """number of copies for evaluations, which come last"""
+    facts: Sequence[str]
+    """names of the facts that are read"""
+    workers: int
+    """number of workers to wait for before the first step"""
+    no_workers_timeout_s: float
+    device: Callable[[], str]
+    """returns the device of the policy; called once the run begins, because it may import PyTorch"""
 
 
-def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSettings:
-    """The vector environment of a run; `elsewhere`: its workers are started elsewhere."""
-    return VectorEnvSettings(
+def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: int) -> ActingSettings:
+    """Those of a training run, whose workers join at `where` if they are started elsewhere. `workers`: to wait for."""
+    copies = VectorEnvSettings(
         env,
         config.envs,
-        workers=None if elsewhere else config.workers,
+        workers=None if where.bind else config.workers,
         lanes=config.lanes,
-        listen=BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
+        listen=where,
         transport=config.transport,
         timeout_s=_longest_order_s(config),
         worker_timeout_s=config.worker_timeout_s,
         call_timeouts=config.call_timeouts(),
         copy=False,
         single_lanes=config.eval_copies,
+    )
+    return ActingSettings(
+        copies,
+        lanes=config.lanes,
+        evaluation_copies=config.eval_copies,
+        facts=config.info_keys,
+        workers=workers,
+        no_workers_timeout_s=config.no_workers_timeout_s,
+        device=lambda: torch_device(config),
     )
 
 
@@ -96,3 +94,147 @@ def _longest_order_s(config: Config) -> float:
     timeouts = config.call_timeouts()
     each_s = 2 * timeouts.start_s + timeouts.step_s
     return each_s * config.envs if timeouts.start_s and timeouts.step_s else NEVER_S
+
+
+class SteppingPool:
+    """A pool whose policy acts in a thread of this process. It is a `millrace.launch.worker_pool.WorkerPool`."""
+
+    def __init__(self, settings: ActingSettings, stepping: VectorEnvPool, own: ActingPool, resources: ExitStack) -> None:
+        """`stepping`: where workers step. `own`: where the thread joins. `resources` are released before both are closed."""
+        self._settings = settings
+        self._stepping = stepping
+        self._own = own
+        self._resources = resources
+        self._before: LobbySettings | None = None
+        self._thread: Supervisor | None = None
+        self._env: ZmqVectorEnv | None = None
+
+    @property
+    def bound(self) -> Bound:
+        """Where the workers join that step."""
+        return self._stepping.bound
+
+    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
+        """Start the workers that step; of the crew, as many as there are copies for."""
+        self._before = before
+        return self._stepping.start(crew, before)
+
+    def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
+        """The lobby in which the thread joins."""
+        assert self._before is not None, "start comes first"
+        settings = self._settings
+        env = self._env = self._stepping.vector_env(described)
+        self._resources.callback(env.close)
+        before_wait = _BeforeWaits(env, settings.workers, settings.no_workers_timeout_s)
+        copies = SplitVectorEnv(env, settings.lanes, before_wait, partial(_step_lanes, env), settings.facts, masked=masked)
+        self._thread = self._acting_thread(copies)
+        processes = _ActingProcesses(self._thread, copies, env, self._stepping.expected)
+        return Lobby(self._own.bound.link, processes, self._before)
+
+    def report(self, status: Callable[[float], Status]) -> None:
+        """`millrace status` asks where workers join, and the hub of the run is elsewhere."""
+        assert self._env is not None, "begin comes first"
+        self._env.hub.status_of_run = status
+
+    def stop(self, within_s: float) -> None:
+        """Stop the thread. The workers that step are stopped when the pool is closed."""
+        if self._thread is not None:
+            self._thread.ask_to_leave()  # `stop` asks a second time: then the worker leaves at once
+            self._thread.stop(within_s)
+
+    def _acting_thread(self, copies: SplitVectorEnv) -> Supervisor:
+        evaluation_copies = copies.evaluation_lane(self._settings.evaluation_copies)
+
+        def actors(run: RunSpec) -> Actors:
+            policy = acting_policy(run.policy, self._settings.device(), run.images_dtype)
+            evaluator = Evaluator(run, policy, lambda run, count, render_mode, pulse: evaluation_copies)
+            return Actors(Collector(run, policy, copies.open_lane, copies.step_all), evaluator)
+
+        def start(name: str) -> WorkerThread:
+            return WorkerThread(self._own.bound.link.address, name, self._own.bound.context, actors)
+
+        return Supervisor(start, 1, prefix="inference")
+
+
+@contextmanager
+def open_stepping_pool(settings: ActingSettings) -> Iterator[SteppingPool]:
+    """Bind the address where workers join that only step. Raises `UsageError`."""
+    with open_worker_pool(BindSettings(), "inproc") as own, ExitStack() as of_env, ExitStack() as resources:
+        pool = SteppingPool(settings, open_vector_env_pool(settings.copies, of_env), own, resources)
+        resources.callback(lambda: pool.stop(AT_ONCE_S))
+        yield pool
+
+
+class _ActingProcesses(WorkerProcesses):
+    """The thread that acts, and the workers that step for it."""
+
+    def __init__(self, thread: Supervisor, copies: SplitVectorEnv, env: ZmqVectorEnv, expected: int) -> None:
+        """`expected`: number of workers that were started here to step."""
+        self.expected = expected
+        self._thread = thread
+        self._copies = copies
+        self._hub = env.hub
+        self._failures: list[Failed] = []
+        env.hub.on_death = self._failures.append
+
+    def ended(self) -> Sequence[WorkerExit | StartFailed]:
+        self._copies.raise_if_no_workers()
+        return self._thread.poll()
+
+    def activities(self) -> Sequence[WorkerActivity]:
+        return self._thread.activities()
+
+    def stepping(self) -> Sequence[Member]:
+        return list(self._hub.coordinator.members.values())
+
+    def take_failures(self) -> Sequence[Failed]:
+        failures = self._failures.copy()
+        self._failures.clear()
+        return failures
+
+
+def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> GymnasiumStep:
+    """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
+    env.step_async(actions, lanes)
+    return env.step_wait()
+
+
+def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
+    """The policy that acts. If numpy can compute it, it runs in numpy on the CPU and gives the same bits as on a worker.
+
+    Otherwise it runs in torch on the device, for all lanes in one pass.
+    """
+    if device == "cpu" and not spec.needs_torch:
+        return make_policy(spec)
+    from millrace.protocol.policy.torch_policy import TorchPolicy
+
+    return TorchPolicy(spec, device, together=True, images=images)
+
+
+class _BeforeWaits:
+    """Call it before each wait for `env`: it calls the pulse during the wait. The first wait is for workers to join.
+
+    Rule: a wait raises `NoWorkers` once no worker has been there for `timeout_s`, however long an order may take.
+    """
+
+    def __init__(self, env: ZmqVectorEnv, workers: int, timeout_s: float) -> None:
+        self._env = env
+        self._workers = workers
+        self._timeout_s = timeout_s
+        self._there_s = 0.0  # when a worker was there, or the wait began
+
+    def __call__(self, pulse: Pulse) -> None:
+        """A wait begins."""
+        self._there_s = monotonic()
+        self._env.hub.while_waiting = partial(self._during, pulse)
+        if self._workers:
+            self._env.hub.wait_for(self._workers, self._timeout_s)
+            self._workers = 0
+
+    def _during(self, pulse: Pulse) -> None:
+        pulse()
+        now = monotonic()
+        if self._env.hub.coordinator.members:
+            self._there_s = now
+        elif now - self._there_s > self._timeout_s:
+            raise self._env.hub.no_workers(self._timeout_s)

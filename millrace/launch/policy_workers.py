@@ -1,29 +1,27 @@
-"""Workers that play the episodes of a saved policy: processes of this machine, or workers that join from elsewhere.
-
-Rule: whatever happens, no worker, socket file or temporary folder is left behind.
-"""
+"""Workers that play the episodes of a saved policy: processes of this machine, or workers that join from elsewhere."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from millrace.launch.acting_thread import NEVER_S, acting_processes, acting_thread, lanes_of
-from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import FlagsOfWorker
-from millrace.launch.vector import listen
+from millrace.launch.crew import Crew
+from millrace.launch.learner_inference import NEVER_S, ActingSettings, open_stepping_pool
+from millrace.launch.worker_pool import WorkerPool, open_worker_pool
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.conversations import lobby_settings
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.members.lobby import Lobby
+from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy
 from millrace.learner.torch_setup import one_thread
 from millrace.learner.vector_env.settings import VectorEnvSettings
+
+STOP_WITHIN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -55,10 +53,14 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
             if interrupts.received:
                 raise KeyboardInterrupt
 
+        pool = stack.enter_context(_pool(policy, which))
+        lobby = pool.start(Crew(which.workers, logs=_log_folder(which, stack)), lobby_settings(which.settings))
+        described = None
         if which.inference == "learner":
-            player = _acting_player(policy, which, check_interrupt, watch, stack)
-        else:
-            player = _player(policy, which, check_interrupt, watch, stack)
+            described = lobby.describe(Unknown(policy.env.for_evaluation()), check_interrupt)
+            lobby = pool.begin(described, masked=policy.masked)
+        stack.callback(pool.stop, STOP_WITHIN_S)
+        player = PolicyPlayer(policy, lobby, check_interrupt, watch, which.settings, described)
         reason = "all episodes played"
         try:
             yield player
@@ -69,37 +71,18 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
             player.leave(reason)
 
 
-def _player(
-    policy: SavedPolicy,
-    which: PlayingWorkers,
-    check_interrupt: Callable[[], None],
-    watch: Callable[[str], None],
-    stack: ExitStack,
-) -> PolicyPlayer:
-    """A player whose workers act."""
-    endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
-    started = endpoint.workers(which.workers, _own_logs(which, stack), 2.0)
-    _, processes = stack.enter_context(started)
-    lobby = Lobby(endpoint.link, processes, lobby_settings(which.settings))
-    return PolicyPlayer(policy, lobby, check_interrupt, watch, which.settings)
-
-
-def _acting_player(
-    policy: SavedPolicy,
-    which: PlayingWorkers,
-    check_interrupt: Callable[[], None],
-    watch: Callable[[str], None],
-    stack: ExitStack,
-) -> PolicyPlayer:
-    """A player that acts itself, in a thread: its workers step the copies of a vector environment, each a lane."""
-    endpoint = open_endpoint(BindSettings(), "inproc", stack)
-    workers, settings = None if which.bind else min(which.workers, which.copies), which.settings
+def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[WorkerPool]:
+    where = BindSettings(which.bind)
+    if which.inference == "workers":
+        return open_worker_pool(where, which.transport)
+    workers = None if which.bind else min(which.workers, which.copies)
+    settings = which.settings
     copies = VectorEnvSettings(
         policy.env.for_evaluation(),
         which.copies,
         workers,
         which.copies,
-        BindSettings(which.bind),
+        where,
         which.transport,
         timeout_s=NEVER_S,
         worker_timeout_s=settings.worker_timeout_s,
@@ -107,21 +90,18 @@ def _acting_player(
         copy=False,
         evaluates=True,
     )
-    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(which, stack), lobby_settings(settings))
-    described = started.describe(check_interrupt)
-    env = started.vector_env(described)
-    stack.callback(env.close)
-    lanes = lanes_of(env, 0, policy.facts, workers or 1, settings.no_workers_timeout_s, masked=policy.masked)
-    thread = acting_thread(endpoint, lanes, lanes.evaluation_lane(which.copies), lambda: "cpu")
-    stack.callback(thread.stop, 2.0)
-    processes = acting_processes(thread, lanes, env, workers or 0)
-    lobby = Lobby(endpoint.link, processes, lobby_settings(settings))
-    return PolicyPlayer(policy, lobby, check_interrupt, watch, settings, described)
+    acting = ActingSettings(
+        copies,
+        lanes=0,
+        evaluation_copies=which.copies,
+        facts=policy.facts,
+        workers=workers or 1,
+        no_workers_timeout_s=settings.no_workers_timeout_s,
+        device=lambda: "cpu",
+    )
+    return open_stepping_pool(acting)
 
 
-def _own_logs(which: PlayingWorkers, stack: ExitStack) -> FlagsOfWorker:
-    """No flags, and for each worker that is started here a log in a folder that is removed at the end."""
-    if which.bind:
-        return lambda name: ([], None)
-    logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))
-    return lambda name: ([], logs / f"{name}.log")
+def _log_folder(which: PlayingWorkers, stack: ExitStack) -> Path | None:
+    """A folder for the logs of workers that are started here, which is removed at the end."""
+    return None if which.bind else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))

@@ -9,16 +9,17 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 from gymnasium.vector import AutoresetMode
 
 from millrace.arguments import checked
-from millrace.launch.endpoint import Endpoint, StartedWorkers, open_endpoint
-from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, FlagsOfWorker, no_flags
+from millrace.launch.crew import Crew, InheritedByWorkers
+from millrace.launch.worker_pool import ActingPool, open_worker_pool
+from millrace.learner.members.bound import Bound
 from millrace.learner.members.events import Failed
 from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.lobby import Lobby, LobbySettings
@@ -35,8 +36,8 @@ from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError
 from millrace.protocol.machine.cpu_cores import usable_cores
-from millrace.protocol.specs import WaitSpec
-from millrace.protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
+from millrace.protocol.specs import StepSpec, WaitSpec
+from millrace.protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
 from millrace.protocol.wire.wake_up import SPIN_S, WakePipe
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
@@ -159,8 +160,9 @@ def make_vec(
     )
     resources = ExitStack()
     try:
-        started = listen(settings, resources).start(no_flags, before)
-        made = started.vector_env(started.describe())
+        pool = open_vector_env_pool(settings, resources)
+        lobby = pool.start(Crew(), before)
+        made = pool.vector_env(lobby.describe(pool.requested.to_describe))
         made.hub.on_death = died
         made.hub.while_waiting = deaths.check
         made.hub.wait_for(local_workers or settings.lane_count, join_timeout_s)
@@ -173,95 +175,84 @@ def make_vec(
         raise
 
 
-@dataclass(frozen=True)
-class InheritedByWorkers:
-    """Shared memory and wake pipes, which local workers inherit before the sizes of the arrays are known."""
+class VectorEnvPool:
+    """The pool of a vector environment, which is made once one of its workers has described the environment."""
 
-    memory_fd: int
-    to_workers: Mapping[str, WakePipe]
-    """the pipe that wakes each worker, by its name"""
-    to_learner: WakePipe
-    """one for all workers: the last worker to finish a step writes to it"""
+    def __init__(
+        self, settings: VectorEnvSettings, requested: RequestedCopies, pool: ActingPool, resources: ExitStack
+    ) -> None:
+        """Closing `resources` closes the pool."""
+        self.requested = requested
+        self._settings = settings
+        self._pool = pool
+        self._resources = resources
+        self._inherited = self._new_inherited()
 
-    def close(self) -> None:
-        """Close all file descriptors. The memory is freed with its last view."""
-        os.close(self.memory_fd)
-        for pipe in (*self.to_workers.values(), self.to_learner):
-            pipe.close()
+    @property
+    def bound(self) -> Bound:
+        """The address where workers join, and who may."""
+        return self._pool.bound
 
+    @property
+    def expected(self) -> int:
+        """Number of workers that are started here."""
+        return self._settings.local_workers
 
-@dataclass(frozen=True)
-class ListeningVectorEnv:
-    """A vector environment whose address is bound. Its local workers have not been started."""
-
-    settings: VectorEnvSettings
-    requested: RequestedCopies
-    endpoint: Endpoint
-    inherited: InheritedByWorkers | None
-    """For local workers only."""
-    resources: ExitStack
-
-    def start(self, flags: FlagsOfWorker, before: LobbySettings) -> StartedVectorEnv:
-        """Start the local workers with these flags. `before`: settings until they are all there. Call it once."""
-        # They are stopped at once if there will be no hub to close.
-        started = self.endpoint.workers(self.settings.local_workers, flags, LEAVE_AT_ONCE_S, self._handed)
-        workers = self.resources.enter_context(started)
-        lobby = Lobby(self.endpoint.link, workers.processes, replace(before, wait=self.requested.wait))
-        return StartedVectorEnv(self, workers, lobby)
-
-    def _handed(self, worker: str) -> InheritedDescriptors | None:
-        """The file descriptors that this worker inherits."""
-        if self.inherited is None:
-            return None
-        to_worker, to_learner = self.inherited.to_workers[worker].read_fd, self.inherited.to_learner.write_fd
-        return InheritedDescriptors(self.inherited.memory_fd, to_worker, to_learner)
-
-
-@dataclass(frozen=True)
-class StartedVectorEnv:
-    """A vector environment whose local workers were started. They have not necessarily joined."""
-
-    listening: ListeningVectorEnv
-    workers: StartedWorkers
-    lobby: Lobby
-
-    def describe(self, check_interrupt: Callable[[], None] = lambda: None) -> DescribedEnv:
-        """Have a worker describe the environment. Raises `UserFacingError`, and what `check_interrupt` raises."""
-        return self.lobby.describe(self.listening.requested.to_describe, check_interrupt)
+    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
+        """Start the workers, as many as the settings say, with the logs and cores of this crew. Call it once."""
+        crew = replace(crew, count=self.expected, inherited=self._inherited)
+        return self._pool.start(crew, replace(before, wait=self.requested.wait))
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
         """The vector environment. Call it once; it does not wait until workers have joined."""
-        listening, inherited, settings = self.listening, self.listening.inherited, self.listening.settings
-        description = listening.requested.description(described)
-        shared = None
-        if inherited is not None:
-            memory = SharedMemory(description.step, inherited.memory_fd, resize=True)
-            spin_s = SPIN_S if settings.local_workers < usable_cores() else 0.0  # only if one core is free for the learner
-            shared = SharedSteps(memory, inherited.to_workers, inherited.to_learner, spin_s)
+        settings = self._settings
+        lobby = self._pool.lobby
+        assert lobby is not None, "start comes first"
+        description = self.requested.description(described)
         hub = StepHub(
-            listening.endpoint.link,
+            self.bound.link,
             description.step,
-            first_session=self.lobby.first_session,
-            local_workers=self.workers.supervisor,
-            processes=self.workers.processes,
-            shared=shared,
+            first_session=lobby.first_session,
+            processes=self._pool.processes,
+            shared=self._shared_steps(description.step),
             worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
         )
-        listening.resources.callback(hub.close, CLOSE_TIMEOUT_S)
-        hub.take_over(self.lobby.hand_over())
+        self._resources.callback(hub.close, CLOSE_TIMEOUT_S)
+        hub.take_over(lobby.hand_over())
         return ZmqVectorEnv(
             description,
             hub,
             timeout_s=settings.timeout_s,
             on_worker_loss=settings.on_worker_loss,
             copy=settings.copy,
-            on_close=listening.resources.close,
+            on_close=self._resources.close,
         )
 
+    def _new_inherited(self) -> InheritedByWorkers | None:
+        """Shared memory, if local processes can use it."""
+        settings = self._settings
+        if not (settings.shared_memory and SUPPORTED and self.expected) or settings.transport == "inproc":
+            return None
+        pipes = {f"w{n}": WakePipe() for n in range(self.expected)}
+        inherited = InheritedByWorkers(new_memory(), pipes, WakePipe())
+        self._resources.callback(inherited.close)
+        return inherited
 
-def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVectorEnv:
-    """Bind the address. Closing `resources`, or the environment that is started, releases all that was acquired."""
-    where, transport, count = settings.listen, settings.transport, settings.local_workers
+    def _shared_steps(self, spec: StepSpec) -> SharedSteps | None:
+        inherited = self._inherited
+        if inherited is None:
+            return None
+        memory = SharedMemory(spec, inherited.memory_fd, resize=True)
+        spin_s = SPIN_S if self.expected < usable_cores() else 0.0  # only if one core is free for the learner
+        return SharedSteps(memory, inherited.to_workers, inherited.to_learner, spin_s)
+
+
+def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> VectorEnvPool:
+    """Bind the address. Closing `resources`, or the environment that is made, releases all that was acquired.
+
+    Raises `UsageError`.
+    """
+    where = settings.listen
     if where.bind and settings.workers:
         raise UsageError(f"workers: expected 0, got {settings.workers}; with a bind address, start the workers yourself")
     # Local workers end with this process, and this process notices at once if one of them ends. So no timeout is needed.
@@ -269,12 +260,8 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     if where.bind:
         check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
     code = next((env.called_code for env in requested.envs if env.called_code), "")
-    endpoint = open_endpoint(where, transport, resources, code)
-    inherited = None
-    if settings.shared_memory and SUPPORTED and count and transport != "inproc":
-        inherited = InheritedByWorkers(new_memory(), {f"w{n}": WakePipe() for n in range(count)}, WakePipe())
-        resources.callback(inherited.close)
-    return ListeningVectorEnv(settings, requested, endpoint, inherited, resources)
+    pool = resources.enter_context(open_worker_pool(where, settings.transport, code))
+    return VectorEnvPool(settings, requested, pool, resources)
 
 
 def _call_timeouts(timeout_s: float) -> CallTimeouts:

@@ -13,7 +13,7 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.conversations import lobby_settings
 from millrace.learner.members.lobby import Lobby
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.run_folder.run_folder import RunFolder
@@ -29,6 +29,7 @@ from millrace.protocol.wire.codec import Buffer, decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.fake_processes import FakeProcesses
 from tests.support.in_process.saved_policies import load_policy, policy_run
 
 
@@ -63,7 +64,7 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     assert saved_policy(folder.path).facts == ("of_card",)
 
 
-def lobby(link: FakeLink, processes: ProcessCallbacks) -> Lobby:
+def lobby(link: FakeLink, processes: WorkerProcesses) -> Lobby:
     return Lobby(cast(LearnerLink, link), processes, lobby_settings(RolloutConfig()))
 
 
@@ -92,7 +93,10 @@ class FourWorkers(FakeLink):
     def player(self, max_env_failures: int) -> PolicyPlayer:
         run = run_spec()
         policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
-        processes, settings = ProcessCallbacks(self.ended, expected=4), RolloutConfig(max_env_failures=max_env_failures)
+        processes, settings = (
+            FakeProcesses(of_ended=self.ended, expected=4),
+            RolloutConfig(max_env_failures=max_env_failures),
+        )
         return PolicyPlayer(policy, lobby(self, processes), lambda: None, lambda text: None, settings)
 
 
@@ -127,7 +131,7 @@ def test_an_episode_that_does_not_end_is_shown_with_its_env_steps_and_their_boun
             raise KeyboardInterrupt
 
     policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
-    player = PolicyPlayer(policy, lobby(Endless(), ProcessCallbacks()), stop, shown.append, RolloutConfig())
+    player = PolicyPlayer(policy, lobby(Endless(), WorkerProcesses()), stop, shown.append, RolloutConfig())
     with pytest.raises(KeyboardInterrupt):
         player.play(EvaluationPlan.of(2, seed=5, copies=2, max_steps=100_000), bound="--max-steps:", before=(3, 500))
     assert shown[-1] == "3 of 5 episodes, 31,500 env steps (--max-steps: 50,000 each)"

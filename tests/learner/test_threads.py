@@ -15,7 +15,7 @@ import torch
 from msgspec.structs import replace
 
 import millrace
-from millrace.launch.local_worker_options import worker_cores
+from millrace.launch.crew import worker_cores
 from millrace.learner import torch_setup
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.config.costs import minibatch_rows

@@ -18,7 +18,7 @@ import pytest
 
 import millrace
 from millrace.arguments import plain
-from millrace.launch import learner_inference, policy_workers, rollouts, training, vector
+from millrace.launch import policy_workers, rollouts, training, vector
 from millrace.launch.private_address import private_address
 from millrace.learner.members.bound import bind
 from tests.support.users_code import own_policies
@@ -37,8 +37,8 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def started(*arguments: object) -> None:
         raise Started
 
-    for module in (learner_inference, training, policy_workers, rollouts, vector):
-        monkeypatch.setattr(module, "open_endpoint", started)
+    for module in (training, policy_workers, rollouts, vector):
+        monkeypatch.setattr(module, "open_worker_pool", started)
     monkeypatch.chdir(tmp_path)
 
 
@@ -272,7 +272,7 @@ def test_a_limit_of_the_system_is_said_in_one_line(monkeypatch: pytest.MonkeyPat
     def too_many_files(*arguments: object) -> None:
         raise OSError(errno.EMFILE, "Too many open files")
 
-    monkeypatch.setattr(vector, "open_endpoint", too_many_files)
+    monkeypatch.setattr(vector, "open_worker_pool", too_many_files)
     with pytest.raises(millrace.UsageError, match=r"^make_vec: a process may have [0-9]+ files open here, which is too few"):
         millrace.make_vec("CartPole-v1", workers=8)
 

@@ -18,7 +18,7 @@ from millrace.learner.members.events import EnvironmentRaised, Failed, WorkerJoi
 from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.members.member_states import TimedOut
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.protocol.alive import NO_SLOT, WorkerActivity
@@ -50,6 +50,7 @@ from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.plain_values import pack
 from tests.support.conversation.fake_ends import run_spec
 from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.fake_processes import FakeProcesses
 
 WAIT = WaitSpec()
 ENV = EnvSpec("Fake-v0")
@@ -367,9 +368,9 @@ class Ends(Exception):
 
 
 def shell(
-    link: FakeLink, check: Callable[[], None] = lambda: None, processes: ProcessCallbacks | None = None
+    link: FakeLink, check: Callable[[], None] = lambda: None, processes: WorkerProcesses | None = None
 ) -> tuple[DescribedEnv, Lobby]:
-    lobby = Lobby(cast(LearnerLink, link), processes or ProcessCallbacks(expected=1), SETTINGS, lambda: link.now)
+    lobby = Lobby(cast(LearnerLink, link), processes or FakeProcesses(expected=1), SETTINGS, lambda: link.now)
     return lobby.describe(Unknown(ENV), check), lobby
 
 
@@ -420,7 +421,7 @@ def test_nobody_comes() -> None:
 def test_a_worker_that_never_answers_stalls_the_start(caplog: pytest.LogCaptureFixture) -> None:
     link = FakeLink()
     saying(link)
-    beat = ProcessCallbacks(lambda: _heartbeats(link), expected=1)
+    beat = FakeProcesses(of_ended=lambda: _heartbeats(link), expected=1)
     with pytest.raises(Stalled, match=r"no description of the environment within 100 s; worker w0 on host: "):
         shell(link, processes=beat)
     lines = [record.getMessage() for record in caplog.records if "no env steps" in record.getMessage()]
@@ -433,7 +434,7 @@ def test_a_worker_that_never_answers_stalls_the_start(caplog: pytest.LogCaptureF
 def test_what_the_workers_do_and_write_is_told_before_any_has_joined(caplog: pytest.LogCaptureFixture) -> None:
     link = FakeLink()
     making = WorkerActivity("w0", 1, "making", 28.0, 0)
-    processes = ProcessCallbacks(running=lambda: [making], said=lambda: {"w0": "no licence yet"}, expected=1)
+    processes = FakeProcesses(of_activities=lambda: [making], of_last_lines={"w0": "no licence yet"}, expected=1)
     with pytest.raises(NoWorkers):
         shell(link, processes=processes)
     told = [record.getMessage() for record in caplog.records if "no env steps" in record.getMessage()]

@@ -20,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.cli.status import as_table
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
@@ -55,7 +56,6 @@ from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollo
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.conversation.hostile_messages import hostile, real
 from tests.support.examples import examples
-from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 HOSTILE = "spare"
 SECRET_NONCE = 0x5EC2E7_5EC2E7  # of honest workers: nobody but a worker's supervisor and the learner knows it
@@ -204,7 +204,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
         cast(LearnerLink, link),
         SPEC,
         first_session=1,
-        local_workers=NO_LOCAL_WORKERS,
+        processes=WorkerProcesses(),
         worker_timeout_s=3.0,
         clock=lambda: link.now,
     )

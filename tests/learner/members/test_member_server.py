@@ -20,7 +20,7 @@ from millrace.learner.members.member_server import (
     MemberServer,
     ServerSettings,
 )
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.learner.vector_env.vector_env_status import status
@@ -30,7 +30,7 @@ from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heart
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.conversation.fake_link import FakeLink
-from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
+from tests.support.in_process.fake_processes import FakeProcesses
 
 TIMEOUT_S, POLL_S = 5.0, 0.1
 
@@ -46,7 +46,7 @@ class Served:
         self.asked = 0
         self.coordinator = OrderCoordinator(SPEC, 1, TIMEOUT_S)
         link = cast(LearnerLink, self.link)
-        processes = ProcessCallbacks(self._ended, self._running, left=self._left)
+        processes = FakeProcesses(of_ended=self._ended, of_activities=self._running, of_left=self._left)
         self.server = MemberServer(link, self.coordinator, self, processes, settings, lambda: self.link.now)
         self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
         self.server.listen(POLL_S)
@@ -155,7 +155,7 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
         cast(LearnerLink, link),
         SPEC,
         first_session=1,
-        local_workers=NO_LOCAL_WORKERS,
+        processes=WorkerProcesses(),
         worker_timeout_s=TIMEOUT_S,
         clock=lambda: link.now,
     )

@@ -11,7 +11,7 @@ import pytest
 
 from millrace.learner.members.held_up import LONG_S
 from millrace.learner.members.member import Member
-from millrace.learner.members.process_callbacks import ProcessCallbacks
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -24,12 +24,13 @@ from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.fake_processes import FakeProcesses
 
 WORKER_TIMEOUT_S = 3.0
 
 
 def hub_with_a_worker(
-    acting_dtype: ActingDtype = "float32", processes: ProcessCallbacks | None = None, lanes: int = 1
+    acting_dtype: ActingDtype = "float32", processes: WorkerProcesses | None = None, lanes: int = 1
 ) -> tuple[FakeLink, Hub, Heartbeat]:
     link = FakeLink()
     coordinator = TicketCoordinator(run_spec(lanes), max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
@@ -151,7 +152,7 @@ def test_a_wait_for_an_evaluation_without_env_steps_names_who_is_waited_for(
 
 def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
     link, hub, heartbeat = hub_with_a_worker(
-        processes=ProcessCallbacks(stepping=lambda: [Member(b"w9", w9, 1, 0, heard_s=link.now)])
+        processes=FakeProcesses(of_stepping=lambda: [Member(b"w9", w9, 1, 0, heard_s=link.now)])
     )
     w9 = Hello(PROTOCOL_VERSION, "w9", "far", 1, 1, "fake", 1)
     hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))

@@ -12,7 +12,6 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.conversations import lobby_settings, open_hub
 from millrace.learner.members.events import Failed, PolicyRaised, WorkerLeft, WorkerProcessFailed
 from millrace.learner.members.lobby import Lobby
-from millrace.learner.members.process_callbacks import ProcessCallbacks
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
 from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
@@ -22,6 +21,7 @@ from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec, spoiled
 from tests.support.conversation.fake_link import FakeLink
+from tests.support.in_process.fake_processes import FakeProcesses
 
 A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
 NONCE = 1000 * len("host") + 1  # as `Learner.joins` makes it
@@ -375,7 +375,7 @@ def test_with_a_limit_of_copies_as_few_workers_play_evaluations_as_it_allows(mos
 
 @pytest.mark.parametrize(("of_run", "of_machine", "least"), [(0, 0, 0), (9, 0, 9), (0, 7, 7), (9, 7, 7), (7, 9, 7)])
 def test_a_run_keeps_within_its_own_limit_of_copies_and_its_machine_s(of_run: int, of_machine: int, least: int) -> None:
-    config, processes = RolloutConfig(max_env_copies=of_run), ProcessCallbacks(most_copies=of_machine)
+    config, processes = RolloutConfig(max_env_copies=of_run), FakeProcesses(most_copies=of_machine)
     lobby = Lobby(cast(LearnerLink, FakeLink()), processes, lobby_settings(config))
     hub = open_hub(config, run_spec(), lobby, lambda: None)
     assert hub.coordinator.evaluation.most_copies == (least - 4 if least else None)

@@ -15,6 +15,7 @@ from millrace.protocol.random_streams import Purpose
 from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
+from tests.support.in_process.fake_processes import FakeProcesses
 
 A, B = b"a", b"b"
 NO_WORKER = "a worker to join at tcp://box:5555 (the last one was killed by SIGKILL)"
@@ -29,7 +30,9 @@ class Run:
             self.learner.joins(peer, host=f"host-of-{peer.decode()}")
         self.learner.publish(0)
         self.stepping: list[Member] = []
-        self.time = LearnerTime(self.learner.coordinator, self.learner.now, lambda: NO_WORKER, lambda: self.stepping)
+        self.time = LearnerTime(
+            self.learner.coordinator, self.learner.now, lambda: NO_WORKER, FakeProcesses(of_stepping=lambda: self.stepping)
+        )
 
     def turn(self, phase: Phase, after_s: float = 0.0) -> None:
         self.learner.now += after_s

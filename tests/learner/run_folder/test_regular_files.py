@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.launch.local_worker_options import worker_flags
+from millrace.launch.crew import crew_of_run
 from millrace.learner.config.config import Config
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.atomic_write import write_atomically
@@ -78,9 +78,9 @@ def test_a_file_that_is_too_large_is_not_read(run: Path) -> None:
 WRITERS: dict[str, Callable[[Path], object]] = {
     "run.lock": lambda run: RunLock(run).__enter__(),
     "metrics.jsonl": MetricsLog,
-    "workers/w0.log": lambda run: worker_flags(Config(), run),
+    "workers/w0.log": lambda run: crew_of_run(Config(), run),
     "checkpoints": lambda run: checkpoint.save(run, {}, env_steps=1, keep=3),
-    "workers": lambda run: worker_flags(Config(), run),
+    "workers": lambda run: crew_of_run(Config(), run),
     "videos": lambda run: subfolder(run, "videos"),
 }
 

@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 
 from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.lost_lanes import LostLanes
@@ -30,7 +31,6 @@ from millrace.protocol.wire.learner_link import LearnerLink
 from tests.model.settings import TICK_S
 from tests.model.vector_env.order_content import NEW, Copy, executed, make_order, state_in
 from tests.support.conversation.fake_link import FakeLink
-from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping
@@ -79,7 +79,7 @@ class Caller:
         self.oldest = settings.most_ticks
         self.coordinator, self.server = coordinator, Server()
         link, clock = cast(LearnerLink, FakeLink()), lambda: self.now
-        self.hub = StepHub(link, coordinator.spec, first_session=0, local_workers=NO_LOCAL_WORKERS, clock=clock)
+        self.hub = StepHub(link, coordinator.spec, first_session=0, processes=WorkerProcesses(), clock=clock)
         self.hub.coordinator = coordinator
         self.hub._server = self.server  # type: ignore[assignment]
         self.hub._listen_due_s = float("inf")

@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from functools import cache
 from typing import cast
 
+from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.learner.vector_env.shared_steps import SharedSteps
@@ -28,7 +29,6 @@ from millrace.protocol.wire.wake_up import WakePipe
 from millrace.workers.vector_env.stepper import Stepper
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.described import described
-from tests.support.in_process.local_workers import NO_LOCAL_WORKERS
 
 Choose = Callable[[int], int]
 """Chooses one of so many."""
@@ -179,7 +179,7 @@ def any_order(settings: VectorEnvSettings, workers: int, *, shared: bool) -> Ite
             cast(LearnerLink, link),
             description.step,
             first_session=1,
-            local_workers=NO_LOCAL_WORKERS,
+            processes=WorkerProcesses(),
             shared=steps,
             clock=lambda: link.now,
         )

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import gymnasium
 import numpy as np
@@ -23,7 +23,6 @@ import pytest
 
 import millrace
 from millrace.extras.monitoring.report.reported_runs import read_run
-from millrace.launch import learner_inference
 from millrace.launch.training import train
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
@@ -572,15 +571,19 @@ def test_a_local_run_keeps_within_the_env_copies_of_its_machine(monkeypatch: pyt
     """Without room for an evaluation nothing starts. The limit is no setting of the run, which may resume elsewhere."""
     seen: list[int] = []
 
-    def starts(config: Config, *rest: object, elsewhere: bool) -> Path:
-        seen.append(config.max_env_copies)
-        return Path()
+    class Starts(Exception):
+        """The run may start."""
 
-    monkeypatch.setattr(learner_inference, "train", starts)
+    def starts(config: Config, *rest: object, elsewhere: bool) -> NoReturn:
+        seen.append(config.max_env_copies)
+        raise Starts
+
+    monkeypatch.setattr("millrace.launch.training._pool", starts)
     for here, of_run in (("", 0), ("", 9), ("7", 0), ("7", 9), ("7", 6)):
         monkeypatch.setenv(LIMIT_VARIABLE, here)
         config = resolve("CartPole-v1", inference="learner", envs=4, lanes=4, eval_copies=2, max_env_copies=of_run)
-        train(config, None, lambda progress: None)
+        with pytest.raises(Starts):
+            train(config, None, lambda progress: None)
     assert seen == [0, 9, 0, 9, 6]
     monkeypatch.setenv(LIMIT_VARIABLE, "5")
     with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE} 5: expected at least 6, for 4 env copies and 2 that play"):

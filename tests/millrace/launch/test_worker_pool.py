@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import subprocess
-from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
 from millrace.flags.parse import parse_flags
-from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import no_flags
+from millrace.launch.crew import Crew
+from millrace.launch.worker_pool import open_worker_pool
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.conversations import lobby_settings
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.workers import worker_thread
 from millrace.workers.conversation.connection_rules import wait_limits_s
@@ -31,9 +32,8 @@ def test_a_worker_process_waits_for_its_learner_as_long_as_that_does_not_listen(
         return subprocess.Popen(["sh", "-c", "exit 0"], **how)
 
     monkeypatch.setattr(worker_process, "popen", popen)
-    with ExitStack() as stack:
-        endpoint = open_endpoint(BindSettings(), "ipc", stack)
-        stack.enter_context(endpoint.workers(2, no_flags, evaluating=1))
+    with open_worker_pool(BindSettings(), "ipc") as pool:
+        pool.start(Crew(2, evaluating=1), lobby_settings(RolloutConfig()))
     for command, evaluates in zip(commands, (False, True), strict=True):
         flags = parse_flags(WorkerFlags, command[command.index("millrace.workers") + 1 :], "worker")
         assert wait_limits_s(flags.join_timeout_s, stay=flags.stay) == (math.inf, math.inf)
@@ -48,10 +48,9 @@ def test_a_worker_thread_waits_for_its_learner_as_long_as_that_does_not_listen(m
         return Session(who, now, join_timeout_s=join_timeout_s, rejoin_timeout_s=rejoin_timeout_s)
 
     monkeypatch.setattr(worker_thread, "Session", session)
-    with ExitStack() as stack:
-        endpoint = open_endpoint(BindSettings(), "inproc", stack)
-        supervisor, _ = stack.enter_context(endpoint.workers(1, no_flags, WITHIN_S))
-        supervisor.stop(WITHIN_S)
-        supervisor.poll()
-        assert supervisor.count == 0
+    with open_worker_pool(BindSettings(), "inproc") as pool:
+        pool.start(Crew(1), lobby_settings(RolloutConfig()))
+        pool.stop(WITHIN_S)
+        pool.processes.ended()
+        assert not pool.processes.left(collecting=False)
     assert limits == [(math.inf, math.inf)]

@@ -1,0 +1,107 @@
+"""The workers that this program starts for a learner: how many, their flags, their logs and their cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from millrace.learner.config.config import Config
+from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.run_folder.regular_files import open_regular, reason, subfolder
+from millrace.protocol.errors import UsageError
+from millrace.protocol.wire.shared_memory import InheritedDescriptors
+from millrace.protocol.wire.wake_up import WakePipe
+from millrace.workers.conversation.connection_rules import LEARNER_STARTED_IT_S
+from millrace.workers.supervise.supervisor import core_flags
+
+
+@dataclass(frozen=True)
+class InheritedByWorkers:
+    """Shared memory and wake pipes, which local workers inherit before the sizes of the arrays are known."""
+
+    memory_fd: int
+    to_workers: Mapping[str, WakePipe]
+    """the pipe that wakes each worker, by its name"""
+    to_learner: WakePipe
+    """one for all workers: the last worker to finish a step writes to it"""
+
+    def of(self, worker: str) -> InheritedDescriptors:
+        """The file descriptors that this worker inherits."""
+        return InheritedDescriptors(self.memory_fd, self.to_workers[worker].read_fd, self.to_learner.write_fd)
+
+    def close(self) -> None:
+        """Close all file descriptors. The memory is freed with its last view."""
+        os.close(self.memory_fd)
+        for pipe in (*self.to_workers.values(), self.to_learner):
+            pipe.close()
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Which workers to start. They are called w0, w1, and so on."""
+
+    count: int = 0
+    evaluating: int = 0
+    """the last so many of them only evaluate"""
+    logs: Path | None = None
+    """the folder of their logs; None: they write to this process's stderr"""
+    cores: Sequence[int] = ()
+    """the cores that they are pinned to, in turn; empty: they are not pinned"""
+    inherited: InheritedByWorkers | None = None
+
+    def evaluates(self, worker: str) -> bool:
+        """Whether this worker only evaluates."""
+        return int(worker.removeprefix("w")) >= self.count - self.evaluating
+
+    def log_of(self, worker: str) -> Path | None:
+        """The file for what this worker writes to stderr."""
+        return None if self.logs is None else self.logs / f"{worker}.log"
+
+    def descriptors_of(self, worker: str) -> InheritedDescriptors | None:
+        """The file descriptors that this worker inherits."""
+        return None if self.inherited is None else self.inherited.of(worker)
+
+    def flags_of(self, worker: str) -> list[str]:
+        """The flags of this worker's process."""
+        flags = [*core_flags(self.cores, worker), "--join-timeout-s", str(LEARNER_STARTED_IT_S)]
+        if self.evaluates(worker):
+            flags.append("--evaluate")
+        if (descriptors := self.descriptors_of(worker)) is not None:
+            flags += ["--handed", ",".join(map(str, descriptors))]
+        return flags
+
+
+def crew_of_run(config: Config, run: Path) -> Crew:
+    """The workers of a run on this machine, whose logs are in the run folder. Raises `UsageError` if they can't be there."""
+    count = config.workers + config.eval_workers
+    if config.transport == "inproc":
+        return Crew(count, config.eval_workers)
+    cores = [] if config.eval_workers else worker_cores(config)
+    return Crew(count, config.eval_workers, _log_folder(run), cores)
+
+
+def _log_folder(run: Path) -> Path:
+    """The folder of the workers' logs, which are files of ours, or are made."""
+    try:
+        logs = subfolder(run, "workers")
+        for log in logs.glob("*.log"):
+            os.close(open_regular(log))
+    except OSError as error:
+        raise UsageError(f"{error.filename}: {reason(error)}; the workers' logs go there: remove it") from error
+    return logs
+
+
+def worker_cores(config: RolloutConfig) -> list[int]:
+    """The cores that local workers are pinned to, in turn; empty if they are not pinned.
+
+    New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
+    leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they are not
+    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run. Nor are
+    they with a lag, where it gains nothing.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return []
+    cores = sorted(os.sched_getaffinity(0))
+    return cores if config.max_lag == 0 and config.workers % len(cores) == 0 else []

@@ -1,0 +1,168 @@
+"""The pool of workers of a learner: they are started here, or join from elsewhere.
+
+The order is: open the pool, which binds its address; `start` its workers, or log how one is started elsewhere; let a worker
+in the lobby describe the environment; `begin` with those who collect.
+
+Rule: whatever happens, no worker, thread, socket file or folder of ours outlives its pool. When a pool is closed, workers
+that still run are stopped at once. So whoever has let them work calls `stop` first, with the time that they may take.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Protocol
+
+from millrace.launch.crew import Crew
+from millrace.launch.private_address import private_address
+from millrace.learner.members.bound import Bound, bind, listen
+from millrace.learner.members.lobby import Lobby, LobbySettings
+from millrace.learner.members.who_may_connect import BindSettings, generate_run_keys
+from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.keys.key_folder import Keyring, chosen_key_folder
+from millrace.protocol.keys.keys import Token
+from millrace.protocol.messages import Status
+from millrace.workers.machine_slots import copies_per_machine
+from millrace.workers.supervise.supervisor import Running, Supervisor
+from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from millrace.workers.worker_thread import WorkerThread
+
+AT_ONCE_S = 0.5  # a worker in the constructor of its environment hears nothing
+
+
+class WorkerPool(Protocol):
+    """The workers of a learner. The policy acts in them, or in this process (`learner_inference.py`)."""
+
+    @property
+    def bound(self) -> Bound:
+        """The address where workers join, and who may."""
+        ...
+
+    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
+        """Start these workers, or say how one is started elsewhere. Call it once.
+
+        `before`: settings that hold until the run begins.
+        """
+        ...
+
+    def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
+        """The run may begin. Returns the lobby of those who collect for it. Call it once.
+
+        `described`: the environment, as one in the first lobby described it. `masked`: whether masks are used.
+        """
+        ...
+
+    def report(self, status: Callable[[float], Status]) -> None:
+        """From now on, `millrace status` gets the answer of the run."""
+        ...
+
+    def stop(self, within_s: float) -> None:
+        """Ask all that was started here to leave, and end what still runs after this time."""
+        ...
+
+
+@dataclass
+class ActingPool:
+    """A pool whose workers act."""
+
+    bound: Bound
+    where: BindSettings
+    """Where workers from elsewhere join, if they do."""
+    token: Token | None
+    """Token of local workers."""
+    processes: WorkerProcesses = field(default_factory=WorkerProcesses)
+    """The workers that were started here."""
+    lobby: Lobby | None = None
+    """Once they were."""
+
+    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
+        """The lobby of the workers. None is started here if they join at `where`."""
+        if self.where.bind:
+            self.bound.announce(self.where.advertise)
+        else:
+            self.processes = _LocalProcesses(crew, lambda name: self._started(crew, name))
+        self.lobby = Lobby(self.bound.link, self.processes, before)
+        return self.lobby
+
+    def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
+        """The same lobby: these workers collect."""
+        assert self.lobby is not None, "start comes first"
+        return self.lobby
+
+    def report(self, status: Callable[[float], Status]) -> None:
+        """Nothing is to do: the hub of the run answers at this address."""
+
+    def stop(self, within_s: float) -> None:
+        """Stop the workers that were started here."""
+        self.processes.stop(within_s)
+
+    def _started(self, crew: Crew, name: str) -> Running:
+        """A worker: a thread of this process if the address is within it, else a process."""
+        address = self.bound.link.address
+        if address.startswith("inproc://"):
+            return WorkerThread(address, name, self.bound.context, evaluates=crew.evaluates(name))
+        inherited = crew.descriptors_of(name) or ()
+        return WorkerProcess(WorkerCommand(address, name, crew.log_of(name), self.token, crew.flags_of(name), inherited))
+
+
+@contextmanager
+def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Iterator[ActingPool]:
+    """Bind `where.bind`, or without one an address of this transport for local workers.
+
+    `code`: as of `millrace.learner.members.bound.bind`. Raises `UsageError`.
+    """
+    with ExitStack() as resources:
+        if where.bind:
+            token = None
+            bound = listen(where, resources, code)
+        else:
+            keyring, token = _temporary_keys(transport, where.keys, insecure=where.insecure)
+            bound = bind(private_address(transport, resources), keyring, resources, code)
+        pool = ActingPool(bound, where, token)
+        resources.callback(lambda: pool.stop(AT_ONCE_S))
+        yield pool
+
+
+def _temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
+    """Keys for this run only, if it uses TCP and a key folder was named; else None."""
+    encrypted = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
+    return generate_run_keys("local", datetime.now(UTC)) if encrypted else (None, None)
+
+
+class _LocalProcesses(WorkerProcesses):
+    """The processes or threads of a crew."""
+
+    def __init__(self, crew: Crew, start: Callable[[str], Running]) -> None:
+        """Starts them all. `start`: starts the worker of this name."""
+        self.expected = crew.count
+        self.most_copies = copies_per_machine() if crew.count else 0
+        self._crew = crew
+        self._supervisor = Supervisor(start, crew.count)
+
+    def ended(self) -> Sequence[WorkerExit | StartFailed]:
+        return self._supervisor.poll()
+
+    def activities(self) -> Sequence[WorkerActivity]:
+        return self._supervisor.activities()
+
+    def last_lines(self) -> Mapping[str, str]:
+        return self._supervisor.said()
+
+    def left(self, *, collecting: bool) -> float:
+        if not self.expected:  # none was asked for: others join
+            return math.inf
+        return sum(not (collecting and self._crew.evaluates(name)) for name in self._supervisor.names)
+
+    def kill(self, worker: str) -> bool:
+        return self._supervisor.kill(worker)
+
+    def stop(self, timeout_s: float) -> None:
+        self._supervisor.stop(timeout_s)
+
+    def lower_priority(self) -> None:
+        self._supervisor.lower_priority()
