@@ -188,12 +188,12 @@ class ActorCritic(GradientDescent):
         """The rows of a minibatch with the network's outputs: a pass of the network, and the distribution on top.
 
         The logits of actions that are not allowed become -1e30. A Box has a normal distribution that is not clipped. A small
-        network on the CPU computes the same in numpy (`kernels.networks`).
+        network on the CPU computes the same in numpy (`kernels/trained_networks.py`).
         """
-        features, images, action, log_prob, raw, target, recurrent, mask = minibatch
-        outputs = self.net.evaluate(features, images, recurrent, action, mask)
-        advantage = losses.standardized(raw) if self.standardizes_advantages() else raw
-        return LossInput(action, log_prob, advantage, raw, target, *outputs)
+        rows = minibatch
+        outputs = self.net.evaluate(rows.features, rows.images, rows.recurrent, rows.action, rows.mask)
+        advantage = losses.standardized(rows.advantage) if self.standardizes_advantages() else rows.advantage
+        return LossInput(rows.action, rows.log_prob, advantage, rows.advantage, rows.target, *outputs)
 
     def count_update(self, batch: Batch, epochs: int) -> None:
         """Count an update of `epochs` epochs with this batch: steps and versions. Its observation statistics take effect."""

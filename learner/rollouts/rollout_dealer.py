@@ -160,7 +160,7 @@ class RolloutDealer:
         if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:
             expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
             got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
-            raise BadRollout(f"expected {expects}, got {got}")
+            raise BadRollout(f"numbers: expected {expects}, got {got}")
         self.ledger.transitions_received += rollout.env_steps
         self._end(member, ticket).arrived(rollout.sequence)
         member.has_stepped()

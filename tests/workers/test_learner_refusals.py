@@ -400,7 +400,7 @@ NO_ENVIRONMENT_CAN: dict[str, str] = {
     "rows of ticket {}: expected an episode below {}, got {}": COUNTS,
     "expected {} episodes, got {} and {} marks of cut ones": COUNTS,
     "expected the opponents {}, got {}": "the order names them",
-    "ticket {}: expected {}, got {}": "the ticket names the lane, the version and the sequence",
+    "numbers: expected {}, got {}": "the ticket names the lane, the version and the sequence",
     "answer: expected one from lane {}, got one from lane {}": "the order names the lane",
     "answer to {}: expected {}, got {}": "the kind of answer follows from the order",
     "results: expected a list of {}, got {}": "the worker makes the list",

@@ -832,7 +832,9 @@ def test_what_becomes_of_each_rollout_is_an_event() -> None:
     assert learner.coordinator.events == [
         RolloutArrived("a", 0, 0),
         RolloutRejected(A, f"rollout of ticket 1: {NOT_FINITE}"),
-        RolloutRejected(A, "rollout of ticket 2: expected lane 0, version 1, sequence 2, got lane 0, version 1, sequence 0"),
+        RolloutRejected(
+            A, "rollout of ticket 2: numbers: expected lane 0, version 1, sequence 2, got lane 0, version 1, sequence 0"
+        ),
     ]
 
 
