@@ -190,10 +190,11 @@ class ActorCritic(GradientDescent):
         The logits of actions that are not allowed become -1e30. A Box has a normal distribution that is not clipped. A small
         network on the CPU computes the same in numpy (`kernels/trained_networks.py`).
         """
-        rows = minibatch
-        outputs = self.net.evaluate(rows.features, rows.images, rows.recurrent, rows.action, rows.mask)
-        advantage = losses.standardized(rows.advantage) if self.standardizes_advantages() else rows.advantage
-        return LossInput(rows.action, rows.log_prob, advantage, rows.advantage, rows.target, *outputs)
+        action = minibatch.action
+        outputs = self.net.evaluate(minibatch.features, minibatch.images, minibatch.recurrent, action, minibatch.mask)
+        raw = minibatch.advantage
+        advantage = losses.standardized(raw) if self.standardizes_advantages() else raw
+        return LossInput(action, minibatch.log_prob, advantage, raw, minibatch.target, *outputs)
 
     def count_update(self, batch: Batch, epochs: int) -> None:
         """Count an update of `epochs` epochs with this batch: steps and versions. Its observation statistics take effect."""

@@ -27,7 +27,7 @@ from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.run_folder.results import Evaluation, fact_means
 from millrace.protocol.bounds import LARGEST
-from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, versions_of
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.rollout import Episode
 from millrace.protocol.rows.played import reason_to_reject
@@ -226,11 +226,6 @@ class EvaluationDealer:
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
         """The orders for these tickets, those of an evaluation among them."""
         return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
-
-    def versions(self, tickets: Iterable[int]) -> set[int]:
-        """The versions that these tickets name, those of an evaluation among them."""
-        held = [number for number in tickets if number in self.held]
-        return {version for number in held for version in versions_of(self.version, self._matches(number)[0])}
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
         """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""

@@ -18,7 +18,7 @@ from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.protocol.errors import BadRollout
-from millrace.protocol.messages import Collect, Permit, Received, Rollout, versions_of
+from millrace.protocol.messages import Collect, Permit, Received, Rollout
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,11 +133,6 @@ class RolloutDealer:
             )
             out.append((member.peer, Collect(member.session, version, permits, self.received(member), keep=())))
         return out
-
-    def versions(self, tickets: Iterable[int]) -> set[int]:
-        """The versions that these tickets name, those of a rollout among them."""
-        named = [self.held[number] for number in tickets if number in self.held]
-        return {version for ticket in named for version in versions_of(ticket.version, [ticket.opponent])}
 
     def received(self, member: Member) -> tuple[Received, ...]:
         """The lanes of this worker, and what has come of them."""

@@ -12,15 +12,17 @@ then on a worker has as long to take them as if they had just been sent to it; w
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
+
+import msgspec
 
 from millrace.learner.members.member import SharingSupervisor
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.protocol.alive import SHARED_VERSIONS
-from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
+from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights, versions_of
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,13 @@ Standing = SentAfter | FromSupervisor | Confirmed
 
 
 class WeightsHeld:
-    """Which weights each worker and each supervisor holds or is about to get. The only record of it."""
+    """Which weights each worker and each supervisor holds or is about to get, and which it needs. The only record of it."""
 
     def __init__(self) -> None:
         self.by_worker: dict[bytes, dict[int, Standing]] = {}
         """by routing id and version"""
+        self.named: dict[bytes, dict[int, set[int]]] = {}
+        """by routing id and ticket, the versions that the ticket names; tickets that have ended may be among them"""
         self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
         """by version, the newest last; it ends with the last member that has this supervisor"""
 
@@ -71,6 +75,17 @@ class WeightsHeld:
         for oldest in list(shared)[:-SHARED_VERSIONS]:
             del shared[oldest]
         return supervisor.peer
+
+    def needs(self, member: CollectingMember, tickets: Collection[int]) -> set[int]:
+        """The versions that these tickets name, those of the worker that have not ended among them."""
+        named = self.named.get(member.peer, {})
+        return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
+
+    def note(self, member: CollectingMember, order: Collect | Evaluate) -> None:
+        """Note what the tickets of this order name."""
+        named = self.named.get(member.peer, {})
+        outstanding = {ticket: versions for ticket, versions in named.items() if ticket in member.tickets}
+        self.named[member.peer] = outstanding | _by_ticket(order)
 
     def keep_only(self, peer: bytes, versions: Collection[int]) -> None:
         """The worker is told to drop all others."""
@@ -95,6 +110,7 @@ class WeightsHeld:
     def forget(self, peer: bytes) -> None:
         """The session of this worker has ended."""
         self.by_worker.pop(peer, None)
+        self.named.pop(peer, None)
 
     def _may_be_under_way(self, version: int, supervisor: SharingSupervisor | None) -> bool:
         """Whether these weights may not have reached the supervisor yet. False if it shares no more."""
@@ -117,25 +133,39 @@ class SentWeights:
         self.kept = {version: weights for version, weights in self.kept.items() if version in needed}
         self.kept[newest.version] = newest
 
-    def after(self, orders: Iterable[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
-        """The weights that these orders name and their workers lack. They are sent after the orders."""
+    def after(self, orders: Sequence[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
+        """These orders, which list what their workers are to keep. After all of them, the weights that the workers lack."""
         out = list[Outgoing]()
+        weights = list[Outgoing]()
+        for peer, order in orders:
+            if isinstance(order, Collect | Evaluate):
+                self.held.note(members[peer], order)
         for peer, order in orders:
             if isinstance(order, Collect | Evaluate):
                 member = members[peer]
                 for version in sorted(order.versions - self.held.versions(peer)):
                     # Opponents differ from worker to worker, so theirs are not shared.
                     supervisor = member.shared_by if version == order.version else None
-                    out += self._send(member, version, supervisor)
-                self.held.keep_only(peer, order.keep)
-        return out
+                    weights += self._send(member, version, supervisor)
+                keep = self.held.needs(member, member.tickets)  # also those of the orders that follow
+                self.held.keep_only(peer, keep)
+                order = msgspec.structs.replace(order, keep=tuple(sorted(keep)))
+            out.append((peer, order))
+        return out + weights
 
-    def again(self, member: CollectingMember, heartbeat: Heartbeat, named: Collection[int]) -> list[Outgoing]:
-        """Of these versions, which the worker's unfinished tickets name, those that were lost, as its heartbeat shows."""
+    def again(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
+        """The weights that the worker's unfinished tickets name and that were lost, as its heartbeat shows."""
         self.held.hear(member, heartbeat)
-        lost = sorted(set(named) - self.held.versions(member.peer))
+        lost = sorted(self.held.needs(member, heartbeat.tickets) - self.held.versions(member.peer))
         return [message for version in lost for message in self._send(member, version, None)]
 
     def _send(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> list[Outgoing]:
         receiver = self.held.give(member, version, supervisor)
         return [] if receiver is None else [(receiver, self.kept[version])]
+
+
+def _by_ticket(order: Collect | Evaluate) -> dict[int, set[int]]:
+    """The versions that each ticket of an order names."""
+    if isinstance(order, Evaluate):
+        return {order.ticket: order.versions}
+    return {permit.ticket: versions_of(order.version, [permit.opponent]) for permit in order.permits}

@@ -13,9 +13,7 @@ only evaluate play it, whatever the others do.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
-
-import msgspec
+from collections.abc import Callable, Sequence
 
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, RolloutArrived, RolloutRejected
@@ -32,9 +30,7 @@ from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import (
     Array,
-    Collect,
     EpisodeRows,
-    Evaluate,
     Evaluated,
     Failure,
     Goodbye,
@@ -150,7 +146,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def share_evaluation(self) -> list[Outgoing]:
         """No answer of the evaluation has come for long: a second worker plays the oldest ticket as well, if one is free."""
-        return self._with_weights(self.evaluation.share(self.membership.active()))
+        return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:
         """Env steps of the next update's rollouts: of those that have come, and of those under way, as workers report."""
@@ -175,21 +171,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             out += self.evaluation.deal(self.membership.active())
         if self.evaluation.beside or not self.evaluation.pending:
             out += self.rollouts.deal(self.members)
-        return self._with_weights(out)
-
-    def _with_weights(self, orders: list[Outgoing]) -> list[Outgoing]:
-        """These orders, which list the versions that their workers are to keep, and the weights that these workers lack."""
-        out = list[Outgoing]()
-        for peer, order in orders:
-            if isinstance(order, Collect | Evaluate):
-                keep = tuple(sorted(self._named(self.members[peer].tickets)))
-                order = msgspec.structs.replace(order, keep=keep)
-            out.append((peer, order))
-        return out + self.weights.after(out, self.members)
-
-    def _named(self, tickets: Collection[int]) -> set[int]:
-        """The versions that these tickets name."""
-        return self.rollouts.versions(tickets) | self.evaluation.versions(tickets)
+        return self.weights.after(out, self.members)
 
     def _needed(self) -> set[int]:
         """The versions that orders may name, beside the newest."""
@@ -259,9 +241,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super()._heartbeat(member, heartbeat)
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        out = self.weights.again(member, heartbeat, self._named(heartbeat.tickets))
+        out = self.weights.again(member, heartbeat)
         orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
-        return out + self._with_weights(orders)
+        return out + self.weights.after(orders, self.members)
 
     def _received(self, member: CollectingMember) -> tuple[Received, ...]:
         return self.rollouts.received(member)

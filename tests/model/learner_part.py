@@ -17,7 +17,7 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.sent_weights import Confirmed, SentAfter, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
-from millrace.protocol.messages import ToLearner, WorkerExit
+from millrace.protocol.messages import ToLearner, WorkerExit, versions_of
 from tests.model import membership_part
 from tests.model.conversation import Content
 from tests.model.message_content import (
@@ -55,7 +55,7 @@ NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes", "_check_rows"},
     RolloutDealer: {"_absent", "opponents"},
     SentWeights: set(),
-    WeightsHeld: {"by_supervisor"},
+    WeightsHeld: {"by_supervisor", "named"},
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare", "has_policy_code"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
@@ -72,8 +72,8 @@ NOT_SAVED: dict[type, set[str]] = {
     LanePlacement: {"_tie_break"},
     Rounds: {"_max_lag"},
 }
-"""What is not: constants, figures for people, what follows from the version, as the opponents do, and parts that no event of
-the model uses."""
+"""What is not: constants, figures for people, what follows from the version, as the opponents do, or from tickets, as the
+versions that they name, and parts that no event of the model uses."""
 
 
 class Learner:
@@ -311,6 +311,7 @@ def _held(coordinator: TicketCoordinator) -> Content:
     members = sorted(coordinator.members.values(), key=lambda each: each.join_number)
     by_worker = coordinator.weights.held.by_worker
     assert by_worker.keys() <= coordinator.members.keys(), "weights count as held by a worker that is gone"
+    assert coordinator.weights.held.named.keys() <= coordinator.members.keys(), "a worker that is gone needs weights"
     return tuple(
         tuple(
             (version, name(Kind.REPLIES, standing.replies, member.session) if isinstance(standing, SentAfter) else None)
@@ -394,6 +395,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
         each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value), opponent)
         coordinator.rollouts.held[number.value] = each
         coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
+        coordinator.weights.held.named.setdefault(each.peer, {})[number.value] = versions_of(under, [opponent])
     membership_part.load(coordinator.membership, members, CollectingMember)
     for peer, by_version in zip(coordinator.members, held, strict=True):  # in the order in which they joined
         standings = {version: _standing(sent_at) for version, sent_at in by_version}

@@ -109,17 +109,13 @@ MUTATIONS = {
         WEIGHTS, "case _ if version in heartbeat.versions:", "case _:"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
-        COORDINATOR, "out + self._with_weights(orders)", "out + orders"
+        COORDINATOR, "out + self.weights.after(orders, self.members)", "out + orders"
     ),
     "weights are never sent": Mutation(WEIGHTS, "in sorted(order.versions - self.held.versions(peer)):", "in ():"),
     "weights are sent with every order": Mutation(
         WEIGHTS, "sorted(order.versions - self.held.versions(peer))", "sorted(order.versions)"
     ),
-    "weights are sent before the order that names them": Mutation(
-        COORDINATOR,
-        "return out + self.weights.after(out, self.members)",
-        "return self.weights.after(out, self.members) + out",
-    ),
+    "weights are sent before the order that names them": Mutation(WEIGHTS, "return out + weights", "return weights + out"),
     "the newest weights are sent to whoever holds a ticket": Mutation(
         WEIGHTS, "[(receiver, self.kept[version])]", "[(receiver, self.kept[max(self.kept)])]"
     ),
@@ -206,14 +202,15 @@ MUTATIONS = {
         "return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}",
         "return {asked.version for lane in self._lanes.values() for asked in lane.asked.values()}",
     ),
-    "an order does not list the weights that its worker keeps": Mutation(
-        COORDINATOR, "replace(order, keep=keep)", "replace(order, keep=())"
-    ),
+    "an order does not list the weights that its worker keeps": Mutation(WEIGHTS, "keep=tuple(sorted(keep))", "keep=()"),
     "only the weights that act are sent after an order": Mutation(
         WEIGHTS, "sorted(order.versions -", "sorted({order.version} -"
     ),
     "the weights of opponents do not count as named": Mutation(
-        ROLLOUTS, "for version in versions_of(ticket.version, [ticket.opponent])}", "for version in [ticket.version]}"
+        WEIGHTS, "versions_of(order.version, [permit.opponent]) for", "{order.version} for"
+    ),
+    "what the earlier tickets of a worker name is forgotten": Mutation(
+        WEIGHTS, "outstanding | _by_ticket(order)", "_by_ticket(order)"
     ),
     "the weights of opponents are dropped": Mutation(COORDINATOR, "needed.update(opponents.versions)", "pass"),
     "an opponent is forgotten while a version can meet it": Mutation(

@@ -727,6 +727,14 @@ def test_weights_that_a_worker_has_dropped_are_sent_again_with_the_next_order_th
     assert [weights.version for weights in of(outs, Weights, A)] == [1]
 
 
+def test_a_worker_gets_no_weights_for_the_ticket_of_another() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.joins(B)
+    assert of(learner.beats(A, versions=[], tickets=[0], replies=1), Weights) != [], "they were lost on the way"
+    assert of(learner.beats(B, versions=[], tickets=[0], replies=1), Weights) == []
+
+
 def test_weights_that_only_finished_tickets_name_are_not_said_again() -> None:
     """Its worker has dropped them."""
     learner = Learner(lanes=1, max_lag=1)

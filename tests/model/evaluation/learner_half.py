@@ -186,6 +186,8 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
         for index, sent_at in mine:
             tickets.held[tickets._first + index] = member
             member.tickets[tickets._first + index] = sent_at.value
+            named = learner.coordinator.weights.held.named.setdefault(member.peer, {})
+            named[tickets._first + index] = {version}
     tickets._played = {index: evaluated(0, tickets._first + index, returns) for index, returns in played}
     for index, episode, of_session, step in rows:
         holder = tickets.held[tickets._first + index]

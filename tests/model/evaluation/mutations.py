@@ -27,13 +27,11 @@ MUTATIONS = {
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         COORDINATOR,
-        "return self._with_weights(out)",
-        "return out if self.evaluation.pending else self._with_weights(out)",
+        "        return self.weights.after(out, self.members)",
+        "        return out if self.evaluation.pending else self.weights.after(out, self.members)",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
-        COORDINATOR,
-        "return self.rollouts.versions(tickets) | self.evaluation.versions(tickets)",
-        "return self.rollouts.versions(tickets)",
+        WEIGHTS, "return {order.ticket: order.versions}", "return {order.ticket: set()}"
     ),
     "a lost order to evaluate is not sent again": Mutation(COORDINATOR, " + self.evaluation.send(member, lost)", ""),
     "the evaluation's tickets of a lost worker are kept": Mutation(
@@ -83,7 +81,7 @@ MUTATIONS = {
         "for version, standing in mine.items()}",
     ),
     "weights that a ticket names count as dropped": Mutation(
-        WEIGHTS, "self.held.keep_only(peer, order.keep)", "self.held.keep_only(peer, order.versions)"
+        WEIGHTS, "self.held.keep_only(peer, keep)", "self.held.keep_only(peer, order.versions)"
     ),
     "a worker drops weights that an evaluation names": Mutation(
         SESSION, "self.rollouts.versions() | self.evaluations.versions()", "self.rollouts.versions()"
