@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import Protocol
 
 from millrace.launch.crew import Crew
@@ -85,7 +86,7 @@ class ActingPool:
         if self.where.bind:
             self.bound.announce(self.where.advertise)
         else:
-            self.processes = _LocalProcesses(crew, lambda name: self._started(crew, name))
+            self.processes = _LocalProcesses(crew, partial(_started, self.bound, self.token, crew))
         self.lobby = Lobby(self.bound.link, self.processes, before)
         return self.lobby
 
@@ -101,13 +102,14 @@ class ActingPool:
         """Stop the workers that were started here."""
         self.processes.stop(within_s)
 
-    def _started(self, crew: Crew, name: str) -> Running:
-        """A worker: a thread of this process if the address is within it, else a process."""
-        address = self.bound.link.address
-        if address.startswith("inproc://"):
-            return WorkerThread(address, name, self.bound.context, evaluates=crew.evaluates(name))
-        inherited = crew.descriptors_of(name) or ()
-        return WorkerProcess(WorkerCommand(address, name, crew.log_of(name), self.token, crew.flags_of(name), inherited))
+
+def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Running:
+    """A worker of this crew: a thread of this process if the address is within it, else a process."""
+    address = bound.link.address
+    if address.startswith("inproc://"):
+        return WorkerThread(address, name, bound.context, evaluates=crew.evaluates(name))
+    inherited = crew.descriptors_of(name) or ()
+    return WorkerProcess(WorkerCommand(address, name, crew.log_of(name), token, crew.flags_of(name), inherited))
 
 
 @contextmanager
