@@ -1,13 +1,14 @@
 """What exists of a run before PyTorch is imported: its folder, what a worker says of the environment, and its interrupts.
 
 The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let one of them describe
-the environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/run.py`), which takes
-over the workers; train. This file does not know who the workers are, and the learner runs no code of the environment.
+the environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/open_run.py`), which
+takes over the workers; train. This file does not know who the workers are, and the learner runs no code of the environment.
 """
 
 from __future__ import annotations
 
 import logging
+import socket
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -19,13 +20,16 @@ from millrace.learner.env_spaces import EnvSpaces
 from millrace.learner.extras import started_by
 from millrace.learner.imports_ahead import ImportsAhead
 from millrace.learner.interrupts import Interrupts
+from millrace.learner.members.bound import Bound
 from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.resume_checks import Resumption, check_spaces
 from millrace.learner.rollouts.hub import HubObserver
 from millrace.learner.run_folder.json_log import kept_log
+from millrace.learner.run_folder.lease import Closed, Listens
 from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.learner.run_folder.run_lock import RunLock
+from millrace.protocol.address import advertised_address, own_address
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.advice.atari_ids import preprocessed
 from millrace.protocol.envs.description import DescribedEnv, agents_in_words
@@ -64,6 +68,22 @@ class RunSetup:
     """Entered: signals are noted from now on."""
     elsewhere: bool = False
     """Whether its workers are started elsewhere, and not by this program."""
+
+    def announce(self, bound: Bound) -> None:
+        """Say in the lock of the run folder that `millrace status` may ask at this address; or why it cannot."""
+        address = bound.link.address
+        keyring = bound.keyring
+        lock = self.folder.lock
+        if lock is None:
+            return
+        if address.startswith("inproc://"):
+            lock.announce(Closed.INPROC)
+        elif keyring is not None and keyring.folder is None:
+            lock.announce(Closed.KEYS_OF_THE_RUN)
+        else:
+            keys = "" if keyring is None or keyring.folder is None else str(keyring.folder.path.absolute())
+            others = advertised_address(address, self.config.advertise, socket.gethostname())
+            lock.announce(Listens(others, own_address(address), keys))
 
     def check_interrupt(self) -> None:
         """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""

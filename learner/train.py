@@ -14,47 +14,43 @@ metrics that are no numbers; so is one whose rollouts a callback does not accept
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from millrace.learner.algorithms import Algorithm
 from millrace.learner.algorithms.algorithm import acting_weights, numbers
-from millrace.learner.between_updates.between_updates import BetweenUpdates
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
+from millrace.learner.run import OpenRun
 from millrace.learner.run_folder.progress import Row
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import RunError
 from millrace.protocol.rollout import stack_rollouts
-from millrace.protocol.specs import PolicySpec
 
 ADVICE = "try a lower learning_rate, or normalize_observations"
 
 
-def train(
-    algorithm: Algorithm,
-    policy: PolicySpec,
-    hub: Hub,
-    between: BetweenUpdates,
-    workers: int,
-    check_time: Callable[[], None] = lambda: None,
-    cores: CrowdedCores | None = None,
-) -> str:
+def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
     """Train until the tally gives a reason to stop. Returns that reason.
 
-    `policy`: what acts with the weights of the algorithm. `workers`: number of workers to wait for before the first rollout.
-    `check_time` is called between gradient steps: what it raises takes the update back. `cores` watches the updates.
+    `workers`: number of workers to wait for before the first rollout. `cores` watches the updates.
 
     If the run cannot go on (no worker is left, the environment raised too often, the user interrupted the run, a loss is not
     finite, the user's code raised), the state after the last whole update is saved. Then the error is raised.
     """
-    tally, files, audience, evaluations = between
-    cores = cores or CrowdedCores(0)
+    algorithm = run.parts.algorithm
+    policy = run.parts.spec.policy
+    hub = run.parts.hub
+    tally = run.parts.tally
+    files = run.files
+    audience = run.audience
+    evaluations = run.evaluations
 
     def pulse() -> None:
+        """Between gradient steps. What it raises takes the update back."""
         hub.pulse()
-        check_time()
+        run.check_time()
 
     def publish(weights: tuple[Floats, Floats]) -> None:
         deal = tally.training_goes_on()

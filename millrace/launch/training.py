@@ -24,6 +24,7 @@ from millrace.learner.run_setup import (
     run_folder,
 )
 from millrace.learner.torch_setup import one_thread
+from millrace.learner.whole_run import train_to_the_end
 from millrace.protocol.env_spec import EnvSpec
 from millrace.workers.machine_slots import LIMIT_VARIABLE, copies_per_machine
 from millrace.workers.supervise.supervisor import STOP_WITHIN_S
@@ -65,14 +66,16 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
         folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
-        from millrace.learner.run import open_run  # imports PyTorch, which was done while a worker described the environment
+        from millrace.learner.open_run import (
+            open_run,  # imports PyTorch, as was done while a worker described the environment
+        )
 
         with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
             run = open_run(setup, lobby, watch, observer)
-            pool.report(run.hub.status)
-            run.announce(pool.bound, config.advertise)
-            run.train(1 if acts else workers)
+            pool.report(run.parts.hub.status)
+            setup.announce(pool.bound)
+            train_to_the_end(run, 1 if acts else workers)
         return folder.shown
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from millrace.learner.algorithms.ppo import PPO
-from millrace.learner.between_updates.between_updates import BetweenUpdates
+from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.config.layers import resolve
@@ -60,8 +60,8 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
     )
     service = MagicMock(gather=lambda show: arrived)
     tally = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
-    between = BetweenUpdates(tally, MagicMock(), MagicMock(), MagicMock())
-    train(algorithm, policy, service, between, 1)  # type: ignore[arg-type]
+    run = MagicMock(parts=SimpleNamespace(algorithm=algorithm, spec=fake_run_spec(), hub=service, tally=tally))
+    train(run, 1, CrowdedCores(0))
     (batch,) = batches
     assert batch.lane.tolist() == [0, 1, 2]
     assert batch.fresh.tolist() == [True, False, True]
