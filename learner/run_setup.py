@@ -26,7 +26,7 @@ from millrace.learner.members.lobby import Lobby
 from millrace.learner.resume_checks import Resumption, check_spaces
 from millrace.learner.rollouts.hub import HubObserver
 from millrace.learner.run_folder.json_log import kept_log
-from millrace.learner.run_folder.lease import Closed, Listens
+from millrace.learner.run_folder.lease import Listens, Unreachable
 from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.learner.run_folder.run_lock import RunLock
 from millrace.protocol.address import advertised_address, own_address
@@ -77,9 +77,9 @@ class RunSetup:
         if lock is None:
             return
         if address.startswith("inproc://"):
-            lock.announce(Closed.INPROC)
+            lock.announce(Unreachable.INPROC)
         elif keyring is not None and keyring.folder is None:
-            lock.announce(Closed.KEYS_OF_THE_RUN)
+            lock.announce(Unreachable.KEYS_OF_THE_RUN)
         else:
             keys = "" if keyring is None or keyring.folder is None else str(keyring.folder.path.absolute())
             others = advertised_address(address, self.config.advertise, socket.gethostname())

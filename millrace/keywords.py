@@ -36,8 +36,9 @@ class RolloutKeywords(TypedDict, total=False):
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: int
-    """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
-    turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
+    """Lag of the rollouts: their weights are exactly this many versions older than the learner's, after the first
+    updates. 0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made
+    for that. Results repeat with any lag.
     """
     vector: str
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.

@@ -12,8 +12,10 @@ from millrace.protocol.bounds import MAX_WORKERS, Line, Name, Natural, Seconds
 from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.message_base import Message
 
-SHARED_VERSIONS = 4  # so many of the last weights that came to it, a supervisor keeps for its workers
-NO_SLOT = "no slot is free"  # the beginning of the reason of a worker that leaves, and comes back when there is room
+SHARED_VERSIONS = 4  # how many of the newest versions a supervisor keeps in shared memory for its workers
+NO_SLOT = (
+    "no slot is free"  # so begins the reason, which the learner compares, of a worker that comes back when there is room
+)
 
 
 class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):

@@ -93,7 +93,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
 def _env_steps(valid: Array, resets: Array | None) -> int:
     if resets is None:
         return int(np.count_nonzero(valid))
-    return int(np.count_nonzero(np.atleast_1d(resets)[:-1] == 0))  # also of a rollout that was not checked
+    return int(np.count_nonzero(np.atleast_1d(resets)[:-1] == 0))  # a rollout that was not checked may have any shape
 
 
 def rollout_bytes(run: RunSpec) -> int:
@@ -105,9 +105,9 @@ def rollout_bytes(run: RunSpec) -> int:
     if run.masked:
         steps.append((T + 1, (sum(run.policy.action.sizes),), "bool"))
     steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
-    flags = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
-    flags += (T + 1) * run.copies if run.seats else 0  # resets
-    return flags + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
+    fixed = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
+    fixed += (T + 1) * run.copies if run.seats else 0  # resets
+    return fixed + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
 
 
 class Batch(msgspec.Struct, frozen=True):
@@ -154,26 +154,30 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = N
     if fresh is None:
         fresh = [rollout.sequence == 0 for rollout in rollouts]
     order = sorted(range(len(rollouts)), key=lambda index: rollouts[index].lane)
-    rows = [rollouts[index] for index in order]
+    ordered = [rollouts[index] for index in order]
 
     def side_by_side(arrays: Sequence[Array]) -> Array:
         return np.concatenate(arrays, axis=1)
 
-    copies = rows[0].reward.shape[1]
+    def side_by_side_if_any(arrays: Sequence[Array | None]) -> Array | None:
+        """All rollouts of a run have the array, or none has."""
+        return None if arrays[0] is None else side_by_side([array for array in arrays if array is not None])
+
+    copies = ordered[0].reward.shape[1]
     return Batch(
-        obs=tuple(side_by_side(leaves) for leaves in zip(*(row.obs for row in rows), strict=True)),
-        action=side_by_side([row.action for row in rows]),
-        log_prob=side_by_side([row.log_prob for row in rows]),
-        reward=side_by_side([row.reward for row in rows]),
-        terminated=side_by_side([row.terminated for row in rows]),
-        truncated=side_by_side([row.truncated for row in rows]),
-        valid=side_by_side([row.valid for row in rows]),
-        state=np.concatenate([row.state for row in rows]),
-        lane=np.repeat([row.lane for row in rows], copies),
+        obs=tuple(side_by_side(leaves) for leaves in zip(*(one.obs for one in ordered), strict=True)),
+        action=side_by_side([one.action for one in ordered]),
+        log_prob=side_by_side([one.log_prob for one in ordered]),
+        reward=side_by_side([one.reward for one in ordered]),
+        terminated=side_by_side([one.terminated for one in ordered]),
+        truncated=side_by_side([one.truncated for one in ordered]),
+        valid=side_by_side([one.valid for one in ordered]),
+        state=np.concatenate([one.state for one in ordered]),
+        lane=np.repeat([one.lane for one in ordered], copies),
         fresh=np.repeat([fresh[index] for index in order], copies),
         copies=copies,
-        episodes=tuple(episode for row in rows for episode in row.episodes),
-        extras=tuple(side_by_side(arrays) for arrays in zip(*(row.extras for row in rows), strict=True)),
-        mask=None if rows[0].mask is None else side_by_side([row.mask for row in rows if row.mask is not None]),
-        resets=None if rows[0].resets is None else side_by_side([row.resets for row in rows if row.resets is not None]),
+        episodes=tuple(episode for one in ordered for episode in one.episodes),
+        extras=tuple(side_by_side(arrays) for arrays in zip(*(one.extras for one in ordered), strict=True)),
+        mask=side_by_side_if_any([one.mask for one in ordered]),
+        resets=side_by_side_if_any([one.resets for one in ordered]),
     )

@@ -64,8 +64,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: Free[Natural] = 0
-    """Lag of the rollouts: by how many versions their weights are older than the learner's. 0: workers and learner take
-    turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that. Results repeat with any lag.
+    """Lag of the rollouts: their weights are exactly this many versions older than the learner's, after the first updates.
+    0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that.
+    Results repeat with any lag.
     """
     vector: Annotated[Free[str], Flag(f"{{{','.join(KINDS)}}}|NAME")] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.

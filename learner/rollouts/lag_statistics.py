@@ -11,8 +11,9 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Iterable
 from statistics import median
 
-REMEMBERED = 1_000  # the newest versions, and the newest measurements of each worker
-WORKERS = 1_000  # of which measurements are kept; of more, the newest
+MOST_VERSIONS = 1_000  # the oldest is forgotten
+MOST_MEASUREMENTS = 1_000  # of each worker; the oldest is forgotten
+MOST_WORKERS = 1_000  # the one that was heard least recently is forgotten
 
 
 class LagStatistics:
@@ -23,25 +24,23 @@ class LagStatistics:
         """rollouts that were used, by their lag"""
         self._published_s: dict[int, float] = {}
         self._newest_used: dict[str, int] = {}  # by worker: the newest version that a rollout of it was acted under
-        self._first_use_s: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=REMEMBERED))
+        self._first_use_s: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=MOST_MEASUREMENTS))
 
     def published(self, version: int, now: float) -> None:
-        """New weights were sent."""
+        """From now on, rollouts may be acted under these weights."""
         self._published_s[version] = now
-        self._published_s.pop(version - REMEMBERED, None)
+        self._published_s.pop(version - MOST_VERSIONS, None)
 
     def arrived(self, worker: str, version: int, now: float) -> None:
         """A rollout of this worker arrived. It was acted under this version."""
-        if version > self._newest_used.get(worker, -1) and version in self._published_s:
-            self._first_use_s[worker].append(now - self._published_s[version])
         newest = self._newest_used.pop(worker, -1)
-        self._newest_used[worker] = max(
-            version, newest
-        )  # last in the table: the worker that sent nothing for longest is first
-        if len(self._newest_used) > WORKERS:
-            oldest = next(iter(self._newest_used))
-            del self._newest_used[oldest]
-            self._first_use_s.pop(oldest, None)
+        if version > newest and version in self._published_s:
+            self._first_use_s[worker].append(now - self._published_s[version])
+        self._newest_used[worker] = max(version, newest)  # at the end, so that the first was heard least recently
+        if len(self._newest_used) > MOST_WORKERS:
+            forgotten = next(iter(self._newest_used))
+            del self._newest_used[forgotten]
+            self._first_use_s.pop(forgotten, None)
 
     def used(self, lags: Iterable[int]) -> None:
         """Rollouts with these lags went into an update."""
@@ -50,7 +49,7 @@ class LagStatistics:
     def not_used(self, lags: Iterable[int]) -> None:
         """Rollouts with these lags were to go into an update, which failed."""
         self.lags.subtract(lags)
-        self.lags = +self.lags
+        self.lags = +self.lags  # without those that are 0 now
 
     def histogram(self) -> dict[str, int]:
         """Number of rollouts that were used, by lag, from the smallest; a JSON object has strings for keys."""

@@ -1,7 +1,7 @@
-"""The content of a run's lock file, and how an observer judges from it whether the owner lives. Pure.
+"""The lock of a run is a lease: it lapses unless its owner renews it. The content of its file, and who lives by it. Pure.
 
-Rule: a living owner rewrites the file every few seconds with a higher count. An observer compares no clocks: it judges by
-its own how long the content stays the same.
+Rule: a living owner rewrites the lock file every few seconds with another count. An observer compares no clocks of two
+machines: it measures with its own how long the content stays the same.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them re
 HIGHEST_COUNT = 10**12
 
 
-class Closed(Enum):
+class Unreachable(Enum):
     """Why nobody can ask the learner of a run."""
 
     INPROC = "inproc"
@@ -46,21 +46,21 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
     host: Line
     pid: Annotated[int, Meta(ge=1, le=2**31 - 1)]
-    boot: Line
-    """Which running kernel the process is on: processes with the same one are on one machine."""
+    boot_id: Line
+    """Of the kernel that runs there: processes with the same one are on one machine."""
     token: Line
     """Random: two locks never have the same."""
-    network: Line = ""
-    """Which network it is in: a container on the same machine may be in another one."""
-    numbers: Line = ""
-    """In which namespace `pid` is its number: a container has one of its own."""
+    network_namespace: Line = ""
+    """Empty if unknown. A container on the same machine may have one of its own."""
+    pid_namespace: Line = ""
+    """The namespace of `pid`; empty if unknown. A container may have one of its own."""
     address: Line = ""
     """Where its learner listens, for other machines; empty if nobody can ask it, or it does not listen yet."""
     here: Line = ""
     """The same for processes on its machine and in its network."""
     keys: Line = ""
     """The key folder of its learner; empty if it needs no key."""
-    closed: Closed | None = None
+    unreachable: Unreachable | None = None
     """Why nobody can ask it, where that is known."""
     count: Natural = 0
     """How often the owner has rewritten the file."""
@@ -68,13 +68,13 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
 
-    def listening(self, where: Listens | Closed) -> Owner:
+    def listening(self, where: Listens | Unreachable) -> Owner:
         """The owner with the place where its learner listens; without it, if that is too long for the file."""
-        if isinstance(where, Closed):
-            return replace(self, address="", here="", keys="", closed=where)
-        found = replace(self, address=where.address, here=where.here, keys=where.keys, closed=None)
-        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH
-        return found if fits else replace(self, address="", here="", keys="", closed=None)
+        if isinstance(where, Unreachable):
+            return replace(self, address="", here="", keys="", unreachable=where)
+        found = replace(self, address=where.address, here=where.here, keys=where.keys, unreachable=None)
+        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH  # a longer one is not cut
+        return found if fits else replace(self, address="", here="", keys="", unreachable=None)
 
     def encoded(self) -> bytes:
         """The content of the lock file."""
@@ -107,7 +107,7 @@ class Verdict(Enum):
 
 
 class LeaseWatch:
-    """One observer of one lock file."""
+    """One observer of one lock file, for one decision: once the content has changed, the owner lives."""
 
     def __init__(self, content: bytes, now: float, dead_after_s: float) -> None:
         self._content = content

@@ -27,8 +27,12 @@ def newest_run(config: RunSettings) -> Path | None:
     name = re.escape(f"{as_folder_name(config.env)}-{as_folder_name(config.algo)}-s{config.seed}-")
     pattern = re.compile(name + r"(\d{8}-\d{6})(?:-(\d{1,9}))?")
     root = Path(config.run_dir)
-    named = [(found, path) for path in (root.iterdir() if root.is_dir() else ()) if (found := pattern.fullmatch(path.name))]
-    matching = [(found[1], int(found[2] or 1), path) for found, path in named if _can_be_resumed(path, config)]
+    matching: list[tuple[str, int, Path]] = []
+    for path in root.iterdir() if root.is_dir() else ():
+        named = pattern.fullmatch(path.name)
+        if named is not None and _can_be_resumed(path, config):
+            number = int(named[2] or 1)  # of the runs that began in one second, the first has no number, and the next is 2
+            matching.append((named[1], number, path))
     if not matching:
         log_notice(log, f"no run to resume in {config.run_dir}: a new one begins")
         return None
@@ -36,7 +40,7 @@ def newest_run(config: RunSettings) -> Path | None:
 
 
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:
-    """Whether this is a run of the same environment and algorithm that can be resumed: it has a checkpoint."""
+    """Whether this is a run of the same environment and algorithm, and has a checkpoint."""
     if not os.path.lexists(path / CONFIG_FILE):
         return False
     try:

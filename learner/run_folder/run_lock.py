@@ -23,7 +23,7 @@ from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
-from millrace.learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from millrace.learner.run_folder.lease import WIDTH, LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
 from millrace.learner.run_folder.regular_files import open_regular, read, reason
 from millrace.protocol.address import is_local
 from millrace.protocol.errors import RunError, RunTakenOver, UsageError
@@ -47,9 +47,9 @@ class Pace(NamedTuple):
 
 
 PACE = Pace()
-WHY_CLOSED = {
-    Closed.INPROC: "with --transport inproc it listens in its own process only; run it with --transport ipc",
-    Closed.KEYS_OF_THE_RUN: (
+WHY_UNREACHABLE = {
+    Unreachable.INPROC: "with --transport inproc it listens in its own process only; run it with --transport ipc",
+    Unreachable.KEYS_OF_THE_RUN: (
         "with --transport tcp and --keys, the keys of its local workers are in no file; run it with --transport ipc"
     ),
 }
@@ -74,10 +74,10 @@ class RunLock:
         self._owner = Owner(
             host=socket.gethostname(),
             pid=os.getpid(),
-            boot=_boot(),
+            boot_id=_boot(),
             token=secrets.token_hex(8),
-            network=_namespace(NETWORK),
-            numbers=_namespace(NUMBERS),
+            network_namespace=_namespace(NETWORK),
+            pid_namespace=_namespace(NUMBERS),
         )
         self._file = -1
         self._other: Owner | None = None
@@ -106,7 +106,7 @@ class RunLock:
                 self._path.unlink()
         self._close()
 
-    def announce(self, where: Listens | Closed) -> None:
+    def announce(self, where: Listens | Unreachable) -> None:
         """Write into the lock file where the learner of this run listens for `millrace status`, or why nobody can ask it."""
         with self._writing:
             self._owner = self._owner.listening(where)
@@ -162,7 +162,7 @@ class RunLock:
             self._write()
             return True
         owner = decoded(self._read_open_file())
-        elsewhere = owner is None or owner.boot != self._owner.boot or not alone
+        elsewhere = owner is None or owner.boot_id != self._owner.boot_id or not alone
         if elsewhere:
             self._wait_until_dead(owner)
             if not self._is_open_file():
@@ -214,7 +214,7 @@ class RunLock:
                 f"{self._path}; end that process (`lslocks` shows it) or delete the file, then resume"
             )
         who = str(owner) if owner is not None else "another process"
-        here = owner is not None and owner.boot == self._owner.boot
+        here = owner is not None and owner.boot_id == self._owner.boot_id
         how = f"kill {owner.pid}" if here and owner is not None else "end that process"
         return UsageError(f"run {self._folder}: {who} is training it; wait until it ends, or end it ({how}), then resume")
 
@@ -290,9 +290,11 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
     """
     owner = living_owner(folder, time.time())
     if not owner.address:
-        why = "it has not begun yet; try again" if owner.closed is None else WHY_CLOSED[owner.closed]
+        why = "it has not begun yet; try again" if owner.unreachable is None else WHY_UNREACHABLE[owner.unreachable]
         raise UsageError(f"run {folder}: {owner} trains it and cannot be asked: {why}")
-    here = owner.boot == _boot() and (not owner.address.startswith("tcp://") or owner.network == _namespace(NETWORK))
+    here = owner.boot_id == _boot() and (
+        not owner.address.startswith("tcp://") or owner.network_namespace == _namespace(NETWORK)
+    )
     if not here and is_local(owner.address):
         raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
     return LearnerOfRun(owner.here if here else owner.address, Path(owner.keys) if owner.keys else None, here)
@@ -327,7 +329,7 @@ def _is_gone(owner: Owner) -> bool:
 
 def _has_our_numbers(owner: Owner) -> bool:
     """Whether the owner's process has the same number for it and for us: it is on this machine, in the same container."""
-    return owner.boot == _boot() and owner.numbers == _namespace(NUMBERS)
+    return owner.boot_id == _boot() and owner.pid_namespace == _namespace(NUMBERS)
 
 
 def _is_alive(pid: int) -> bool:

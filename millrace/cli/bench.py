@@ -15,17 +15,20 @@ from millrace.protocol.errors import UsageError
 
 def run(argv: list[str]) -> int:
     """Run them. Returns the exit code."""
-    clone = next((folder for folder in (INSTALLED_IN, Path.cwd()) if (folder / "benchmarks" / "program.py").is_file()), None)
-    if clone is None and asks_for_help(argv):
-        show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
-    if clone is None:
+    places = (INSTALLED_IN, Path.cwd())
+    repository = next((folder for folder in places if (folder / "benchmarks" / "program.py").is_file()), None)
+    if repository is None:
+        if asks_for_help(argv):
+            show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
-    path = os.pathsep.join(filter(None, [str(clone), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-P", "-m", "benchmarks.program", *(flag for flag in argv if flag != "--debug")]
+    # The repository alone is added to the path, and not this folder, whose modules are not ours (-P).
+    path = os.pathsep.join(filter(None, [str(repository), os.environ.get("PYTHONPATH")]))
+    flags = [flag for flag in argv if flag != "--debug"]  # which is a flag of `millrace` itself
+    command = [sys.executable, "-P", "-m", "benchmarks.program", *flags]
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
         try:
             return process.wait()
         except KeyboardInterrupt:
-            process.terminate()  # it ends its benchmark
+            process.terminate()  # it then ends the benchmark that it runs
             process.wait()
             raise

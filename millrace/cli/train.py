@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from millrace.cli.shown_run import ShownRun
+from millrace.cli.train_output import ShownRun
 from millrace.learner.config.command_line import read_config
 
 

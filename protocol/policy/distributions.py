@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from millrace.protocol.arrays import Array, Floats
-from millrace.protocol.policy.exploration import LOG_SQRT_2PI, TINY, Deterministic, EpsilonGreedy, Squashed
+from millrace.protocol.policy.exploration import LOG_SQRT_2PI, TINY, EpsilonGreedy, NoisyDeterministic, SquashedGaussian
 from millrace.protocol.specs import PolicySpec
 
 
@@ -146,9 +146,9 @@ def distribution(spec: PolicySpec) -> Distribution:
     if spec.head == "q":
         return EpsilonGreedy(action.sizes[0])
     if spec.head == "squashed":
-        return Squashed(action.shape)
+        return SquashedGaussian(action.shape)
     if spec.head == "deterministic":
-        return Deterministic(action.shape)
+        return NoisyDeterministic(action.shape)
     match action.kind:
         case "discrete" | "multidiscrete":
             return Categorical(action.sizes, action.shape)

@@ -1,13 +1,16 @@
 """How DQN, SAC and TD3 explore: ε-greedy actions, a squashed normal distribution, normal noise. Pure: noise is an argument.
 
 As in `distributions.py`, a network's output is `params` [..., P]. Here its last numbers come from the learner, with the
-weights, and are the same for every observation. So it decides how much is explored, and workers know no schedule.
+weights, and are the same for every observation. So the learner decides how much is explored, and workers know no schedule.
 
-    EpsilonGreedy P = n + 1     action values, ε; action = uniform at random where noise₀ < ε, else argmax
-    Squashed      P = 2 D + 1   mean, log standard deviation, warm-up; action = tanh(mean + exp(log_std) · normal noise)
-    Deterministic P = D + 2     output, noise scale, warm-up; action = tanh(output) + scale · normal noise, clipped to ±1
+    EpsilonGreedy       P = n + 1     action values, ε
+                                      action = uniform at random where noise₀ < ε, else argmax
+    SquashedGaussian    P = 2 D + 1   mean, log standard deviation, warm-up
+                                      action = tanh(mean + exp(log_std) · normal noise)
+    NoisyDeterministic  P = D + 2     output, noise scale, warm-up
+                                      action = tanh(output) + scale · normal noise, clipped to ±1
 
-The warm-up number is 1 or 0. While it is 1, the actions of the last two are uniform in [-1, 1].
+The warm-up number is 1 until `learning_starts`, then 0. While it is 1, both kinds of actions in [-1, 1] are drawn uniformly.
 """
 
 from __future__ import annotations
@@ -44,7 +47,7 @@ class EpsilonGreedy:
         return np.asarray(params[..., :-1].argmax(-1))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """log(ε / n + (1 − ε) [action is the best]) [...], at least −69."""
+        """log(ε / n + (1 − ε) [action is the best]) [...], at least log 1e-30 ≈ −69.1."""
         epsilon = params[..., -1]
         chance = epsilon / np.float32(self._actions) + (1 - epsilon) * (action == self.mode(params))
         return np.asarray(np.log(np.maximum(chance, TINY)), np.float32)
@@ -64,13 +67,17 @@ class _Bounded:
         noise[..., self._size :] = 2 * generator.random((*shape, self._size), dtype=np.float32) - 1
         return noise
 
-    def _or_uniform(self, params: Floats, noise: Floats, action: Floats) -> Array:
+    def mode(self, params: Floats) -> Array:
+        """The action without noise: the hyperbolic tangent of the first D numbers."""
+        return np.tanh(params[..., : self._size]).reshape(*params.shape[:-1], *self._shape)
+
+    def _uniform_in_warm_up(self, params: Floats, noise: Floats, action: Floats) -> Array:
         """The action [..., D] in its shape; a uniform one where the warm-up lasts."""
         chosen = np.where(params[..., -1:] > 0, noise[..., self._size :], action)
         return chosen.reshape(*params.shape[:-1], *self._shape)
 
 
-class Squashed(_Bounded):
+class SquashedGaussian(_Bounded):
     """The hyperbolic tangent of a diagonal normal distribution (bounded Box). Actions are in [-1, 1]."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -78,18 +85,14 @@ class Squashed(_Bounded):
         self.params_size = 2 * self._size + 1
 
     def _latent(self, params: Floats, noise: Floats) -> Floats:
-        """[..., D] the action before the tangent."""
+        """[..., D] the action before tanh."""
         mean = params[..., : self._size]
         log_std = params[..., self._size : -1]
         return np.asarray(mean + np.exp(log_std) * noise[..., : self._size])
 
     def sample(self, params: Floats, noise: Floats) -> Array:
         """A sample, float32."""
-        return self._or_uniform(params, noise, np.tanh(self._latent(params, noise)))
-
-    def mode(self, params: Floats) -> Array:
-        """The hyperbolic tangent of the mean."""
-        return np.tanh(params[..., : self._size]).reshape(*params.shape[:-1], *self._shape)
+        return self._uniform_in_warm_up(params, noise, np.tanh(self._latent(params, noise)))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """Log-density [...] in [-1, 1]^D: of the normal distribution, less log(1 − tanh²), summed; −D log 2 in the warm-up.
@@ -102,11 +105,11 @@ class Squashed(_Bounded):
         z = noise[..., : self._size]
         log_std = params[..., self._size : -1]
         normal = np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)
-        found = (normal - log_tanh_slope(self._latent(params, noise))).sum(-1)
+        found = (normal - log_tanh_derivative(self._latent(params, noise))).sum(-1)
         return np.where(params[..., -1] > 0, np.float32(-self._size * math.log(2)), found)
 
 
-class Deterministic(_Bounded):
+class NoisyDeterministic(_Bounded):
     """One action for each observation, with normal noise while it explores (bounded Box). Actions are in [-1, 1]."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -116,17 +119,13 @@ class Deterministic(_Bounded):
     def sample(self, params: Floats, noise: Floats) -> Array:
         """The action with noise, clipped to ±1, float32."""
         action = np.tanh(params[..., : self._size]) + params[..., -2:-1] * noise[..., : self._size]
-        return self._or_uniform(params, noise, np.clip(action, -1, 1))
-
-    def mode(self, params: Floats) -> Array:
-        """The action without noise."""
-        return np.tanh(params[..., : self._size]).reshape(*params.shape[:-1], *self._shape)
+        return self._uniform_in_warm_up(params, noise, np.clip(action, -1, 1))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """Zeros [...]: clipped noise has no density."""
         return np.zeros(params.shape[:-1], np.float32)
 
 
-def log_tanh_slope(x: Floats) -> Floats:
+def log_tanh_derivative(x: Floats) -> Floats:
     """Log(1 − tanh²(x)) = 2 (log 2 − x − softplus(−2x)), which is exact for every x."""
     return np.asarray(2 * (np.float32(math.log(2)) - x - np.logaddexp(np.float32(0), -2 * x)))

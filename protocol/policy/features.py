@@ -17,15 +17,15 @@ from millrace.protocol.specs import Leaf, PolicySpec
 
 def feature_size(spec: PolicySpec) -> int:
     """D, the number of features of all leaves that are not images."""
-    return sum(_leaf_features(leaf) for leaf in spec.observation if not leaf.is_image)
+    return sum(_feature_count(leaf) for leaf in spec.observation if not leaf.is_image)
 
 
 def critic_size(spec: PolicySpec) -> int:
-    """The number of features that only the critic sees. For the critic, they stand behind the others."""
-    return sum(map(_leaf_features, spec.critic))
+    """The number of features that only the critic sees (privileged observations). They are appended to the others."""
+    return sum(map(_feature_count, spec.critic))
 
 
-def _leaf_features(leaf: Leaf) -> int:
+def _feature_count(leaf: Leaf) -> int:
     return sum(leaf.sizes) if leaf.sizes else math.prod(leaf.shape)
 
 
@@ -33,29 +33,30 @@ def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
     Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32, or
-    float64 if the policy normalizes and an array of the observation is wide: `normalize` makes float32 of them.
+    float64 if the policy normalizes and float32 would lose digits of an array (`Leaf.is_wide`): `normalize` then returns
+    float32. The result may be a view of a leaf.
     """
     plain = [(leaf, array) for leaf, array in zip(spec.observation, leaves, strict=True) if not leaf.is_image]
-    parts = [_features(leaf, array, spec.normalize_observations) for leaf, array in plain]
+    parts = [_features_of_leaf(leaf, array, spec.normalize_observations) for leaf, array in plain]
     if len(parts) == 1:
         return parts[0]
     if not parts:
-        lead = leaves[0].ndim - len(spec.observation[0].shape)
-        return np.empty((*leaves[0].shape[:lead], 0), np.float32)
+        batch_dims = leaves[0].ndim - len(spec.observation[0].shape)
+        return np.empty((*leaves[0].shape[:batch_dims], 0), np.float32)
     return np.concatenate(parts, -1)
 
 
-def _features(leaf: Leaf, array: Array, keeps_digits: bool) -> Array:
-    lead = array.shape[: array.ndim - len(leaf.shape)]
+def _features_of_leaf(leaf: Leaf, array: Array, keep_float64: bool) -> Array:
+    batch_shape = array.shape[: array.ndim - len(leaf.shape)]
     if leaf.sizes:
-        flat = array.reshape(*lead, len(leaf.sizes))
+        flat = array.reshape(*batch_shape, len(leaf.sizes))
         if len(leaf.sizes) > 1:
             flat = np.repeat(flat, leaf.sizes, -1)
         return np.equal(flat, _one_hot_values(leaf)).astype(np.float32)
-    flat = array.reshape(*lead, math.prod(leaf.shape))
+    flat = array.reshape(*batch_shape, math.prod(leaf.shape))
     if leaf.divisor != 1:
         return flat * np.float32(1 / leaf.divisor)
-    return flat.astype(np.float64 if keeps_digits and leaf.is_wide else np.float32, copy=False)
+    return flat.astype(np.float64 if keep_float64 and leaf.is_wide else np.float32, copy=False)
 
 
 @lru_cache(maxsize=64)
@@ -66,4 +67,4 @@ def _one_hot_values(leaf: Leaf) -> Array:
 
 def leaf_of_features(spec: PolicySpec) -> list[Leaf]:
     """The leaf that each of the D features belongs to. Only features of a Box are normalized."""
-    return [leaf for leaf in spec.observation if not leaf.is_image for _ in range(_leaf_features(leaf))]
+    return [leaf for leaf in spec.observation if not leaf.is_image for _ in range(_feature_count(leaf))]

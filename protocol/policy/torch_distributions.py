@@ -53,7 +53,7 @@ def policy_log_prob(policy: PolicySpec, params: Tensor, action: Tensor) -> Tenso
 def squashed_sample(params: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Actions [B, D] = tanh(mean + std · noise) and their log-densities [B], for params [B, 2 D] and normal noise [B, D].
 
-    The log-density is computed from the noise (`distributions.Squashed`), so that it is exact also near ±1.
+    The log-density is computed from the noise (`exploration.SquashedGaussian`), so that it is exact also near ±1.
     """
     mean, log_std = params.chunk(2, -1)
     latent = mean + log_std.exp() * noise

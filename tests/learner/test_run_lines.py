@@ -58,7 +58,7 @@ def test_a_run_trains_as_long_as_its_lock_is_held(tmp_path: Path) -> None:
         owner = decoded((run / LOCK_FILE).read_bytes())
         assert owner is not None
     path = run / LOCK_FILE
-    path.write_bytes(replace(owner, pid=GONE, numbers="pid:[1]").encoded())  # in a container
+    path.write_bytes(replace(owner, pid=GONE, pid_namespace="pid:[1]").encoded())  # in a container
     now = path.stat().st_mtime
     assert read_line(run, now + PACE.dead_after - 1).state == "training"
     assert read_line(run, now + PACE.dead_after + 1).state == "finished"

@@ -1,8 +1,8 @@
 """The base of algorithms that learn from a replay buffer: what an update does besides its gradient steps.
 
 No sockets, no files, no clock; seeded. The buffer holds raw observations and rewards. They are normalized when they are
-drawn, with the current statistics. With one torch thread on a CPU the same batches give the same bits, also after
-`load_state_dict`.
+drawn, with the current statistics. A subclass moves its target networks itself, in `step`. With one torch thread on a CPU
+the same batches give the same bits, also after `load_state_dict`.
 """
 
 from __future__ import annotations

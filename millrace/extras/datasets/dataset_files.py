@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from millrace.extras.datasets.closed_hdf5 import ClosedHDF5, UnfitFile
 from millrace.extras.datasets.minari_spaces import space_of_json
+from millrace.extras.datasets.self_contained_hdf5 import SelfContainedHDF5, UnfitFile
 from millrace.learner.run_folder.regular_files import read, reason
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import Natural, one_line
@@ -84,13 +84,13 @@ class DatasetFiles:
 
     def read_episodes(self) -> Iterator[StoredEpisode]:
         """The episodes, in their order. Raises `UsageError` at one that cannot be used."""
-        with self._as_usage_error(ARRAYS), ClosedHDF5.open(self._folder / ARRAYS) as file:
+        with self._as_usage_error(ARRAYS), SelfContainedHDF5.open(self._folder / ARRAYS) as file:
             for number in range(self.episodes):
                 yield self._episode(file, number)
 
     def _check_counts(self) -> None:
         """Raise `UsageError` unless there are as many episodes and steps as the metadata says, and as the file can hold."""
-        with self._as_usage_error(ARRAYS), ClosedHDF5.open(self._folder / ARRAYS) as file:
+        with self._as_usage_error(ARRAYS), SelfContainedHDF5.open(self._folder / ARRAYS) as file:
             if (episodes := len(file.root)) != self.episodes:
                 raise UnfitFile(f"expected {self.episodes} episodes, as {METADATA} says, got {episodes}")
             groups = (file.group(file.root, f"episode_{number}") for number in range(episodes))
@@ -101,7 +101,7 @@ class DatasetFiles:
             if size > file.most_bytes:
                 raise UnfitFile(f"expected at most {file.most_bytes:,} bytes in a file of this size, got {size:,}")
 
-    def _episode(self, file: ClosedHDF5, number: int) -> StoredEpisode:
+    def _episode(self, file: SelfContainedHDF5, number: int) -> StoredEpisode:
         group = file.group(file.root, f"episode_{number}")
         rewards = file.array(group, "rewards")
         L = _length(rewards)
@@ -151,7 +151,7 @@ def _length(rewards: Any) -> int:
     return int(rewards.shape[0])
 
 
-def _leaves(file: ClosedHDF5, parent: Any, name: str, space: gymnasium.Space[Any]) -> Iterator[tuple[Any, Any]]:
+def _leaves(file: SelfContainedHDF5, parent: Any, name: str, space: gymnasium.Space[Any]) -> Iterator[tuple[Any, Any]]:
     """The stored arrays of an observation, in the order of its leaves, with their spaces."""
     match space:
         case spaces.Dict():

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from millrace.cli.shown_run import ShownRun
 from millrace.cli.subcommands import chosen_subcommand
+from millrace.cli.train_output import ShownRun
 from millrace.extras.launchers.command_line import SET_BY_LAUNCHER, read_flags
 from millrace.extras.launchers.flags import KubernetesFlags, LaunchFlags, RayFlags, SlurmFlags
 from millrace.extras.launchers.kubernetes import manifest

@@ -19,7 +19,7 @@ from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import RunError, UsageError
-from millrace.protocol.policy.exploration import Squashed
+from millrace.protocol.policy.exploration import SquashedGaussian
 from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -139,7 +139,7 @@ def test_the_density_of_a_squashed_action_is_the_one_that_workers_compute() -> N
     generator = np.random.default_rng(0)
     params = generator.normal(0, 0.5, (50, 5)).astype(np.float32)
     params[:, -1] = 0  # no warm-up
-    numpy_distribution = Squashed((2,))
+    numpy_distribution = SquashedGaussian((2,))
     noise = numpy_distribution.noise(generator, (50,))
     action = numpy_distribution.sample(params, noise)
     inside = (abs(action) < 0.99).all(-1)

@@ -177,9 +177,9 @@ def huge_chunks(group: Any, other: Path) -> None:
     [
         (external_link, "expected a name in this file, got a link"),
         (soft_link, "expected a name in this file, got a link"),
-        (external_storage, "expected its numbers in this file, got an array that names other files"),
-        (virtual, "expected its numbers in this file, got an array that names other files"),
-        (nothing_written, "expected all of its numbers in this file, got a part of them"),
+        (external_storage, "expected its data in this file, got an array that names other files"),
+        (virtual, "expected its data in this file, got an array that names other files"),
+        (nothing_written, "expected all of its data in this file, got a part of them"),
         (too_narrow, "expected float32[6, 2], got float32[6, 1]"),
         (too_short, "expected float32[6, 2], got float32[5, 2]"),
         (texts, "expected float32[6, 2], got |S1[6, 2]"),

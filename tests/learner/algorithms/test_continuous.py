@@ -27,7 +27,7 @@ from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.spaces import action_spec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.distributions import distribution
-from millrace.protocol.policy.exploration import Deterministic, Squashed
+from millrace.protocol.policy.exploration import NoisyDeterministic, SquashedGaussian
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS, named_views
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_distributions import squashed_sample
@@ -83,7 +83,7 @@ def test_the_density_of_squashed_actions_is_the_derivative_of_their_distribution
     """P(a ≤ A) by the normal distribution function; its numerical derivative is the density. It sums to 1."""
     noise: Any = np.linspace(-2, 2, 4001)  # float64, for the derivative
     params: Any = np.array([mean, log_std, 0.0])
-    over = Squashed((1,))
+    over = SquashedGaussian((1,))
     both: Any = np.stack([noise, np.zeros_like(noise)], -1)
     action = over.sample(np.broadcast_to(params, (4001, 3)), both)[:, 0]
     density = np.exp(over.log_prob(np.broadcast_to(params, (4001, 3)), action[:, None], both).astype(np.float64))
@@ -98,7 +98,7 @@ def test_the_density_of_squashed_actions_is_the_derivative_of_their_distribution
 
 def test_an_action_at_the_bound_has_a_finite_density() -> None:
     params, noise = np.array([[30.0, 0.0, 0.0]], np.float32), np.array([[1.0, 0.0]], np.float32)
-    over = Squashed((1,))
+    over = SquashedGaussian((1,))
     assert over.sample(params, noise) == 1
     expected = -0.5 - 0.5 * math.log(2 * math.pi) - 2 * (math.log(2) - 31)  # log(1 − tanh²(31))
     assert over.log_prob(params, over.sample(params, noise), noise)[0] == pytest.approx(expected, rel=1e-5)
@@ -106,8 +106,8 @@ def test_an_action_at_the_bound_has_a_finite_density() -> None:
         over.log_prob(params, over.sample(params, noise))
 
 
-@pytest.mark.parametrize("over", [Squashed((2,)), Deterministic((2,))])
-def test_actions_are_uniform_while_the_buffer_says_so(over: Squashed | Deterministic) -> None:
+@pytest.mark.parametrize("over", [SquashedGaussian((2,)), NoisyDeterministic((2,))])
+def test_actions_are_uniform_while_the_buffer_says_so(over: SquashedGaussian | NoisyDeterministic) -> None:
     generator = np.random.default_rng(0)
     params = np.zeros((20_000, over.params_size), np.float32)
     params[:, 0] = 3.0
@@ -120,12 +120,12 @@ def test_actions_are_uniform_while_the_buffer_says_so(over: Squashed | Determini
     counts = np.histogram(uniform, 10, (-1, 1))[0]
     assert counts.sum() == 40_000
     assert np.ptp(counts) < 400  # six standard deviations of a difference: 6 · √(2 · 3600)
-    if isinstance(over, Squashed):
+    if isinstance(over, SquashedGaussian):
         np.testing.assert_allclose(over.log_prob(params, uniform, noise), -2 * math.log(2), rtol=1e-6)
 
 
 def test_noise_of_a_deterministic_action_has_the_scale_of_the_buffer() -> None:
-    over, generator = Deterministic((1,)), np.random.default_rng(0)
+    over, generator = NoisyDeterministic((1,)), np.random.default_rng(0)
     params = np.tile(np.array([0.5, 0.1, 0], np.float32), (20_000, 1))
     acted = over.sample(params, over.noise(generator, (20_000,)))
     assert acted.mean() == pytest.approx(math.tanh(0.5), abs=0.005)

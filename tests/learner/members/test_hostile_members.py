@@ -17,7 +17,7 @@ from millrace.learner.members.member_server import TURN_S
 from millrace.learner.members.membership import MAX_MEMBERS, REMEMBERED
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import Hub, HubSettings
-from millrace.learner.rollouts.lag_statistics import WORKERS, LagStatistics
+from millrace.learner.rollouts.lag_statistics import MOST_WORKERS, LagStatistics
 from millrace.learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from millrace.protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from millrace.protocol.messages import (
@@ -196,10 +196,10 @@ def test_the_stages_of_a_process_that_joins_again_are_counted_once() -> None:
 def test_measurements_of_the_weights_age_are_kept_of_a_limited_number_of_workers() -> None:
     age = LagStatistics()
     age.published(0, 0.0)
-    for number in range(3 * WORKERS):
+    for number in range(3 * MOST_WORKERS):
         age.arrived("honest", 0, 1.0)
         age.arrived(f"w{number}", 0, 2.0)
-    assert len(age.first_use_s()) == WORKERS
+    assert len(age.first_use_s()) == MOST_WORKERS
     assert "honest" in age.first_use_s()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from millrace.learner.rollouts.lag_statistics import REMEMBERED, LagStatistics
+from millrace.learner.rollouts.lag_statistics import MOST_VERSIONS, LagStatistics
 
 
 def test_lags_are_counted() -> None:
@@ -28,8 +28,8 @@ def test_only_a_workers_first_rollout_under_new_weights_tells_how_long_they_took
 def test_versions_of_before_this_learner_and_of_long_ago_tell_nothing() -> None:
     fresh = LagStatistics()
     fresh.arrived("a", 5, 1.0)
-    for version in range(6, 10 + REMEMBERED):
+    for version in range(6, 10 + MOST_VERSIONS):
         fresh.published(version, float(version))
     fresh.arrived("a", 7, 2_000.0)
     assert fresh.first_use_s() == {}
-    assert len(fresh._published_s) == REMEMBERED
+    assert len(fresh._published_s) == MOST_VERSIONS

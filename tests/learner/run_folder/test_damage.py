@@ -76,7 +76,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         logging.getLogger("millrace").warning("a worker was lost\n%s", "a line of its traceback\n" * 20)
     for picture in ("observation.png", "videos/a.mp4"):
         (folder / picture).write_bytes(b"a picture")
-    owner = Owner(host="there", pid=1, boot="another", token="t", address="tcp://127.0.0.1:1")
+    owner = Owner(host="there", pid=1, boot_id="another", token="t", address="tcp://127.0.0.1:1")
     (folder / LOCK_FILE).write_bytes(owner.encoded())
     return folder
 

@@ -17,11 +17,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from millrace.learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from millrace.learner.run_folder.lease import WIDTH, LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
 from millrace.learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run, living_owner
 from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
-ELSEWHERE = Owner(host="far", pid=77, boot="another kernel", token="theirs")
+ELSEWHERE = Owner(host="far", pid=77, boot_id="another kernel", token="theirs")
 SOCKET = Listens("ipc:///tmp/here/learner", "ipc:///tmp/here/learner")
 NEVER = Pace(rewrite_every=1e6, dead_after=30.0, look_every=1.0, confirm_after=1.0)
 OWNS = """
@@ -61,7 +61,9 @@ def owner_of(folder: Path) -> Owner:
 
 
 def held_elsewhere(folder: Path, count: int = 0) -> None:
-    (folder / LOCK_FILE).write_bytes(Owner(host="far", pid=77, boot="another kernel", token="theirs", count=count).encoded())
+    (folder / LOCK_FILE).write_bytes(
+        Owner(host="far", pid=77, boot_id="another kernel", token="theirs", count=count).encoded()
+    )
 
 
 # ------------------------------------------------------------------------------------------- the judgement
@@ -77,7 +79,9 @@ def test_an_observer_judges_by_its_own_clock() -> None:
 
 
 def test_every_rewrite_replaces_the_whole() -> None:
-    lengths = {len(Owner(host="h" * n, pid=n, boot="b" * 36, token="t" * 16, count=10**n).encoded()) for n in range(1, 15)}
+    lengths = {
+        len(Owner(host="h" * n, pid=n, boot_id="b" * 36, token="t" * 16, count=10**n).encoded()) for n in range(1, 15)
+    }
     assert len(lengths) == 1
     assert decoded(ELSEWHERE.encoded()) == ELSEWHERE
     for damaged in (b"", b"{}", ELSEWHERE.encoded()[:40], b"\xff" * 512):
@@ -177,7 +181,7 @@ def test_a_lock_that_is_released_while_one_waits_is_taken(tmp_path: Path) -> Non
 
 def test_of_two_that_take_over_at_the_same_time_one_is_refused(tmp_path: Path) -> None:
     held_elsewhere(tmp_path)
-    third = Owner(host="third", pid=5, boot="a third kernel", token="third")
+    third = Owner(host="third", pid=5, boot_id="a third kernel", token="third")
     time = Time(lambda now: (tmp_path / LOCK_FILE).write_bytes(third.encoded()) if now > 1030 else None)
     with pytest.raises(UsageError, match="process 5 on third is training it"):
         lock(tmp_path, time).__enter__()
@@ -256,8 +260,8 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
             assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
             assert owner_of(tmp_path).address == ""
         for why, line in (
-            (Closed.INPROC, "cannot be asked: with --transport inproc it listens in its own process only"),
-            (Closed.KEYS_OF_THE_RUN, "cannot be asked: .* the keys of its local workers are in no file; run it with"),
+            (Unreachable.INPROC, "cannot be asked: with --transport inproc it listens in its own process only"),
+            (Unreachable.KEYS_OF_THE_RUN, "cannot be asked: .* the keys of its local workers are in no file; run it with"),
         ):
             held.announce(why)
             with pytest.raises(UsageError, match=line):
@@ -312,7 +316,7 @@ def test_a_learner_of_this_machine_is_asked_at_its_own_address(tmp_path: Path) -
     with lock(tmp_path) as held:
         held.announce(Listens("tcp://box:5555", "tcp://127.0.0.1:5555", "/home/me/keys"))
         assert learner_of_run(tmp_path) == LearnerOfRun("tcp://127.0.0.1:5555", Path("/home/me/keys"), is_here=True)
-        in_a_container = replace(owner_of(tmp_path), network="net:[1]")
+        in_a_container = replace(owner_of(tmp_path), network_namespace="net:[1]")
     (tmp_path / LOCK_FILE).write_bytes(in_a_container.encoded())
     assert learner_of_run(tmp_path) == LearnerOfRun("tcp://box:5555", Path("/home/me/keys"), is_here=False)
     (tmp_path / LOCK_FILE).write_bytes(replace(in_a_container, address="tcp://127.0.0.1:5555").encoded())
@@ -330,7 +334,7 @@ def test_a_process_that_is_gone_trains_nothing(tmp_path: Path, address: str) -> 
     (tmp_path / LOCK_FILE).write_bytes(mine.encoded())
     with pytest.raises(UsageError, match=rf"no process trains it now; process {ended.pid} on \S+ did, and is gone"):
         learner_of_run(tmp_path)
-    (tmp_path / LOCK_FILE).write_bytes(replace(mine, numbers="pid:[1]").encoded())
+    (tmp_path / LOCK_FILE).write_bytes(replace(mine, pid_namespace="pid:[1]").encoded())
     assert str(living_owner(tmp_path, time.time())).startswith(f"process {ended.pid}"), "a container has other numbers"
 
 

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 import millrace
 from millrace.cli.commands import COMMANDS
 from millrace.cli.main import main
-from millrace.cli.shown_run import next_commands
+from millrace.cli.train_output import next_commands
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS

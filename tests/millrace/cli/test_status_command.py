@@ -52,7 +52,7 @@ def write_lock(run: Path, keys: str, boot: str = "", host: str = "box") -> None:
 
 
 def _elsewhere(owner: Owner, boot: str, host: str) -> Owner:
-    return replace(owner, boot=boot, host=host) if boot else owner
+    return replace(owner, boot_id=boot, host=host) if boot else owner
 
 
 def test_a_learner_here_is_asked_with_the_token_of_its_key_folder(run: Path, keys: KeyFolder) -> None:

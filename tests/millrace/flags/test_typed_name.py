@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.cli.shown_run import next_commands
+from millrace.cli.train_output import next_commands
 from millrace.flags.program_name import typed_name
 
 

@@ -228,7 +228,7 @@ def test_an_interrupt_while_a_callback_runs(tmp_path: Path, whole: Path) -> None
 
 
 def test_a_run_that_another_process_takes_over_ends_without_a_summary(tmp_path: Path) -> None:
-    other = Owner(host="far", pid=77, boot="another kernel", token="theirs").encoded()
+    other = Owner(host="far", pid=77, boot_id="another kernel", token="theirs").encoded()
     told = Acts("on_update", lambda progress: Path(progress.run, LOCK_FILE).write_bytes(other), updates=4)
     with pytest.raises(RunTakenOver):
         run(tmp_path, told, checkpoint_every_s=0.0)

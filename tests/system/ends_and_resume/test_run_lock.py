@@ -129,7 +129,7 @@ def test_a_second_learner_is_refused_a_killed_one_replaced_and_a_replaced_one_en
     third.hears(f"process {first.pid} on .* held its lock and is gone; this process takes over", START_S)
     third.trains(2)
 
-    other = Owner(host="far", pid=77, boot="another kernel", token="theirs").encoded()
+    other = Owner(host="far", pid=77, boot_id="another kernel", token="theirs").encoded()
     lock.write_bytes(other)  # as if a process elsewhere had found this one dead
     assert third.ends(START_S) == 1, third.said()
     assert "process 77 on far has taken it over" in third.said().splitlines()[-1]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from millrace.extras.monitoring.dashboard.live import LaneSample, Seen
+from millrace.extras.monitoring.dashboard.lookout import LaneSample, Seen
 from millrace.extras.monitoring.metric_names import METRICS, NONE, described, label
 from millrace.extras.monitoring.report.charts import DOT_KEY, Segment, Series, bar, chart_for_all_widths
 from millrace.extras.monitoring.report.curve import points

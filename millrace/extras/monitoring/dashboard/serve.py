@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from millrace.extras.monitoring.dashboard.known_runs import KnownRuns
-from millrace.extras.monitoring.dashboard.live import Lookout
+from millrace.extras.monitoring.dashboard.lookout import Lookout
 from millrace.extras.monitoring.dashboard.server import DashboardServer
 from millrace.extras.monitoring.dashboard.site import Site
 from millrace.learner.interrupts import Interrupts, Stopped

@@ -18,7 +18,7 @@ from urllib.parse import quote
 from millrace.extras.monitoring.dashboard import run_page
 from millrace.extras.monitoring.dashboard.http import PageAnswer, PageRequest, StoredBody, refusal
 from millrace.extras.monitoring.dashboard.known_runs import KnownRuns, key_of, newest_logs
-from millrace.extras.monitoring.dashboard.live import Seen
+from millrace.extras.monitoring.dashboard.lookout import Seen
 from millrace.extras.monitoring.dashboard.run_page import Choice
 from millrace.extras.monitoring.report import ledger_and_stages, sections
 from millrace.extras.monitoring.report.history import history

@@ -14,7 +14,7 @@ import pytest
 from millrace.extras.monitoring.dashboard import run_page, site
 from millrace.extras.monitoring.dashboard.http import PageAnswer, answer_parts, parsed
 from millrace.extras.monitoring.dashboard.known_runs import KnownRuns, key_of, newest_logs
-from millrace.extras.monitoring.dashboard.live import LaneSample, Seen, sample
+from millrace.extras.monitoring.dashboard.lookout import LaneSample, Seen, sample
 from millrace.extras.monitoring.dashboard.run_page import Choice, smoothed
 from millrace.extras.monitoring.dashboard.site import Site
 from millrace.extras.monitoring.metric_names import METRICS, described, label
@@ -136,7 +136,7 @@ def test_a_finished_run_shows_its_last_state_and_no_learner_is_asked(tmp_path: P
 
 @pytest.mark.parametrize("address", ["tcp://*:5555", "tcp://box:5555;touch x", "tcp://$(id):1", "tcp://box:1' x"])
 def test_the_command_for_one_more_worker_is_words_that_a_shell_leaves_alone(address: str) -> None:
-    owner = Owner(host="box", pid=1, boot="", token="t", address=address)
+    owner = Owner(host="box", pid=1, boot_id="", token="t", address=address)
     page = Reader(run_page.join(SimpleNamespace(owner=owner)))  # type: ignore[arg-type]
     (command,) = re.findall("millrace worker .*", page.text)
     assert shlex.split(command) == ["millrace", "worker", address, "--insecure"]

@@ -1,6 +1,6 @@
 """Reads groups and arrays of an HDF5 file that may come from a stranger, and of no other file.
 
-Rule: nothing leads out of the file. A link is not followed, wherever it leads, and the numbers of an array are all in the
+Rule: nothing leads out of the file. A link is not followed, wherever it leads, and the data of an array are all in the
 file, compressed only by what h5py brings with it. So memory is bounded by the size of the file: an array has at most
 `MOST_EXPANSION` times as many bytes.
 """
@@ -16,7 +16,7 @@ from typing import Any, Self
 
 from millrace.learner.run_folder.regular_files import open_regular
 
-MOST_EXPANSION = 1_032  # deflate, the strongest compression that is read, makes no more bytes of one
+MOST_EXPANSION = 1_032  # deflate makes at most so many bytes of one; no other filter that is read makes more
 FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf. Any other may be a plug-in, which the file would choose
 
 
@@ -24,11 +24,11 @@ class UnfitFile(Exception):
     """What is wrong with the file, in one line."""
 
 
-class ClosedHDF5:
+class SelfContainedHDF5:
     """An open file. Its methods raise `UnfitFile`; h5py raises other errors, of several types, if the file is damaged."""
 
     def __init__(self, file: Any, most_bytes: int) -> None:
-        """`most_bytes`: of its arrays."""
+        """`most_bytes`: of each of its arrays."""
         self.root = file
         self.most_bytes = most_bytes
 
@@ -36,15 +36,10 @@ class ClosedHDF5:
     @contextmanager
     def open(cls, path: Path) -> Iterator[Self]:
         """Open a file to read it. Raises `OSError`, also for a link or anything but a regular file."""
-        descriptor = open_regular(path)
-        try:
-            size = os.fstat(descriptor).st_size
-        finally:
-            os.close(descriptor)
         import h5py
 
-        with h5py.File(path, "r") as file:
-            yield cls(file, size * MOST_EXPANSION)
+        with os.fdopen(open_regular(path), "rb") as opened, h5py.File(opened, "r") as file:
+            yield cls(file, os.fstat(opened.fileno()).st_size * MOST_EXPANSION)
 
     def group(self, parent: Any, name: str) -> Any:
         """The group of this name inside another."""
@@ -62,15 +57,15 @@ class ClosedHDF5:
         if not isinstance(found, h5py.Dataset) or found.shape is None:
             raise UnfitFile(f"{found.name}: expected an array, got {type(found).__name__}")
         if found.is_virtual or found.external:
-            raise UnfitFile(f"{found.name}: expected its numbers in this file, got an array that names other files")
-        made = found.id.get_create_plist()
-        if unknown := {made.get_filter(each)[0] for each in range(made.get_nfilters())} - FILTERS:
+            raise UnfitFile(f"{found.name}: expected its data in this file, got an array that names other files")
+        creation = found.id.get_create_plist()
+        if unknown := {creation.get_filter(each)[0] for each in range(creation.get_nfilters())} - FILTERS:
             raise UnfitFile(f"{found.name}: expected no compression, gzip or lzf, got filter {min(unknown)}")
         elements = max(found.size, math.prod(found.chunks or ()))  # HDF5 decompresses whole chunks
         if (most := elements * found.dtype.itemsize) > self.most_bytes:
             raise UnfitFile(f"{found.name}: expected at most {self.most_bytes:,} bytes in a file of this size, got {most:,}")
         if not _is_whole(found):
-            raise UnfitFile(f"{found.name}: expected all of its numbers in this file, got a part of them")
+            raise UnfitFile(f"{found.name}: expected all of its data in this file, got a part of them")
         return found
 
     def _member(self, parent: Any, name: str) -> Any:
@@ -86,7 +81,7 @@ class ClosedHDF5:
 
 
 def _is_whole(array: Any) -> bool:
-    """Whether the file has every number of an array. HDF5 would make up those that were not written."""
+    """Whether the file has all data of an array. HDF5 returns a fill value for what was never written."""
     if not array.chunks:
         return bool(array.id.get_storage_size() >= array.nbytes)
     sides = zip(array.shape, array.chunks, strict=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from millrace.extras.monitoring.dashboard import live
-from millrace.extras.monitoring.dashboard.live import Lookout, Seen
+from millrace.extras.monitoring.dashboard import lookout as lookout_module
+from millrace.extras.monitoring.dashboard.lookout import Lookout, Seen
 from millrace.learner.run_folder.lease import Listens
 from millrace.learner.run_folder.run_lock import RunLock
 from millrace.protocol.messages import Status
@@ -53,8 +53,8 @@ def address() -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def _often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "ASK_EVERY_S", 0.01)
-    monkeypatch.setattr(live, "ANSWER_WITHIN_S", 0.05)
+    monkeypatch.setattr(lookout_module, "ASK_EVERY_S", 0.01)
+    monkeypatch.setattr(lookout_module, "ANSWER_WITHIN_S", 0.05)
 
 
 def looked(lookout: Lookout, run: Path, samples: int) -> Seen:
@@ -78,12 +78,12 @@ def test_a_learner_is_asked_as_long_as_somebody_looks(tmp_path: Path, address: s
             assert seen.status.progress.waiting == "waiting 3 s for lane 0"
             assert seen.samples[-1].lanes == {0: "collecting", 1: "no worker"}
             assert seen.samples[-1].learner == "waiting"
-            monkeypatch.setattr(live, "LOOKED_AT_S", 0.0)
+            monkeypatch.setattr(lookout_module, "LOOKED_AT_S", 0.0)
             threading.Event().wait(0.2)
             asked = learner.asked
             threading.Event().wait(0.2)
             assert learner.asked == asked
-            monkeypatch.setattr(live, "FORGOTTEN_S", 0.0)
+            monkeypatch.setattr(lookout_module, "FORGOTTEN_S", 0.0)
             threading.Event().wait(0.2)
             assert lookout.look(tmp_path) == Seen()
     finally:
@@ -105,13 +105,13 @@ def test_a_learner_that_never_stops_answering_holds_nobody_up(tmp_path: Path) ->
         def answers(self) -> Iterator[Status]:
             return repeat(status(worker()))
 
-    watched = live._Watched(0.0, Answering())  # type: ignore[arg-type]
+    watched = lookout_module._Watched(0.0, Answering())  # type: ignore[arg-type]
     Lookout()._listen(watched, 0.0)
     assert watched.status == status(worker())
 
 
 def test_what_is_remembered_is_bounded(tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "SAMPLES", 4)
+    monkeypatch.setattr(lookout_module, "SAMPLES", 4)
     learner = AnsweringLearner(address, status(worker(), wanted=10**9))
     try:
         with RunLock(tmp_path) as lock, Lookout() as lookout:
@@ -121,7 +121,7 @@ def test_what_is_remembered_is_bounded(tmp_path: Path, address: str, monkeypatch
                 threading.Event().wait(0.01)
             seen = lookout.look(tmp_path)
             assert len(seen.samples) == 4
-            assert len(seen.samples[0].lanes) == live.MOST_LANES
+            assert len(seen.samples[0].lanes) == lookout_module.MOST_LANES
     finally:
         learner.close()
 
@@ -155,17 +155,17 @@ MADE: list[SilentLearner] = []
 def test_a_learner_that_is_silent_is_asked_anew_after_a_pause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it has sent of a message fills our memory as long as the connection is open."""
     MADE.clear()
-    monkeypatch.setattr(live, "WorkerLink", SilentLearner)
+    monkeypatch.setattr(lookout_module, "WorkerLink", SilentLearner)
     now = 100.0
-    lookout, watched = Lookout(lambda: now), live._Watched(now)
+    lookout, watched = Lookout(lambda: now), lookout_module._Watched(now)
     with RunLock(tmp_path) as lock:
         lock.announce(Listens("tcp://127.0.0.1:9", "tcp://127.0.0.1:9"))
         for now, made, closed in (
             (100.0, 1, False),
-            (100.0 + live.SILENT_S, 1, False),
-            (100.1 + live.SILENT_S, 1, True),
-            (100.1 + live.SILENT_S + live.PAUSE_S / 2, 1, True),
-            (100.2 + live.SILENT_S + live.PAUSE_S, 2, False),
+            (100.0 + lookout_module.SILENT_S, 1, False),
+            (100.1 + lookout_module.SILENT_S, 1, True),
+            (100.1 + lookout_module.SILENT_S + lookout_module.PAUSE_S / 2, 1, True),
+            (100.2 + lookout_module.SILENT_S + lookout_module.PAUSE_S, 2, False),
         ):
             lookout._ask(tmp_path, watched)
             lookout._listen(watched, 0.0)

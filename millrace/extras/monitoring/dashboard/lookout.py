@@ -1,7 +1,7 @@
 """Asks the learners of the runs that somebody looks at, twice a second, and remembers the answers of the last minutes.
 
 Rule: a learner is asked as `millrace status` asks it, with the same rights, and only while a page of its run is open. What
-is remembered of a run is bounded, and forgotten when nobody looks.
+is remembered of a run is bounded, and forgotten when nobody looks. An open page asks for it once a second (`page.js`).
 """
 
 from __future__ import annotations
