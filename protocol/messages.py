@@ -42,19 +42,23 @@ TOLD_TO_STOP = "told to stop"
 
 
 class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
-    """May I join? Repeated with backoff until it is answered."""
+    """May I join? Repeated with backoff until it is answered.
+
+    (rule HELLO_AGAIN)
+    """
 
     protocol: Natural
     worker: Name
-    """the worker's name; also its routing id"""
+    """the worker's name; also its routing id (rule HELLO)"""
     host: Line
     pid: Pid
     process_nonce: Natural
-    """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner"""
+    """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner
+    (rule REAPPEARS)"""
     software: Line
     attempt: Natural
     """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
-    Hello keeps the number. So it also tells which process a Welcome answers."""
+    Hello keeps the number. So it also tells which process a Welcome answers (rules HELLO, HELLO_AGAIN)"""
     evaluates: bool = False
     """true: the worker only plays evaluations, and gets no lane"""
 
@@ -100,7 +104,7 @@ class Weights(Message, frozen=True):
     env_attributes: Array | None = None
     """[bytes] uint8, `plain_values`: attributes by name, which the copies of a lane get before its next
     rollout under these weights, new copies before their first reset. They keep them until other weights name them. Copies
-    that play evaluations get none
+    that play evaluations get none (rule ATTRIBUTES)
     """
 
 
@@ -171,14 +175,16 @@ class Heartbeat(Message, frozen=True):
 
     session: Natural
     replies: Natural
-    """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost"""
+    """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost
+    (rule HEARTBEAT_REPLIES)"""
     versions: Versions
-    """of the weights held, ascending"""
+    """of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
     tickets: Tickets
-    """tickets that are held and not finished: those that wait, and those of the work in progress"""
+    """tickets that are held and not finished: those that wait, and those of the work in progress
+    (rule HEARTBEAT_TICKETS)"""
     steps: Natural
     """env steps since the worker started, in all sessions: of rollouts and evaluations, best counted as they are made, and
-    with `StepSpec` those of each copy that a Step steps; a copy that it only resets may count too
+    with `StepSpec` those of each copy that a Step steps; a copy that it only resets may count too (rule HEARTBEAT_STEPS)
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""
@@ -189,7 +195,8 @@ class Heartbeat(Message, frozen=True):
     note: Line = ""
     """what whoever trains should know of the environment, if the worker has seen something; the learner says it once"""
     waits: bool = False
-    """true: the worker knows of no run, because its `Welcome` brought a `WaitSpec`, and no second one has come"""
+    """true: the worker knows of no run, because its `Welcome` brought a `WaitSpec`, and no second one has come
+    (rule HEARTBEAT_WAITS)"""
 
 
 class HeartbeatReply(Message, frozen=True):
@@ -248,7 +255,10 @@ class Described(Message, frozen=True):
 
 
 class Evaluate(Message, frozen=True):
-    """Play one episode for each seed, on copies of their own, under weights of this version. Answered by `Evaluated`."""
+    """Play one episode for each seed, on copies of their own, under weights of this version. Answered by `Evaluated`.
+
+    (rule EVALUATE)
+    """
 
     session: Natural
     ticket: Natural
@@ -257,7 +267,7 @@ class Evaluate(Message, frozen=True):
     """reset seed of each episode; all are stepped together, and those that ended stay in the batch, unused"""
     greedy: bool
     """true: take the most probable actions; false: draw them, from random numbers that follow from the first seed and that
-    no environment with this seed draws"""
+    no environment with this seed draws (rule GREEDY)"""
     most_steps: Count
     """an episode that reaches this number of steps without an end is cut"""
     send_rows: bool
@@ -287,15 +297,15 @@ class EpisodeRows(Message, frozen=True):
     first_step: Natural
     """step of the episode at which the first row stands, from 0"""
     obs: tuple[Array, ...]
-    """one array [L+1, *leaf] for each leaf of the observation"""
+    """one array [L+1, *leaf] for each leaf of the observation (rule EPISODE_ROWS)"""
     action: Array
     """[L, *action]"""
     reward: Array
-    """[L] float64, raw"""
+    """[L] float64, raw (rule EPISODE_ROWS)"""
     terminated: Array
     """[L] bool"""
     truncated: Array
-    """[L] bool; also set in the last row of an episode that was cut"""
+    """[L] bool; also set in the last row of an episode that was cut (rule EPISODE_ROWS)"""
     frames: Array | None = None
     """[L+1, H, W, 3] uint8, what the environment rendered"""
 
@@ -308,7 +318,7 @@ class Evaluated(Message, frozen=True):
     episodes: Annotated[tuple[Episode, ...], Meta(max_length=MAX_SEEDS)]
     """one for each seed"""
     cut: Annotated[tuple[bool, ...], Meta(max_length=MAX_SEEDS)]
-    """for each episode whether it was cut at `most_steps`; one that ends at this step was not"""
+    """for each episode whether it was cut at `most_steps`; one that ends at this step was not (rule CUT)"""
 
 
 class Reset(Message, frozen=True):
@@ -324,7 +334,7 @@ class Reset(Message, frozen=True):
     seeds: tuple[int | None, ...]
     """one seed for each of `copies`; null: go on with the random numbers that the copy has"""
     options: Array
-    """[bytes] uint8, `plain_values`: the options of `Env.reset`, or None; a list has those of each copy"""
+    """[bytes] uint8, `plain_values`: the options of `Env.reset`, or None; a list has those of each copy (rule OPTIONS)"""
 
 
 class Step(Message, frozen=True):
@@ -372,16 +382,17 @@ class Stepped(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     obs: tuple[Array, ...]
-    """one array [N, *leaf] for each leaf of the observation; with seats, three more (`StepSpec.seats`)"""
+    """one array [N, *leaf] for each leaf of the observation; with seats, three more (`StepSpec.seats`)
+    (rule STEPPED_ARRAYS)"""
     reward: Array
-    """[N] float64, raw"""
+    """[N] float64, raw (rule STEPPED_ARRAYS)"""
     terminated: Array
-    """[N] bool"""
+    """[N] bool (rule STEPPED_ARRAYS)"""
     truncated: Array
-    """[N] bool"""
+    """[N] bool (rule STEPPED_ARRAYS)"""
     infos: Array
     """[bytes] uint8: a list of pairs of copy and info, each pair a list or a tuple, packed by `plain_values`;
-    empty infos are left out
+    empty infos are left out (rule STEPPED_ARRAYS)
     """
 
 

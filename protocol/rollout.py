@@ -40,8 +40,9 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     """An episode that ended in this rollout, in raw rewards."""
 
     reward: Real
-    """the return: undiscounted sum of raw rewards"""
+    """the return: undiscounted sum of raw rewards (rule EPISODES)"""
     length: Count
+    """number of steps (rule EPISODES)"""
     seconds: Seconds
     facts: Annotated[tuple[float, ...], Meta(max_length=MAX_FACTS)] = ()
     """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where it had none"""
@@ -75,7 +76,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     state: Array
     """[N, S] float32: state of the recurrent core before obs[0]; S is 0 without a core"""
     episodes: tuple[Episode, ...] = ()
-    """the episodes that ended in this rollout, ordered by step, then by copy"""
+    """the episodes that ended in this rollout, ordered by step, then by copy (rule EPISODE_ORDER)"""
     mask: Array | None = None
     """[T+1, N, choices] bool: which actions were allowed in `obs`; none unless `RunSpec.masked`"""
     extras: tuple[Array, ...] = ()

@@ -18,6 +18,8 @@ from pathlib import Path, PurePosixPath
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
+READ = {"protocol/README.md"}
+"""pages that the program reads"""
 PARTS = ("learner", "workers", "protocol")
 """packages of millrace that stand beside its folder in the repository, which has links to them"""
 PACKAGES = ("millrace", *(f"millrace/{part}" for part in PARTS))
@@ -27,7 +29,7 @@ TRAINING = ["CartPole-v1", "--steps", "20000", "--workers", "1", "--eval-episode
 def data_files() -> set[str]:
     """The files of the packages that are no Python, as a distribution must have them."""
     tracked = subprocess.run(["git", "ls-files", "millrace", *PARTS], cwd=ROOT, capture_output=True, text=True, check=True)
-    paths = {path for path in tracked.stdout.splitlines() if not path.endswith((".py", ".md"))} - {*PACKAGES}
+    paths = {path for path in tracked.stdout.splitlines() if not path.endswith((".py", ".md"))} - {*PACKAGES} | READ
     return {path if path.startswith("millrace/") else f"millrace/{path}" for path in paths}
 
 

@@ -199,6 +199,12 @@ def one_line(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
+def marked(meaning: str) -> str:
+    """A docstring in one line, behind the marker of the rules that it ends with."""
+    text, _, rules = one_line(meaning).partition(" (rule")
+    return f"<!-- rule {rules.removeprefix('s').strip(' )')} -->{text}" if rules else text
+
+
 def in_words(kind: ast.expr) -> str:
     """A type as it is written, in words."""
     match kind:
@@ -265,7 +271,10 @@ def record(kind: type[msgspec.Struct]) -> str:
     """A heading, what the class says of itself, and its fields: with their places, if they go by position."""
     config = kind.__struct_config__
     told = f" See {links(PROSE[kind])}." if kind in PROSE else ""
-    lines = [f"#### `{kind.__name__}`", "", one_line(inspect.getdoc(kind) or "") + told, ""]
+    says = marked(inspect.getdoc(kind) or "")
+    if "<!--" in says and told:
+        says += "<!-- rule -->"
+    lines = [f"#### `{kind.__name__}`", "", says + told, ""]
     rows = fields_of(kind)
     if not config.array_like:
         lines += [f"A map; `{config.tag_field}` is `{kind.__name__}`." if config.tag else "A map.", ""]
@@ -279,7 +288,7 @@ def record(kind: type[msgspec.Struct]) -> str:
         for place, (name, annotation, default, meaning) in enumerate(rows, 1 if config.tag else 0):
             text = annotation + (f" = `{one_line(default)}`" if default else "")
             at = f"| {place} " if places else ""
-            lines.append(f"{at}| `{name}` | {text} | {one_line(meaning or WORDS.get(name, ''))} |")
+            lines.append(f"{at}| `{name}` | {text} | {marked(meaning or WORDS.get(name, ''))} |")
         lines.append("")
     return "\n".join(lines)
 

@@ -14,7 +14,6 @@ import msgpack
 import numpy as np
 from msgspec.structs import replace
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.join_checks import (
     POLE_GAINS,
     begins,
@@ -26,7 +25,6 @@ from millrace.extras.conformance.join_checks import (
 )
 from millrace.extras.conformance.lane_rows import resets_of
 from millrace.extras.conformance.learner import QUIET_S, Learner
-from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
 from millrace.extras.conformance.watch import resets_too_early
 from millrace.protocol.arrays import Floats
@@ -52,6 +50,7 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.policy.features import leaf_of_features
 from millrace.protocol.policy.layout import acting_size, buffer_size, named_views, parameter_layout
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
@@ -121,7 +120,7 @@ class Collecting:
 
     def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
         """The rollout of a permit that was dealt, or has come. If none comes, this rule or the likely one is broken."""
-        rule = rule or self.learner.watch.rule_of_missing(permit.ticket, rules.TICKETS)
+        rule = rule or self.learner.watch.rule_of_missing(permit.ticket, Rule.TICKETS)
         if isinstance(found := self.learner.watch.answers.get(permit.ticket), Rollout):
             return found
         text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
@@ -149,7 +148,7 @@ def run_spec(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Scri
     try:
         policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space), **fields)
     except UsageError as error:
-        raise Broken(rules.DESCRIBE, "spaces that a policy can use", str(error)) from None
+        raise Broken(Rule.DESCRIBE, "spaces that a policy can use", str(error)) from None
     settings = learner.settings
     return RunSpec(
         env=settings.env,
@@ -216,7 +215,7 @@ def acts_as_its_policy_says(learner: Learner) -> Script[None]:
 def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
     text = f"the rollout of ticket {permit.ticket}"
     within_s = 2 * learner.settings.patience_s
-    yield from learner.takes_part(Rollout, rules.TICKETS, text, within_s=within_s)
+    yield from learner.takes_part(Rollout, Rule.TICKETS, text, within_s=within_s)
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
@@ -236,7 +235,7 @@ def sets_attributes(learner: Learner) -> Script[None]:
         if (change > 0.05) != pushed:
             forces = attributes or "as before"
             expected = f"a cart that is {'pushed' if pushed else 'not pushed'} under version {version}: {forces}"
-            raise Broken(rules.ATTRIBUTES, expected, f"its speed changes by up to {change:.3f} in a step")
+            raise Broken(Rule.ATTRIBUTES, expected, f"its speed changes by up to {change:.3f} in a step")
 
 
 def collects(learner: Learner) -> Script[None]:
@@ -271,7 +270,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
         raise Skipped(f"no episode ended in {40 * 7} steps")
     if resets_too_early(around):
         raise Broken(
-            rules.LAST_OBSERVATION,
+            Rule.LAST_OBSERVATION,
             "the last observation of an episode in obs[t+1] of the row that ends it",
             f"the first one of the next episode, at each of {len(around)} ends",
         )
@@ -286,7 +285,7 @@ def declines_other_agents(learner: Learner) -> Script[None]:
     session = Collecting(learner, run)
     session.deal(session.permit())
     text = f"Goodbye with the reason, in a run of {agents_in_words(run.seats, run.takes_turns)}"
-    yield from learner.expect((Goodbye, Failure), rules.OTHER_AGENTS, text, within_s=_long(learner))
+    yield from learner.expect((Goodbye, Failure), Rule.OTHER_AGENTS, text, within_s=_long(learner))
     yield from _ends(learner, (1, 2), "its last words")
 
 
@@ -302,14 +301,12 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
         rollout = yield from session.rollout(permit)
         for episode in rollout.episodes:
             if episode.length > longest:
-                raise Broken(
-                    rules.TRUNCATED, f"episodes of at most {longest} steps, as described", f"{episode.length} steps"
-                )
+                raise Broken(Rule.TRUNCATED, f"episodes of at most {longest} steps, as described", f"{episode.length} steps")
             reached |= episode.length == longest
         lengths = np.array([episode.length for episode in rollout.episodes])
         flags = _truncated_in_order(rollout)
         if (early := flags & (lengths < longest)).any():
-            raise Broken(rules.TRUNCATED, f"truncated after {longest} steps only", f"after {lengths[early][0]} steps")
+            raise Broken(Rule.TRUNCATED, f"truncated after {longest} steps only", f"after {lengths[early][0]} steps")
     if not reached:
         raise Skipped("no episode reached the time limit")
 
@@ -343,9 +340,9 @@ def waits_for_weights(learner: Learner) -> Script[None]:
     permit = session.permit()
     session.order(permit, version=2, keep=(1,))
     text = f"no rollout of ticket {permit.ticket} before the Weights of version 2"
-    yield from learner.quiet(Rollout, rules.VERSION, text)
+    yield from learner.quiet(Rollout, Rule.VERSION, text)
     session.give(session.weights(2))
-    yield from session.rollout(permit, rules.VERSION)
+    yield from session.rollout(permit, Rule.VERSION)
 
 
 def acts_under_the_named_version(learner: Learner) -> Script[None]:
@@ -356,11 +353,11 @@ def acts_under_the_named_version(learner: Learner) -> Script[None]:
     session.order(older, version=3)
     session.give(session.weights(5))
     text = f"no rollout of ticket {older.ticket} before the Weights of version 3, which it names"
-    yield from learner.quiet(Rollout, rules.VERSION, text)
+    yield from learner.quiet(Rollout, Rule.VERSION, text)
     session.give(session.weights(3))
-    yield from session.rollout(older, rules.VERSION)
+    yield from session.rollout(older, Rule.VERSION)
     session.order(newer, version=5)
-    yield from session.rollout(newer, rules.HOLDS_WEIGHTS)
+    yield from session.rollout(newer, Rule.HOLDS_WEIGHTS)
 
 
 def holds_two_versions(learner: Learner) -> Script[None]:
@@ -372,7 +369,7 @@ def holds_two_versions(learner: Learner) -> Script[None]:
     session.deal(second, version=2)
     session.give(session.weights(1))
     for permit in (first, second):
-        yield from session.rollout(permit, rules.HOLDS_WEIGHTS)
+        yield from session.rollout(permit, Rule.HOLDS_WEIGHTS)
 
 
 def collects_in_order(learner: Learner) -> Script[None]:
@@ -383,10 +380,10 @@ def collects_in_order(learner: Learner) -> Script[None]:
     later = session.permit()
     session.deal(later)
     text = f"no rollout of sequence {later.sequence} before that of sequence {lost.sequence}"
-    yield from learner.quiet(Rollout, rules.IN_ORDER, text)
+    yield from learner.quiet(Rollout, Rule.IN_ORDER, text)
     session.deal(lost)
     for permit in (lost, later):
-        yield from session.rollout(permit, rules.IN_ORDER)
+        yield from session.rollout(permit, Rule.IN_ORDER)
 
 
 def lists_what_it_holds(learner: Learner) -> Script[None]:
@@ -396,7 +393,7 @@ def lists_what_it_holds(learner: Learner) -> Script[None]:
     for version in (2, 3):
         session.deal(session.permit(), version=version)
     text = "a Heartbeat with versions 2 and 3, which have come and which tickets name"
-    yield from learner.expect(Heartbeat, rules.HEARTBEAT_VERSIONS, text, versions=(2, 3))
+    yield from learner.expect(Heartbeat, Rule.HEARTBEAT_VERSIONS, text, versions=(2, 3))
     yield from heartbeats(learner, 4)
 
 
@@ -409,7 +406,7 @@ def keeps_listed_weights(learner: Learner) -> Script[None]:
         beat = yield from heartbeats(learner, 2)
         if beat.versions != kept:
             expected = f"{list(kept)}, which the last order listed: no ticket is left"
-            raise Broken(rules.HOLDS_WEIGHTS, expected, f"{list(beat.versions)}")
+            raise Broken(Rule.HOLDS_WEIGHTS, expected, f"{list(beat.versions)}")
 
 
 def keeps_its_weights(learner: Learner) -> Script[None]:
@@ -443,7 +440,7 @@ def sends_again(learner: Learner) -> Script[None]:
     for _ in range(2):
         session.deal(permit)
         yield from learner.expect(
-            Rollout, rules.ROLLOUT_ONCE, f"the rollout of ticket {permit.ticket} again", ticket=permit.ticket
+            Rollout, Rule.ROLLOUT_ONCE, f"the rollout of ticket {permit.ticket} again", ticket=permit.ticket
         )
     yield from session.collect()
 
@@ -455,7 +452,7 @@ def forgets_what_arrived(learner: Learner) -> Script[None]:
     yield from session.collect(permit)
     yield from heartbeats(learner, 2)
     session.deal(permit)
-    yield from learner.quiet(Rollout, rules.RECEIVED, f"no rollout of ticket {permit.ticket} after it was received")
+    yield from learner.quiet(Rollout, Rule.RECEIVED, f"no rollout of ticket {permit.ticket} after it was received")
     yield from session.collect()
 
 
@@ -465,7 +462,7 @@ def says_no_rollout_twice(learner: Learner) -> Script[None]:
     learner.watch.confirms = False
     permit = session.permit()
     yield from session.collect(permit)
-    yield from learner.quiet(Rollout, rules.ROLLOUT_ONCE, "one rollout of a ticket that was dealt once", for_s=1.0)
+    yield from learner.quiet(Rollout, Rule.ROLLOUT_ONCE, "one rollout of a ticket that was dealt once", for_s=1.0)
 
 
 def collects_two_lanes(learner: Learner) -> Script[None]:
@@ -487,12 +484,12 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
         drawn = [(a, b) for a, b in zip(actions, its_actions, strict=True) if a and b]
         if len(drawn) >= STEPS and all(a == b for a, b in drawn):
             raise Broken(
-                rules.INDEPENDENT, "copies that draw their own actions", f"those of {one} in {other}, {len(drawn)} times"
+                Rule.INDEPENDENT, "copies that draw their own actions", f"those of {one} in {other}, {len(drawn)} times"
             )
         starts = list(zip(firsts, its_firsts, strict=False))
         if len(starts) >= 2 and len(set(firsts)) > 1 and all(a == b for a, b in starts):
             got = f"those of {one} in {other}, {len(starts)} times"
-            raise Broken(rules.INDEPENDENT, "copies whose episodes begin in their own way", got)
+            raise Broken(Rule.INDEPENDENT, "copies whose episodes begin in their own way", got)
 
 
 def _did(rollouts: Sequence[Rollout], n: int, seats: int) -> tuple[list[bytes], list[bytes]]:
@@ -515,11 +512,11 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     after = yield from session.collect(session.permit(incarnation=2))
     if _repeats(before, after):
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
-        raise Broken(rules.INDEPENDENT, "other episodes in incarnation 2", got)
+        raise Broken(Rule.INDEPENDENT, "other episodes in incarnation 2", got)
     session.permit(incarnation=1)
     old = session.permit(incarnation=1)  # of the sequence that is next
     session.deal(old)
-    yield from learner.quiet(Rollout, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
+    yield from learner.quiet(Rollout, Rule.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
 
 
@@ -533,10 +530,10 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     session.give(session.weights(2))
     yield from session.rollout(kept)
-    yield from session.nothing_of(lost, rules.RELEASE, "whose lane was released")
+    yield from session.nothing_of(lost, Rule.RELEASE, "whose lane was released")
     found = yield from heartbeats(learner, 1)
     if lost.ticket in found.tickets:
-        raise Broken(rules.RELEASE, "no tickets of the released lane in a Heartbeat", f"ticket {lost.ticket}")
+        raise Broken(Rule.RELEASE, "no tickets of the released lane in a Heartbeat", f"ticket {lost.ticket}")
     yield from session.collect(session.permit(0, incarnation=1), version=2)
 
 
@@ -550,7 +547,7 @@ def closes_unlisted_lanes(learner: Learner) -> Script[None]:
     yield from heartbeats(learner, 3)
     session.give(session.weights(2))
     yield from session.rollout(kept)
-    yield from session.nothing_of(lost, rules.UNLISTED, "whose lane is not listed")
+    yield from session.nothing_of(lost, Rule.UNLISTED, "whose lane is not listed")
 
 
 def ignores_a_late_reply(learner: Learner) -> Script[None]:
@@ -568,7 +565,7 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
     session.give(session.weights(2))
     learner.answers_heartbeats = True
     text = f"the rollout of ticket {permit.ticket}: late copies of replies 6 and 2 close no lane"
-    yield from learner.expect(Rollout, rules.LATE_REPLY, text, ticket=permit.ticket)
+    yield from learner.expect(Rollout, Rule.LATE_REPLY, text, ticket=permit.ticket)
 
 
 # --------------------------------------------------------------------------------------------------------------- faults
@@ -582,7 +579,7 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
     permit = again.permit()
     again.order(permit)
     text = "no rollout before the first Weights of the session"
-    yield from learner.quiet(Rollout, rules.FORGETS, text, for_s=2 * QUIET_S)
+    yield from learner.quiet(Rollout, Rule.FORGETS, text, for_s=2 * QUIET_S)
     again.give(again.weights(1))
     yield from again.rollout(permit)
 
@@ -615,7 +612,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
     of_other = replace(permit, ticket=next(learner.tickets))
     learner.send(Collect(learner.session + 1000, 1, (of_other,), (), (1,)))
     text = "no rollout for a Collect with a field too many or too few, or of another session"
-    yield from learner.quiet(Rollout, rules.IGNORE_UNREADABLE, text)
+    yield from learner.quiet(Rollout, Rule.IGNORE_UNREADABLE, text)
     yield from session.collect(replace(permit, ticket=next(learner.tickets)))
 
 
@@ -635,7 +632,7 @@ def evaluates(learner: Learner) -> Script[None]:
     yield from _evaluate(session, order)
     learner.send(order)
     yield from learner.expect(
-        Evaluated, rules.EVALUATE_ONCE, f"Evaluated for ticket {order.ticket} again", ticket=order.ticket
+        Evaluated, Rule.EVALUATE_ONCE, f"Evaluated for ticket {order.ticket} again", ticket=order.ticket
     )
 
 
@@ -646,9 +643,9 @@ def evaluates_one_version(learner: Learner) -> Script[None]:
     order = _evaluation(learner, version=2)
     learner.send(order)
     text = f"no Evaluated for ticket {order.ticket} before version 2"
-    yield from learner.quiet(Evaluated, rules.EVALUATE_VERSION, text)
+    yield from learner.quiet(Evaluated, Rule.EVALUATE_VERSION, text)
     session.give(session.weights(2))
-    yield from learner.expect(Evaluated, rules.EVALUATE, f"Evaluated for ticket {order.ticket}", within_s=_long(learner))
+    yield from learner.expect(Evaluated, Rule.EVALUATE, f"Evaluated for ticket {order.ticket}", within_s=_long(learner))
 
 
 def evaluates_with_rows(learner: Learner) -> Script[None]:
@@ -660,7 +657,7 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
     order = _evaluation(learner, greedy=False, send_rows=True, seeds=(1, 2, 3, 4))
     learner.send(order)
     session.give(session.weights(1, np.zeros_like(session.random_parameters(1))))
-    yield from learner.takes_part(Evaluated, rules.EVALUATE, f"Evaluated for ticket {order.ticket}", within_s=_long(learner))
+    yield from learner.takes_part(Evaluated, Rule.EVALUATE, f"Evaluated for ticket {order.ticket}", within_s=_long(learner))
     order = _evaluation(learner, version=2, send_rows=True)
     answer = yield from _evaluate(session, order)
     swapped = _evaluation(learner, version=2, send_rows=True, seeds=order.seeds[::-1])
@@ -668,7 +665,7 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
     one, other = (learner.watch.played[each.ticket] for each in (order, swapped))
     if any(one.first_observation(n) != other.first_observation(1 - n) for n in (0, 1)):
         expected = f"the same first observations for the seeds {order.seeds} and {swapped.seeds}, in their order"
-        raise Broken(rules.EVALUATE_SEEDS, expected, "others")
+        raise Broken(Rule.EVALUATE_SEEDS, expected, "others")
     whole = answer.episodes[0].length
     for most in (whole - 1, whole):
         again = _evaluation(learner, version=2, send_rows=True, most_steps=max(1, most), seeds=order.seeds[:1])
@@ -676,7 +673,7 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
         is_cut = most < whole or answer.cut[0]
         if (found.episodes[0].length, found.cut[0]) != (again.most_steps, is_cut):
             expected = f"{again.most_steps} steps and cut {is_cut}: with more steps the same episode has {whole}"
-            raise Broken(rules.CUT, expected, f"{found.episodes[0].length} steps and cut {found.cut[0]}")
+            raise Broken(Rule.CUT, expected, f"{found.episodes[0].length} steps and cut {found.cut[0]}")
 
 
 def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
@@ -687,7 +684,7 @@ def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
     learner.send(order)
     session.give(session.weights(1))
     yield from learner.takes_part(
-        Evaluated, rules.EVALUATE_VERSION, f"Evaluated for ticket {order.ticket}", within_s=_long(learner)
+        Evaluated, Rule.EVALUATE_VERSION, f"Evaluated for ticket {order.ticket}", within_s=_long(learner)
     )
 
 
@@ -701,10 +698,10 @@ def ends_evaluations(learner: Learner) -> Script[None]:
     found = yield from heartbeats(learner, 1)
     if over.ticket in found.tickets:
         got = f"ticket {over.ticket}"
-        raise Broken(rules.EVALUATE_ENDS, "no ticket of version 3 in a Heartbeat, after an Evaluate of version 2", got)
+        raise Broken(Rule.EVALUATE_ENDS, "no ticket of version 3 in a Heartbeat, after an Evaluate of version 2", got)
     session.give(session.weights(3))
     text = f"no Evaluated for ticket {over.ticket}, which ticket {order.ticket} has ended"
-    yield from learner.quiet(Evaluated, rules.EVALUATE_ENDS, text)
+    yield from learner.quiet(Evaluated, Rule.EVALUATE_ENDS, text)
 
 
 def _long(learner: Learner) -> float:
@@ -732,7 +729,7 @@ def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated]:
     text = f"Evaluated for ticket {order.ticket}"
     return (
         yield from session.learner.expect(
-            Evaluated, rules.EVALUATE, text, within_s=_long(session.learner), ticket=order.ticket
+            Evaluated, Rule.EVALUATE, text, within_s=_long(session.learner), ticket=order.ticket
         )
     )
 
@@ -750,20 +747,20 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     beat_s = learner.settings.heartbeat_s
     within_s = 2 * learner.settings.patience_s
     text = "Goodbye after Drain"
-    goodbye = yield from learner.expect((Rollout, Goodbye), rules.DRAIN, text, within_s=within_s)
+    goodbye = yield from learner.expect((Rollout, Goodbye), Rule.DRAIN, text, within_s=within_s)
     finished_s = learner.now
     if not isinstance(goodbye, Goodbye):
-        goodbye = yield from learner.expect(Goodbye, rules.DRAIN, text, within_s=within_s)
+        goodbye = yield from learner.expect(Goodbye, Rule.DRAIN, text, within_s=within_s)
     if learner.watch.heard_heartbeat_s < drained_s + beat_s and finished_s > drained_s + 3 * beat_s:
         got = f"none in {finished_s - drained_s:.1f} s between Drain and the end of its rollout"
-        raise Broken(rules.HEARTBEAT, f"a Heartbeat every {beat_s:g} s while it finishes its rollout", got)
+        raise Broken(Rule.HEARTBEAT, f"a Heartbeat every {beat_s:g} s while it finishes its rollout", got)
     arrived = learner.watch.answers.keys()
     unfinished = {permit.ticket for permit in (*permits, waits)} - arrived
     if (listed := set(goodbye.tickets)) != unfinished:
-        raise Broken(rules.DRAIN, f"Goodbye with the unfinished tickets {sorted(unfinished)}", f"{sorted(listed)}")
+        raise Broken(Rule.DRAIN, f"Goodbye with the unfinished tickets {sorted(unfinished)}", f"{sorted(listed)}")
     if (late := len(arrived - early)) > 1:
-        raise Broken(rules.DRAIN, "no new rollout after Drain: at most the one in progress", f"{late} rollouts")
-    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
+        raise Broken(Rule.DRAIN, "no new rollout after Drain: at most the one in progress", f"{late} rollouts")
+    yield from learner.left(Rule.DRAIN, "Drain and Goodbye")
 
 
 def _draining(learner: Learner) -> Script[Collecting]:
@@ -780,11 +777,11 @@ def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
     late = session.permit(1)
     session.order(late)
     within_s = 2 * learner.settings.patience_s
-    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain", within_s=within_s)
+    goodbye = yield from learner.expect(Goodbye, Rule.DRAIN, "Goodbye after Drain", within_s=within_s)
     if late.ticket in learner.watch.answers or late.ticket in goodbye.tickets:
         got = "its rollout" if late.ticket in learner.watch.answers else "that ticket in Goodbye"
-        raise Broken(rules.DRAINING_IGNORES, f"nothing of ticket {late.ticket}, which came after Drain", got)
-    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
+        raise Broken(Rule.DRAINING_IGNORES, f"nothing of ticket {late.ticket}, which came after Drain", got)
+    yield from learner.left(Rule.DRAIN, "Drain and Goodbye")
 
 
 def leaves_when_refused_while_it_drains(learner: Learner) -> Script[None]:
@@ -812,11 +809,11 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
         case Ended(code) if code in codes:
             return
         case Ended(code):
-            raise Broken(rules.DRAINING_LEAVES, f"exit code {codes[0]} or {codes[1]} after {after}", f"exit code {code}")
+            raise Broken(Rule.DRAINING_LEAVES, f"exit code {codes[0]} or {codes[1]} after {after}", f"exit code {code}")
         case Heard(_, Hello(process_nonce=nonce)) if nonce != before.process_nonce:
             return
         case Heard(_, Goodbye()):
-            yield from learner.left(rules.DRAINING_LEAVES, after, codes)
+            yield from learner.left(Rule.DRAINING_LEAVES, after, codes)
         case _:
             got = "Hello" if found is not None else f"a client that still runs {within_s:g} s later"
-            raise Broken(rules.DRAINING_LEAVES, f"the client's end after {after}", got)
+            raise Broken(Rule.DRAINING_LEAVES, f"the client's end after {after}", got)

@@ -9,10 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.learner import Learner, Settings
-from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import Broken, ClientEvent, EndClient, LearnerEffect, Script, Skipped, Wait
+from millrace.protocol.rules import Rule
 
 CHECK_S = 40.0  # longest time that one check may take
 
@@ -33,6 +32,7 @@ class CheckResult:
     outcome: Literal["passed", "failed", "skipped"]
     seconds: float
     rule: Rule | None = None
+    """that is broken; None if it failed because it took too long"""
     expected: str = ""
     got: str = ""
     note: str = ""
@@ -65,7 +65,7 @@ class Examiner:
                 if self.learner.take(event, self._wait.wanted):
                     self._resume(event)
             except Broken as broken:
-                self._failed(broken)
+                self._failed(broken.rule, broken.expected, broken.got)
         return self._taken()
 
     def tick(self, now: float) -> list[LearnerEffect]:
@@ -79,14 +79,14 @@ class Examiner:
         elif self._script is None:
             self._begin()
         elif now - self._began_s > CHECK_S:
-            self._failed(Broken(rules.PATIENCE, f"the check to end within {CHECK_S:g} s", "none of that"))
+            self._failed(None, f"the check to end within {CHECK_S:g} s", "none of that")
         else:
             try:
                 learner.check_heartbeats()
                 if now >= self._due_s:
                     self._resume(None)
             except Broken as broken:
-                self._failed(broken)
+                self._failed(broken.rule, broken.expected, broken.got)
         return self._taken()
 
     def next_due_s(self) -> float:
@@ -110,10 +110,10 @@ class Examiner:
         except Skipped as skipped:
             self._record("skipped", note=str(skipped))
         except Broken as broken:
-            self._failed(broken)
+            self._failed(broken.rule, broken.expected, broken.got)
 
-    def _failed(self, broken: Broken) -> None:
-        self._record("failed", rule=broken.rule, expected=broken.expected, got=broken.got)
+    def _failed(self, rule: Rule | None, expected: str, got: str) -> None:
+        self._record("failed", rule=rule, expected=expected, got=got)
         if self.learner.runs:
             self.learner.do(EndClient())
         while self.learner.is_mute and not self.done:
@@ -139,7 +139,7 @@ class Examiner:
     def _out_of_time(self) -> None:
         while not self.done:
             self._began_s = self.learner.now
-            self._record("failed", rule=rules.PATIENCE, expected="the whole test within --limit-s", got="no time left")
+            self._record("failed", expected="the whole test within --limit-s", got="no time left")
 
     def _taken(self) -> list[LearnerEffect]:
         effects, self.learner.effects = self.learner.effects, []

@@ -10,9 +10,7 @@ from itertools import pairwise
 import numpy as np
 from msgspec.structs import replace
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.learner import Learner
-from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import AskToStop, Broken, CutConnection, Listen, Script, Skipped, Wait, brief
 from millrace.protocol.bounds import MAX_LINE
 from millrace.protocol.envs.description import DescribedEnv, read_description
@@ -33,6 +31,7 @@ from millrace.protocol.messages import (
     Weights,
     Welcome,
 )
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.socket_options import routing_id
 
@@ -65,13 +64,13 @@ def describes_on_order(learner: Learner) -> Script[Describe]:
     order = describe(learner)
     learner.send(order)
     text = f"Described of the environment {order.env.id}, with ticket {order.ticket} of the order"
-    found = yield from learner.expect((Described, Goodbye), rules.DESCRIBE, text, within_s=learner.settings.start_s)
+    found = yield from learner.expect((Described, Goodbye), Rule.DESCRIBE, text, within_s=learner.settings.start_s)
     if not isinstance(found, Described):
-        raise Broken(rules.DECLINED, text, brief(found))
+        raise Broken(Rule.DECLINED, text, brief(found))
     try:
         learner.env = read_description(found.description)
     except (BadMessage, UsageError) as error:
-        raise Broken(rules.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
+        raise Broken(Rule.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
     return order
 
 
@@ -89,7 +88,7 @@ def is_gymnasium_pole(env: DescribedEnv) -> bool:
     return env.spec is not None and str(env.spec.entry_point).endswith(":CartPoleEnv")
 
 
-def heartbeats(learner: Learner, number: int, rule: Rule = rules.HEARTBEAT) -> Script[Heartbeat]:
+def heartbeats(learner: Learner, number: int, rule: Rule = Rule.HEARTBEAT) -> Script[Heartbeat]:
     """The last of so many Heartbeats that follow."""
     for _ in range(number):
         beat = yield from learner.expect(Heartbeat, rule, "a Heartbeat")
@@ -100,7 +99,7 @@ def over_a_new_connection(learner: Learner, *others: type[Answer | Rollout]) -> 
     """Every connection is reset. A Heartbeat of the same session comes, or one of these messages."""
     learner.do(CutConnection(), Listen())
     text = "a message of the same session over a new connection"
-    yield from learner.expect((Heartbeat, *others), rules.CONNECTION, text, within_s=10)
+    yield from learner.expect((Heartbeat, *others), Rule.CONNECTION, text, within_s=10)
 
 
 # -------------------------------------------------------------------------------------------------------------- joining
@@ -114,11 +113,11 @@ def says_hello(learner: Learner) -> Script[None]:
         learner.peer.rpartition(b"\0")[0] if token else learner.peer
     )  # behind a routing id, the learner's socket puts the key
     if found.partition(b"\0")[0] != hello.worker.encode():
-        raise Broken(rules.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{found!r}")
+        raise Broken(Rule.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{found!r}")
     if found != (expected := routing_id(hello.worker, token)):
-        raise Broken(rules.ROUTING_ID, f"the routing id {expected!r}", f"{found!r}")
+        raise Broken(Rule.ROUTING_ID, f"the routing id {expected!r}", f"{found!r}")
     if hello.attempt != hello.process_nonce + 1:
-        raise Broken(rules.HELLO, f"attempt {hello.process_nonce + 1} (process_nonce + 1)", f"attempt {hello.attempt}")
+        raise Broken(Rule.HELLO, f"attempt {hello.process_nonce + 1} (process_nonce + 1)", f"attempt {hello.attempt}")
 
 
 def repeats_hello(learner: Learner) -> Script[None]:
@@ -126,13 +125,13 @@ def repeats_hello(learner: Learner) -> Script[None]:
     first = yield from learner.newly_started()
     times = [learner.now]
     for _ in range(3):
-        again = yield from learner.expect(Hello, rules.HELLO_AGAIN, "the same Hello again", within_s=6.0)
+        again = yield from learner.expect(Hello, Rule.HELLO_AGAIN, "the same Hello again", within_s=6.0)
         if (again.attempt, again.process_nonce) != (first.attempt, first.process_nonce):
-            raise Broken(rules.HELLO_AGAIN, f"attempt {first.attempt} again", f"attempt {again.attempt}")
+            raise Broken(Rule.HELLO_AGAIN, f"attempt {first.attempt} again", f"attempt {again.attempt}")
         times.append(learner.now)
     gaps = [later - earlier for earlier, later in pairwise(times)]
     if gaps[-1] < 1.3 * gaps[0] or gaps[0] < 0.1:
-        raise Broken(rules.HELLO_AGAIN, "waits that grow, from 0.25 s", f"{', '.join(f'{gap:.2f} s' for gap in gaps)}")
+        raise Broken(Rule.HELLO_AGAIN, "waits that grow, from 0.25 s", f"{', '.join(f'{gap:.2f} s' for gap in gaps)}")
 
 
 def ignores_early_messages(learner: Learner) -> Script[None]:
@@ -142,9 +141,9 @@ def ignores_early_messages(learner: Learner) -> Script[None]:
         Rejoin(1), HeartbeatReply(1, 1, ()), Release(1, ()), Weights(3, np.zeros(4, np.float32), np.zeros(0, np.float32))
     ):  # fmt: skip
         learner.send(message)
-    again = yield from learner.expect(Hello, rules.JOINING_IGNORES, "the same Hello again", within_s=6.0)
+    again = yield from learner.expect(Hello, Rule.JOINING_IGNORES, "the same Hello again", within_s=6.0)
     if again.attempt != hello.attempt:
-        raise Broken(rules.JOINING_IGNORES, f"attempt {hello.attempt} still", f"attempt {again.attempt}")
+        raise Broken(Rule.JOINING_IGNORES, f"attempt {hello.attempt} still", f"attempt {again.attempt}")
 
 
 def accepts_only_its_welcome(learner: Learner) -> Script[None]:
@@ -153,9 +152,9 @@ def accepts_only_its_welcome(learner: Learner) -> Script[None]:
     learner.send(Welcome(77, hello.attempt - 1, wait_spec(learner)))
     learner.send(Welcome(78, hello.attempt + 1, wait_spec(learner)))
     text = f"Hello until a Welcome for attempt {hello.attempt} comes"
-    found = yield from learner.expect((Hello, Heartbeat), rules.WELCOME_ATTEMPT, text, within_s=6.0)
+    found = yield from learner.expect((Hello, Heartbeat), Rule.WELCOME_ATTEMPT, text, within_s=6.0)
     if not isinstance(found, Hello):
-        raise Broken(rules.WELCOME_ATTEMPT, text, brief(found))
+        raise Broken(Rule.WELCOME_ATTEMPT, text, brief(found))
 
 
 def describes(learner: Learner) -> Script[None]:
@@ -164,10 +163,10 @@ def describes(learner: Learner) -> Script[None]:
     order = yield from describes_on_order(learner)
     learner.send(order)
     text = f"Described again, as ticket {order.ticket} came again"
-    yield from learner.expect(Described, rules.DESCRIBE_AGAIN, text, ticket=order.ticket)
+    yield from learner.expect(Described, Rule.DESCRIBE_AGAIN, text, ticket=order.ticket)
     yield from describes_on_order(learner)
     learner.send(replace(order, session=order.session + 1000, ticket=next(learner.tickets)))
-    yield from learner.quiet(Described, rules.OTHER_SESSION, "no Described after an order of another session", for_s=1.0)
+    yield from learner.quiet(Described, Rule.OTHER_SESSION, "no Described after an order of another session", for_s=1.0)
 
 
 # ------------------------------------------------------------------------------------------- a session of any kind
@@ -177,12 +176,12 @@ def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
     """Replies are lost, late and repeated."""
     yield from learner.joining()
     learner.welcome(wait_spec(learner))
-    first = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat", within_s=learner.settings.start_s)
+    first = yield from learner.expect(Heartbeat, Rule.HEARTBEAT, "a Heartbeat", within_s=learner.settings.start_s)
     if first.replies:
-        raise Broken(rules.HEARTBEAT_REPLIES, "replies 0 before the first HeartbeatReply of a session", f"{first.replies}")
+        raise Broken(Rule.HEARTBEAT_REPLIES, "replies 0 before the first HeartbeatReply of a session", f"{first.replies}")
     yield from _replies(learner, 1)
     learner.answers_heartbeats = False
-    yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat although the last one was not answered")
+    yield from learner.expect(Heartbeat, Rule.HEARTBEAT, "a Heartbeat although the last one was not answered")
     learner.send(learner.watch.reply(9))
     yield from _replies(learner, 9)
     learner.send(learner.watch.reply(9))
@@ -190,7 +189,7 @@ def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
     for _ in range(2):
         late = yield from heartbeats(learner, 1)
         if late.replies != 9:
-            raise Broken(rules.HEARTBEAT_REPLIES, "replies 9 after a late copy of reply 4", f"{late.replies}")
+            raise Broken(Rule.HEARTBEAT_REPLIES, "replies 9 after a late copy of reply 4", f"{late.replies}")
 
 
 def _replies(learner: Learner, number: int) -> Script[None]:
@@ -198,7 +197,7 @@ def _replies(learner: Learner, number: int) -> Script[None]:
         found = yield from heartbeats(learner, 1)
         if found.replies >= number:
             return
-    raise Broken(rules.HEARTBEAT_REPLIES, f"replies {number} after HeartbeatReply {number}", f"{found.replies}")
+    raise Broken(Rule.HEARTBEAT_REPLIES, f"replies {number} after HeartbeatReply {number}", f"{found.replies}")
 
 
 def in_any_session(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> Script[None]:
@@ -216,17 +215,17 @@ def keeps_the_rhythm(learner: Learner) -> Script[None]:
     yield from heartbeats(learner, 4)
     took_s = learner.now - began_s
     if not 1.0 <= took_s <= 4.0:
-        raise Broken(rules.HEARTBEAT, "four of them in 2 s, as heartbeat_s is 0.5", f"{took_s:.1f} s")
+        raise Broken(Rule.HEARTBEAT, "four of them in 2 s, as heartbeat_s is 0.5", f"{took_s:.1f} s")
 
 
 def joins_again(learner: Learner) -> Script[None]:
     """A Rejoin of this session, and one of another."""
     yield from in_any_session(learner)
     learner.send(Rejoin(learner.session + 1000))
-    yield from learner.quiet(Hello, rules.OTHER_SESSION, "no Hello after a Rejoin of another session", for_s=1.0)
+    yield from learner.quiet(Hello, Rule.OTHER_SESSION, "no Hello after a Rejoin of another session", for_s=1.0)
     yield from learner.rejoin()
     learner.welcome(wait_spec(learner))
-    yield from heartbeats(learner, 1, rules.SESSION)
+    yield from heartbeats(learner, 1, Rule.SESSION)
 
 
 def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
@@ -239,19 +238,19 @@ def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
     for message in (waited, learner.watch.welcome):  # late copies
         learner.send(message)
     for _ in range(2):
-        found = yield from heartbeats(learner, 1, rules.BEGINS)
+        found = yield from heartbeats(learner, 1, Rule.BEGINS)
         if not found.replies:
-            raise Broken(rules.BEGINS, "a session that goes on (replies above 0)", "one that began again")
+            raise Broken(Rule.BEGINS, "a session that goes on (replies above 0)", "one that began again")
     yield from _begun(learner)
 
 
 def _begun(learner: Learner) -> Script[None]:
     """Heartbeats say that the client waits no more."""
     for _ in range(4):  # one may have been on its way
-        found = yield from heartbeats(learner, 1, rules.BEGINS)
+        found = yield from heartbeats(learner, 1, Rule.BEGINS)
         if not found.waits:
             return
-    raise Broken(rules.BEGINS, "waits false in a Heartbeat after the second Welcome", "true")
+    raise Broken(Rule.BEGINS, "waits false in a Heartbeat after the second Welcome", "true")
 
 
 def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
@@ -260,9 +259,9 @@ def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
     yield from _replies(learner, 1)
     learner.send(learner.watch.welcome)
     for _ in range(2):
-        found = yield from heartbeats(learner, 1, rules.REPEATED_WELCOME)
+        found = yield from heartbeats(learner, 1, Rule.REPEATED_WELCOME)
         if not found.replies:
-            raise Broken(rules.REPEATED_WELCOME, "a session that goes on (replies above 0)", "one that began again")
+            raise Broken(Rule.REPEATED_WELCOME, "a session that goes on (replies above 0)", "one that began again")
 
 
 def notices_silence(learner: Learner) -> Script[None]:
@@ -272,9 +271,9 @@ def notices_silence(learner: Learner) -> Script[None]:
     learner.answers_heartbeats = False
     silent_from_s = learner.now
     text = f"Hello {SILENCE_S} s (learner_timeout_s) after the learner's last message"
-    yield from learner.later_hello(rules.SILENT, text, within_s=SILENCE_S + 4)
+    yield from learner.later_hello(Rule.SILENT, text, within_s=SILENCE_S + 4)
     if learner.now - silent_from_s < SILENCE_S - 2 * learner.settings.heartbeat_s - 0.1:
-        raise Broken(rules.SILENT, f"Hello after {SILENCE_S} s of silence", f"after {learner.now - silent_from_s:.1f} s")
+        raise Broken(Rule.SILENT, f"Hello after {SILENCE_S} s of silence", f"after {learner.now - silent_from_s:.1f} s")
 
 
 # ---------------------------------------------------------------------------------------------------- faults of networks
@@ -305,7 +304,7 @@ def leaves_when_refused(learner: Learner) -> Script[None]:
     """Refuse while joining."""
     yield from learner.newly_started()
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
-    yield from learner.left(rules.REFUSE, "Refuse while joining", (2,))
+    yield from learner.left(Rule.REFUSE, "Refuse while joining", (2,))
 
 
 def leaves_when_refused_later(learner: Learner) -> Script[None]:
@@ -313,39 +312,39 @@ def leaves_when_refused_later(learner: Learner) -> Script[None]:
     yield from in_any_session(learner)
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
     learner.may_leave = True
-    yield from learner.left(rules.REFUSE, "Refuse while ready", (2,))
+    yield from learner.left(Rule.REFUSE, "Refuse while ready", (2,))
 
 
 def drains_while_joining(learner: Learner) -> Script[None]:
     """Drain is the answer to Hello. Its reason is as long as a reason may be."""
     yield from learner.newly_started()
     learner.send(Drain("…" * MAX_LINE))
-    yield from learner.left(rules.DRAIN_JOINING, "Drain while joining")
+    yield from learner.left(Rule.DRAIN_JOINING, "Drain while joining")
 
 
 def drains_while_idle(learner: Learner) -> Script[None]:
     """Drain while there is nothing to do. Its reason is as long as a reason may be."""
     yield from in_any_session(learner)
     learner.send(Drain("…" * MAX_LINE))
-    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain")
+    goodbye = yield from learner.expect(Goodbye, Rule.DRAIN, "Goodbye after Drain")
     if goodbye.tickets:
-        raise Broken(rules.DRAIN, "Goodbye without tickets", f"tickets {list(goodbye.tickets)}")
-    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
+        raise Broken(Rule.DRAIN, "Goodbye without tickets", f"tickets {list(goodbye.tickets)}")
+    yield from learner.left(Rule.DRAIN, "Drain and Goodbye")
 
 
 def stops_on_request(learner: Learner) -> Script[None]:
     """SIGTERM while ready."""
     yield from in_any_session(learner)
     learner.do(AskToStop())
-    yield from learner.expect(Goodbye, rules.STOP, "Goodbye after SIGTERM")
-    yield from learner.left(rules.STOP, "SIGTERM and Goodbye")
+    yield from learner.expect(Goodbye, Rule.STOP, "Goodbye after SIGTERM")
+    yield from learner.left(Rule.STOP, "SIGTERM and Goodbye")
 
 
 def stops_while_joining(learner: Learner) -> Script[None]:
     """SIGTERM while no learner answers."""
     yield from learner.newly_started()
     learner.do(AskToStop())
-    yield from learner.left(rules.STOP, "SIGTERM while joining")
+    yield from learner.left(Rule.STOP, "SIGTERM while joining")
 
 
 def draws_its_nonce(learner: Learner) -> Script[None]:
@@ -353,4 +352,4 @@ def draws_its_nonce(learner: Learner) -> Script[None]:
     one = yield from learner.newly_started()
     other = yield from learner.newly_started()
     if one.process_nonce == other.process_nonce:
-        raise Broken(rules.REAPPEARS, f"another process_nonce than {one.process_nonce} in the second process", "the same")
+        raise Broken(Rule.REAPPEARS, f"another process_nonce than {one.process_nonce} in the second process", "the same")

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.script import Broken
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.messages import Weights
+from millrace.protocol.messages import Rollout, Weights
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.policy import make_policy
-from millrace.protocol.rollout import Rollout
 from millrace.protocol.rows.array_checks import place_of
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.weight_dtypes import to_float32
 
@@ -49,7 +48,7 @@ class LaneRows:
             n = int(np.argmax(wrong))
             flag = "resets" if self._run.seats else "valid"
             raise Broken(
-                rules.FIRST_RESETS if self._run.seats else rules.FIRST_VALID,
+                Rule.FIRST_RESETS if self._run.seats else Rule.FIRST_VALID,
                 f"{flag}[0] {ended[n] == bool(self._run.seats)} in copy {n} of sequence {rollout.sequence}: "
                 f"{'the last row of the rollout before ended its episode' if ended[n] else 'no episode had ended'}",
                 f"{ended[n] != bool(self._run.seats)}",
@@ -58,12 +57,12 @@ class LaneRows:
             for one, other in zip(last.obs, rollout.obs, strict=True):
                 if one[-1].tobytes() != other[0].tobytes():
                     raise Broken(
-                        rules.CONTINUES,
+                        Rule.CONTINUES,
                         f"obs[0] of sequence {rollout.sequence} to be obs[T] of sequence {last.sequence}",
                         "another observation",
                     )
         if rollout.reward[~rollout.valid].any():
-            raise Broken(rules.ROWS, "reward 0 in rows that are not valid", f"{rollout.reward[~rollout.valid].max()}")
+            raise Broken(Rule.ROWS, "reward 0 in rows that are not valid", f"{rollout.reward[~rollout.valid].max()}")
 
     def _check_episodes(self, rollout: Rollout) -> None:
         run = self._run
@@ -82,18 +81,18 @@ class LaneRows:
         if not _same(expected, got) and _same(sorted(expected), sorted(got)):
             lengths = [length for _, length in expected]
             raise Broken(
-                rules.EPISODE_ORDER,
+                Rule.EPISODE_ORDER,
                 f"episodes of sequence {rollout.sequence} of the lengths {lengths}, in the order of their last steps",
                 f"{[length for _, length in got]}",
             )
         for (total, length), episode in zip(expected, rollout.episodes, strict=True):
             if episode.length != length:
                 raise Broken(
-                    rules.EPISODES, f"length {length}, as the rows of sequence {rollout.sequence} say", f"{episode.length}"
+                    Rule.EPISODES, f"length {length}, as the rows of sequence {rollout.sequence} say", f"{episode.length}"
                 )
             if not is_return(episode.reward, total):
                 expected_return = f"return {total:g}, the sum of the rewards of its {length} steps"
-                raise Broken(rules.EPISODES, expected_return, f"{episode.reward:g}")
+                raise Broken(Rule.EPISODES, expected_return, f"{episode.reward:g}")
 
     def _check_log_prob(self, rollout: Rollout, weights: Weights) -> None:
         # What a seat did that waited when the rollout began may be of older weights.
@@ -109,7 +108,7 @@ class LaneRows:
             normalized = self._run.policy.normalize_observations
             place = place_of(np.argwhere(known)[k], self._run.row_axes)
             raise Broken(
-                rules.ROUNDED if rounded else rules.NORMALIZED if normalized else rules.LOG_PROB,
+                Rule.ROUNDED if rounded else Rule.NORMALIZED if normalized else Rule.LOG_PROB,
                 f"log_prob {expected[k]:.5f} at {place} (within {LOG_PROB_TOLERANCE:g}), for action {action[k].tolist()} "
                 f"under version {rollout.version}",
                 f"{got[k]:.5f}",

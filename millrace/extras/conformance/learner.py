@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 from msgspec.structs import replace
 
-from millrace.extras.conformance import rules
-from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import (
     Broken,
     ClientEvent,
@@ -49,6 +47,7 @@ from millrace.protocol.messages import (
     ToWorker,
     Welcome,
 )
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import Buffer, encode
 
@@ -159,7 +158,7 @@ class Learner:
             case Ended():
                 self._forget_process()
                 if not wanted(event):
-                    raise Broken(rules.STAYS, "the client to go on", str(event))
+                    raise Broken(Rule.STAYS, "the client to go on", str(event))
                 return True
             case Heard(_, BadMessage() as error) if self.runs:
                 raise Broken(_rule_of_unreadable(str(error)), "a message that can be read", str(error))
@@ -185,7 +184,7 @@ class Learner:
 
     def _take_hello(self, hello: Hello, is_wanted: bool) -> None:
         if self.hello is not None and hello.process_nonce != self.hello.process_nonce and not self.may_leave:
-            raise Broken(rules.STAYS, "the same process, or the client's end", "the Hello of a new process under its name")
+            raise Broken(Rule.STAYS, "the same process, or the client's end", "the Hello of a new process under its name")
         if self._watch is None:
             return
         if self.hello is not None and hello.attempt == self.hello.attempt:
@@ -194,7 +193,7 @@ class Learner:
             self._watch = None
             self.may_leave = False
         else:
-            raise Broken(rules.SILENT, "the client to stay in its session while the learner answers", brief(hello))
+            raise Broken(Rule.SILENT, "the client to stay in its session while the learner answers", brief(hello))
 
     def _take_message(
         self, message: ToLearner | Inquire | BadMessage, event: ClientEvent, wanted: Callable[[ClientEvent], bool]
@@ -204,7 +203,7 @@ class Learner:
             return True
         if watch is None or getattr(message, "session", None) != watch.session:
             current = "none: the client is joining" if watch is None else str(watch.session)
-            raise Broken(rules.SESSION, f"session {current}", brief(message))
+            raise Broken(Rule.SESSION, f"session {current}", brief(message))
         assert not isinstance(message, Inquire | BadMessage), "they have no session"
         watch.see(message, self.now)
         self._steps = watch.steps
@@ -214,12 +213,12 @@ class Learner:
             return True
         match message:
             case Failure(_, error):
-                raise Broken(rules.STAYS, "the client to go on", f"Failure: {error}")
+                raise Broken(Rule.STAYS, "the client to go on", f"Failure: {error}")
             case Goodbye(_, reason) if watch.answers:
-                raise Broken(rules.STAYS, "the client to go on", f"Goodbye: {reason}")
+                raise Broken(Rule.STAYS, "the client to go on", f"Goodbye: {reason}")
             case Goodbye(_, reason):
                 part = f"a client that takes part in a session with a {type(watch.run).__name__}"
-                raise Broken(rules.DECLINED, part, f"Goodbye: {reason}")
+                raise Broken(Rule.DECLINED, part, f"Goodbye: {reason}")
         return False
 
     def check_heartbeats(self) -> None:
@@ -252,7 +251,7 @@ class Learner:
         """The next message of this kind. A client may decline instead: that skips the check."""
         found = yield from self.expect((kind, Goodbye), rule, expected, within_s=within_s)
         if isinstance(found, Goodbye):
-            yield from self.left(rules.DECLINED, "Goodbye", (2,))
+            yield from self.left(Rule.DECLINED, "Goodbye", (2,))
             raise Skipped(f"it declines: {found.reason}")
         assert isinstance(found, kind)
         return found
@@ -287,16 +286,16 @@ class Learner:
         self.do(StartClient())
         within_s = self.settings.start_s
         hello = yield from self.expect(
-            Hello, rules.HELLO, f"Hello after the start (--start-s {within_s:g})", within_s=within_s
+            Hello, Rule.HELLO, f"Hello after the start (--start-s {within_s:g})", within_s=within_s
         )
         if hello.protocol != PROTOCOL_VERSION:
-            raise Broken(rules.PROTOCOL, f"protocol {PROTOCOL_VERSION}", f"protocol {hello.protocol}")
+            raise Broken(Rule.PROTOCOL, f"protocol {PROTOCOL_VERSION}", f"protocol {hello.protocol}")
         return hello
 
     def rejoin(self) -> Script[Hello]:
         """The client is told to join again, and does so."""
         self.send(Rejoin(self.session))
-        return (yield from self.later_hello(rules.REJOIN, "Hello with a later attempt after Rejoin"))
+        return (yield from self.later_hello(Rule.REJOIN, "Hello with a later attempt after Rejoin"))
 
     def later_hello(self, rule: Rule, expected: str, *, within_s: float = 0.0) -> Script[Hello]:
         """The process stays, and leaves its session to join again."""
@@ -311,4 +310,4 @@ class Learner:
 
 
 def _rule_of_unreadable(error: str) -> Rule:
-    return rules.LIMITS if any(words in error for words in ("at most", "1 to", "length <=")) else rules.FRAMES
+    return Rule.LIMITS if any(words in error for words in ("at most", "1 to", "length <=")) else Rule.FRAMES

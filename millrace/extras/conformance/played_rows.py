@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.lane_rows import LOG_PROB_TOLERANCE, can_be_recomputed, is_return, params_of
 from millrace.extras.conformance.script import Broken, brief
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, Weights
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.rows.played import reason_to_reject
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 
 BY_CHANCE = -14.0  # log of a probability: that so many drawn actions are all the most probable ones
@@ -36,18 +36,18 @@ class PlayedRows:
         """Check the next rows of an episode. Raises `Broken`."""
         order = self._order
         if not (order.send_rows or order.send_frames):
-            raise Broken(rules.ROWS_FIRST, "no rows: the order does not ask for them", brief(rows))
+            raise Broken(Rule.ROWS_FIRST, "no rows: the order does not ask for them", brief(rows))
         if rows.episode >= len(self.rows):
-            raise Broken(rules.EPISODE_ROWS, f"an episode below {len(self.rows)}", f"episode {rows.episode}")
+            raise Broken(Rule.EPISODE_ROWS, f"an episode below {len(self.rows)}", f"episode {rows.episode}")
         before = self.rows[rows.episode]
         if rows.first_step != (at := sum(len(some.reward) for some in before)):
-            raise Broken(rules.ROWS_FIRST, f"rows of episode {rows.episode} from step {at}", f"from step {rows.first_step}")
+            raise Broken(Rule.ROWS_FIRST, f"rows of episode {rows.episode} from step {at}", f"from step {rows.first_step}")
         if why := reason_to_reject(rows, before, self._run, order.most_steps, order.send_frames):
-            raise Broken(rules.EPISODE_ROWS, "rows as in the table", why)
+            raise Broken(Rule.EPISODE_ROWS, "rows as in the table", why)
         for one, other in zip(before[-1].obs if before else (), rows.obs, strict=bool(before)):
             if one[-1].tobytes() != other[0].tobytes():
                 expected = f"obs[0] to be the last observation of the rows of episode {rows.episode} before"
-                raise Broken(rules.EPISODE_ROWS, expected, "another observation")
+                raise Broken(Rule.EPISODE_ROWS, expected, "another observation")
         before.append(rows)
 
     def see_answer(self, answer: Evaluated) -> None:
@@ -55,11 +55,11 @@ class PlayedRows:
         order = self._order
         k = len(self.rows)
         if not len(answer.episodes) == len(answer.cut) == k:
-            raise Broken(rules.EVALUATE, f"{k} episodes for {k} seeds", f"{len(answer.episodes)}")
+            raise Broken(Rule.EVALUATE, f"{k} episodes for {k} seeds", f"{len(answer.episodes)}")
         for n, (episode, cut) in enumerate(zip(answer.episodes, answer.cut, strict=True)):
             if episode.length > order.most_steps or (cut and episode.length != order.most_steps):
                 expected = f"a cut after {order.most_steps} steps (most_steps), or an end before"
-                raise Broken(rules.CUT, expected, f"{episode.length} steps")
+                raise Broken(Rule.CUT, expected, f"{episode.length} steps")
             if order.send_rows:
                 self._check_episode(n, episode.length, episode.reward, cut)
         if order.send_rows and can_be_recomputed(self._run) and not self._run.seats:  # rows do not say which seats act
@@ -70,17 +70,17 @@ class PlayedRows:
         rows = self.rows[n]
         if (got := sum(len(some.reward) for some in rows)) != length:
             raise Broken(
-                rules.ROWS_FIRST, f"{length} rows of episode {n} before Evaluated (send_rows is true)", f"{got} rows"
+                Rule.ROWS_FIRST, f"{length} rows of episode {n} before Evaluated (send_rows is true)", f"{got} rows"
             )
         last = rows[-1]
         if not (last.terminated[-1] or last.truncated[-1]):
             expected = f"terminated or truncated in the last row of episode {n}, {'which was cut' if cut else 'its end'}"
-            raise Broken(rules.EPISODE_ROWS, expected, "neither")
+            raise Broken(Rule.EPISODE_ROWS, expected, "neither")
         if cut and last.terminated[-1]:
-            raise Broken(rules.CUT, f"no cut of episode {n}, which terminated at most_steps", "cut")
+            raise Broken(Rule.CUT, f"no cut of episode {n}, which terminated at most_steps", "cut")
         if not self._run.seats and not is_return(total, summed := float(sum(some.reward.sum() for some in rows))):
             raise Broken(
-                rules.EPISODES, f"return {summed:g} of episode {n}, the sum of the rewards of its rows", f"{total:g}"
+                Rule.EPISODES, f"return {summed:g} of episode {n}, the sum of the rewards of its rows", f"{total:g}"
             )
 
     def _check_actions(self) -> None:
@@ -89,11 +89,11 @@ class PlayedRows:
         version = self._order.version
         if self._order.greedy and (wrong := lost > LOG_PROB_TOLERANCE * np.maximum(1.0, np.abs(best))).any():
             expected = f"the most probable actions under version {version} (greedy is true)"
-            raise Broken(rules.GREEDY, expected, f"others in {int(wrong.sum())} of {wrong.size} rows")
+            raise Broken(Rule.GREEDY, expected, f"others in {int(wrong.sum())} of {wrong.size} rows")
         by_chance = self._run.policy.action.kind != "box" and best.sum() > BY_CHANCE
         if not self._order.greedy and is_best.all() and not by_chance:
             raise Broken(
-                rules.GREEDY, "drawn actions (greedy is false)", f"the most probable one in each of {lost.size} rows"
+                Rule.GREEDY, "drawn actions (greedy is false)", f"the most probable one in each of {lost.size} rows"
             )
 
     def _against_the_best(self, rows: EpisodeRows) -> tuple[Array, Array, Array]:

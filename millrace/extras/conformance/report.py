@@ -12,7 +12,8 @@ from textwrap import wrap
 from typing import Any
 
 from millrace.extras.conformance.examiner import CheckResult
-from millrace.extras.conformance.rules import DOCUMENT
+from millrace.extras.conformance.mends import MENDS, TOO_SLOW
+from millrace.protocol.rules import Rule
 
 WIDTH = 110
 NUMBER = re.compile(r"\d{3,}")  # shapes and exit codes have fewer digits
@@ -27,22 +28,32 @@ def line_of(result: CheckResult) -> str:
 
 def explanation(result: CheckResult, earlier: Sequence[CheckResult] = ()) -> list[str]:
     """What a failure means, indented. If an earlier check failed by the same rule for the same reason, only its name."""
-    if result.rule is None:
+    if result.outcome != "failed":
         return []
     same = next((each for each in earlier if _essence(each) == _essence(result)), None)
     if same is not None:
         return [f"           as in: {same.name}"]
     parts = {
-        "rule": result.rule.text + (f". ({DOCUMENT}, “{result.rule.section}”)" if result.rule.section else ""),
+        "rule": _rule(result.rule),
         "expected": result.expected,
         "got": result.got,
-        "next": result.rule.mend,
+        "next": _next(result.rule),
     }
     return [
         f"           {label if not at else '':9} {line}"
         for label, text in parts.items()
         for at, line in enumerate(wrap(text, WIDTH - 21) or [""])
     ]
+
+
+def _rule(rule: Rule | None) -> str:
+    if rule is None:
+        return "A check ends within its deadline"
+    return f"{rule}: {rule.words.text}. ({rule.words.where})"
+
+
+def _next(rule: Rule | None) -> str:
+    return TOO_SLOW if rule is None else MENDS[rule]
 
 
 def _essence(result: CheckResult) -> tuple[object, str, str]:
@@ -70,11 +81,12 @@ def as_data(results: Sequence[CheckResult], profile: str, command: Sequence[str]
                 "name": each.name,
                 "outcome": each.outcome,
                 "seconds": round(each.seconds, 3),
-                "section": each.rule.section if each.rule else "",
-                "rule": each.rule.text if each.rule else "",
+                "section": each.rule.words.section if each.rule else "",
+                "name_of_rule": each.rule.name if each.rule else "",
+                "rule": each.rule.words.text if each.rule else "",
                 "expected": each.expected,
                 "got": each.got,
-                "next": each.rule.mend if each.rule else "",
+                "next": _next(each.rule) if each.outcome == "failed" else "",
                 "note": each.note,
             }
             for each in results

@@ -10,9 +10,9 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from millrace.extras.conformance.rules import Rule
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import Inquire, ToLearner
+from millrace.protocol.rules import Rule
 from millrace.protocol.wire.codec import Buffer
 
 T = TypeVar("T")
@@ -22,7 +22,7 @@ class Broken(Exception):
     """The client broke a rule."""
 
     def __init__(self, rule: Rule, expected: str, got: str) -> None:
-        super().__init__(f"{rule.text}: expected {expected}, got {got}")
+        super().__init__(f"{rule.words.text}: expected {expected}, got {got}")
         self.rule = rule
         self.expected = expected
         self.got = got

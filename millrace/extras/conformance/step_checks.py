@@ -12,7 +12,6 @@ import msgpack
 import numpy as np
 from msgspec.structs import replace
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.join_checks import (
     POLE_GAINS,
     begins,
@@ -23,7 +22,6 @@ from millrace.extras.conformance.join_checks import (
     time_limit,
 )
 from millrace.extras.conformance.learner import Learner
-from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import Broken, Heard, Script, Skipped, Wait, brief
 from millrace.extras.conformance.watch import resets_too_early
 from millrace.protocol.arrays import Array
@@ -43,6 +41,7 @@ from millrace.protocol.messages import (
     Stepped,
     Weights,
 )
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack, unpack
@@ -122,7 +121,7 @@ class Stepping:
     def answer(self, order: Reset | Step) -> Script[Stepped]:
         """The answer to an order that was sent."""
         text = f"Stepped for the {type(order).__name__} with ticket {order.ticket} of lane {order.lane}"
-        return (yield from self.learner.expect(Stepped, rules.ORDER_ANSWERED, text, ticket=order.ticket))
+        return (yield from self.learner.expect(Stepped, Rule.ORDER_ANSWERED, text, ticket=order.ticket))
 
 
 def stepping(learner: Learner, *lanes: int, mode: Mode = "NextStep") -> Script[Stepping]:
@@ -150,7 +149,7 @@ def answers_reset_and_step(learner: Learner) -> Script[None]:
     steps = yield from stepping(learner)
     first = yield from steps.do(steps.reset())
     if first.reward.any() or first.terminated.any() or first.truncated.any():
-        raise Broken(rules.AFTER_RESET, "reward 0 and neither flag in the answer to a Reset of all copies", brief(first))
+        raise Broken(Rule.AFTER_RESET, "reward 0 and neither flag in the answer to a Reset of all copies", brief(first))
     for _ in range(5):
         yield from steps.do(steps.step())
 
@@ -158,7 +157,7 @@ def answers_reset_and_step(learner: Learner) -> Script[None]:
 def says_nothing_without_an_order(learner: Learner) -> Script[None]:
     """No Stepped before the first Reset."""
     yield from stepping(learner)
-    yield from learner.quiet(Stepped, rules.ORDER_ONLY, "nothing before the first order of the session", for_s=1.0)
+    yield from learner.quiet(Stepped, Rule.ORDER_ONLY, "nothing before the first order of the session", for_s=1.0)
 
 
 def ends_episodes(learner: Learner) -> Script[None]:
@@ -175,7 +174,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
         for n in np.flatnonzero(ended):
             if row.reward[n] or row.terminated[n] or row.truncated[n]:
                 raise Broken(
-                    rules.NEXT_STEP,
+                    Rule.NEXT_STEP,
                     f"reward 0 and neither flag in copy {n}, in the step after the end of its episode",
                     f"reward {row.reward[n]:g}, terminated {row.terminated[n]}, truncated {row.truncated[n]}",
                 )
@@ -191,7 +190,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
         raise Skipped(f"no episode ended in {WALK_STEPS} steps")
     if resets_too_early(around):
         raise Broken(
-            rules.NEXT_STEP,
+            Rule.NEXT_STEP,
             "the last observation of an episode in the step that ends it, and the first one of the next in the step after",
             f"the same observation in both, at each of {len(around)} ends",
         )
@@ -216,9 +215,9 @@ def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
     steps = yield from stepping(learner, mode=mode)
     order = steps.reset()
     learner.send(order)
-    yield from learner.takes_part(Stepped, rules.ORDER_ANSWERED, f"Stepped for ticket {order.ticket}")
+    yield from learner.takes_part(Stepped, Rule.ORDER_ANSWERED, f"Stepped for ticket {order.ticket}")
     *_, row = yield from steps.walk(actions)
-    rule, resets = (rules.SAME_STEP, True) if mode == "SameStep" else (rules.DISABLED, False)
+    rule, resets = (Rule.SAME_STEP, True) if mode == "SameStep" else (Rule.DISABLED, False)
     if _numbers_of_copy(row, n) != _numbers_of_copy(last, n):
         raise Broken(rule, f"the reward and flags of copy {n} at the end of its episode, as with NextStep", "others")
     if _of_copy(row, n) != _of_copy(first if resets else last, n):
@@ -234,7 +233,7 @@ def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
     learner.send(steps.step(actions=actions[-1]))
     found = yield from learner.expect((Stepped, Failure), rule, "Stepped for a Step after the end of an episode")
     if isinstance(found, Failure):
-        yield from learner.left(rules.STAYS, "Failure", (1,))
+        yield from learner.left(Rule.STAYS, "Failure", (1,))
         raise Skipped("its environment cannot be stepped after an end")
     assert isinstance(found, Stepped)
     if _of_copy(found, n) == _of_copy(first, n) != _of_copy(last, n):
@@ -260,7 +259,7 @@ def resets_with_options(learner: Learner) -> Script[None]:
             bounds = options[n] if isinstance(options, list) else options
             if not (bounds["low"] - 1e-6 <= state.min() and state.max() <= bounds["high"] + 1e-6):
                 expected = f"a first state of copy {n} between {bounds['low']:g} and {bounds['high']:g} (options)"
-                raise Broken(rules.OPTIONS, expected, f"{state.round(4).tolist()}")
+                raise Broken(Rule.OPTIONS, expected, f"{state.round(4).tolist()}")
 
 
 def _of_copy(row: Stepped, n: int) -> bytes:
@@ -275,7 +274,7 @@ def _within(longest: int | None, length: Array, row: Stepped) -> None:
     if at_limit.any():
         n = int(np.argmax(at_limit))
         raise Broken(
-            rules.TRUNCATED,
+            Rule.TRUNCATED,
             f"the end of the episode of copy {n} at {longest} steps, the longest_episode that the client described",
             f"no end after {int(length[n])} steps",
         )
@@ -296,7 +295,7 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
         early = row.truncated & ~row.terminated & (length < longest) & (length > 0)
         if early.any():
             n = int(np.argmax(early))
-            raise Broken(rules.TRUNCATED, f"truncated at {longest} steps, or terminated", f"truncated at {int(length[n])}")
+            raise Broken(Rule.TRUNCATED, f"truncated at {longest} steps, or terminated", f"truncated at {int(length[n])}")
         at = (length == longest) & row.truncated
         if at.any():
             return
@@ -321,7 +320,7 @@ def begins_the_same_episode_for_a_seed(learner: Learner) -> Script[None]:
     yield from steps.do(steps.step())
     two = yield from steps.do(steps.reset(seed=11))
     if not _same(one, two):
-        raise Broken(rules.SEEDED, "the same first observations for the same seeds", "others")
+        raise Broken(Rule.SEEDED, "the same first observations for the same seeds", "others")
 
 
 def _same(one: Stepped, other: Stepped) -> bool:
@@ -357,7 +356,7 @@ def keeps_copies_apart(learner: Learner) -> Script[None]:
             if _of_copy(row, n) != _of_copy(alone[n % 2][t], n):
                 as_before = f"what all copies observed when they had its seed {seeds[n % 2]} and its actions"
                 expected = f"copy {n} to observe after {t} steps {as_before}"
-                raise Broken(rules.OWN_ROW if t else rules.SEEDED, expected, "another observation")
+                raise Broken(Rule.OWN_ROW if t else Rule.SEEDED, expected, "another observation")
 
 
 def executes_an_order_once(learner: Learner) -> Script[None]:
@@ -374,7 +373,7 @@ def executes_an_order_once(learner: Learner) -> Script[None]:
         found = yield from steps.do(again)
         if not _same(found, expected):
             raise Broken(
-                rules.ORDER_ONCE,
+                Rule.ORDER_ONCE,
                 "the same observations, for the same seed and actions, as without repeated orders",
                 "others",
             )
@@ -385,7 +384,7 @@ def executes_an_order_once(learner: Learner) -> Script[None]:
 def _again(learner: Learner, order: Reset | Step) -> Script[None]:
     """Repeat an order, and wait for the same answer again."""
     learner.send(order)
-    yield from learner.expect(Stepped, rules.ORDER_ONCE, f"the answer to ticket {order.ticket} again", ticket=order.ticket)
+    yield from learner.expect(Stepped, Rule.ORDER_ONCE, f"the answer to ticket {order.ticket} again", ticket=order.ticket)
 
 
 def ignores_an_old_order(learner: Learner) -> Script[None]:
@@ -395,7 +394,7 @@ def ignores_an_old_order(learner: Learner) -> Script[None]:
     yield from steps.do(first)
     yield from steps.do(steps.step())
     learner.send(first)
-    yield from learner.quiet(Stepped, rules.ORDER_OLD, f"no answer to ticket {first.ticket} after a newer one")
+    yield from learner.quiet(Stepped, Rule.ORDER_OLD, f"no answer to ticket {first.ticket} after a newer one")
     yield from steps.do(steps.step())
 
 
@@ -409,10 +408,10 @@ def ignores_another_session(learner: Learner) -> Script[None]:
         if heartbeat.steps:
             break
     else:
-        raise Broken(rules.HEARTBEAT_STEPS, "steps above 0 after a Step", "0")
+        raise Broken(Rule.HEARTBEAT_STEPS, "steps above 0 after a Step", "0")
     steps = yield from stepping(learner, 0)
     learner.send(replace(steps.step(), session=before))
-    yield from learner.quiet(Stepped, rules.OTHER_SESSION, "no answer to an order of the session before")
+    yield from learner.quiet(Stepped, Rule.OTHER_SESSION, "no answer to an order of the session before")
     yield from steps.do(steps.step())
     yield from heartbeats(learner, 1)
 
@@ -439,7 +438,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     yield from steps.do(steps.reset(incarnation=2))
     yield from steps.do(steps.step(incarnation=2))
     learner.send(steps.step(incarnation=1))
-    yield from learner.quiet(Stepped, rules.INCARNATION, "no answer to an order of incarnation 1 after one of 2")
+    yield from learner.quiet(Stepped, Rule.INCARNATION, "no answer to an order of incarnation 1 after one of 2")
     yield from steps.do(steps.step(incarnation=2))
 
 
@@ -453,9 +452,9 @@ def resets_some_copies(learner: Learner) -> Script[None]:
     after = yield from steps.do(steps.reset(copies=(0,), seed=5))
     for one, other in zip(before.obs, after.obs, strict=True):
         if one[1:].tobytes() != other[1:].tobytes():
-            raise Broken(rules.RESET_SOME, "the observations of copies that the Reset does not list as they were", "others")
+            raise Broken(Rule.RESET_SOME, "the observations of copies that the Reset does not list as they were", "others")
     if after.reward[0] or after.terminated[0] or after.truncated[0]:
-        raise Broken(rules.AFTER_RESET, "reward 0 and neither flag in copy 0", f"reward {after.reward[0]:g}")
+        raise Broken(Rule.AFTER_RESET, "reward 0 and neither flag in copy 0", f"reward {after.reward[0]:g}")
 
 
 def answers_calls(learner: Learner) -> Script[None]:
@@ -465,12 +464,12 @@ def answers_calls(learner: Learner) -> Script[None]:
         given = np.frombuffer(pack(((), {})), np.uint8)
         call = Call(learner.session, next(learner.tickets), 0, 0, (0,), name, False, given)
         learner.send(call)
-        found = yield from learner.expect(Returned, rules.RETURNED, f"Returned for ticket {call.ticket}", ticket=call.ticket)
+        found = yield from learner.expect(Returned, Rule.RETURNED, f"Returned for ticket {call.ticket}", ticket=call.ticket)
         if found.error:
             continue
         results = unpack(found.results.tobytes())
         if name != "render_mode" or not isinstance(results, list) or len(results) != 1:
-            raise Broken(rules.RETURNED, "one result for the one copy, or an error", f"{results!r}"[:100])
+            raise Broken(Rule.RETURNED, "one result for the one copy, or an error", f"{results!r}"[:100])
     yield from steps.do(steps.step())
 
 
@@ -487,7 +486,7 @@ def lists_its_tickets(learner: Learner) -> Script[None]:
     yield from stepping(learner, 0)
     found = yield from heartbeats(learner, 3)
     if found.tickets:
-        raise Broken(rules.HEARTBEAT_TICKETS, "no tickets while no order is open", f"{list(found.tickets)}")
+        raise Broken(Rule.HEARTBEAT_TICKETS, "no tickets while no order is open", f"{list(found.tickets)}")
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
@@ -496,13 +495,13 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     learner.send(steps.step(0))  # it may be answered or not
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     learner.answers_heartbeats = False  # a reply would close the lane too
-    yield from _has_no_copies(steps, rules.RELEASE)
+    yield from _has_no_copies(steps, Rule.RELEASE)
     learner.answers_heartbeats = True
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     yield Wait(0.3)
     found = yield from heartbeats(learner, 3)
     if found.tickets:
-        raise Broken(rules.RELEASE, "no tickets of the released lane", f"{list(found.tickets)}")
+        raise Broken(Rule.RELEASE, "no tickets of the released lane", f"{list(found.tickets)}")
     yield from steps.do(steps.step(1))
     yield from steps.do(steps.reset(0, incarnation=1))
     yield from steps.do(steps.step(0, incarnation=1))
@@ -513,7 +512,7 @@ def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
     steps = yield from stepping(learner, 0, 1)
     learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
     yield from heartbeats(learner, 3)
-    yield from _has_no_copies(steps, rules.UNLISTED)
+    yield from _has_no_copies(steps, Rule.UNLISTED)
     yield from steps.do(steps.step(1))
     yield from steps.do(steps.reset(0, incarnation=1))
 
@@ -559,7 +558,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
         [b"\xc1"],
         [b""],
     )
-    yield from learner.quiet(Stepped, rules.IGNORE_UNREADABLE, "no answer to what cannot be read")
+    yield from learner.quiet(Stepped, Rule.IGNORE_UNREADABLE, "no answer to what cannot be read")
     yield from steps.do(steps.step())
 
 
@@ -582,7 +581,7 @@ def takes_a_late_welcome(learner: Learner) -> Script[None]:
     learner.send(learner.watch.welcome)
     found = yield from steps.do(steps.step(actions=expected[1]))
     if not _same(found, rows[1]):
-        raise Broken(rules.REPEATED_WELCOME, "the episode to go on after a repeated Welcome", "another observation")
+        raise Broken(Rule.REPEATED_WELCOME, "the episode to go on after a repeated Welcome", "another observation")
 
 
 def drains_while_it_steps(learner: Learner) -> Script[None]:
@@ -591,12 +590,12 @@ def drains_while_it_steps(learner: Learner) -> Script[None]:
     order = steps.step()
     learner.send(order)
     learner.send(Drain("the run is over"))
-    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain")
+    goodbye = yield from learner.expect(Goodbye, Rule.DRAIN, "Goodbye after Drain")
     listed = order.ticket in goodbye.tickets
     if listed == (order.ticket in learner.watch.answers):
         raise Broken(
-            rules.DRAIN,
+            Rule.DRAIN,
             f"ticket {order.ticket} either answered before Goodbye or listed in it",
             "both" if listed else "neither",
         )
-    yield from learner.left(rules.DRAIN, "Drain and Goodbye")
+    yield from learner.left(Rule.DRAIN, "Drain and Goodbye")

@@ -11,10 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from millrace.extras.conformance import rules
 from millrace.extras.conformance.lane_rows import LaneRows
 from millrace.extras.conformance.played_rows import PlayedRows
-from millrace.extras.conformance.rules import Rule
 from millrace.extras.conformance.script import Broken, brief
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import (
@@ -48,12 +46,13 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.rows.stepped import wrong_rows
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds
-OTHER_SESSION = rules.OTHER_SESSION, "its session was another"
-UNREADABLE = rules.IGNORE_UNREADABLE, "no message that names it can be read"
+OTHER_SESSION = Rule.OTHER_SESSION, "its session was another"
+UNREADABLE = Rule.IGNORE_UNREADABLE, "no message that names it can be read"
 
 
 class Dealt(NamedTuple):
@@ -169,7 +168,7 @@ class WatchedSession:
         newest = self._lanes[order.lane] = max(order.incarnation, self._lanes.get(order.lane, 0))
         if order.incarnation < newest:
             why = f"it is of incarnation {order.incarnation}, its lane is in {newest}"
-            self._ignored[order.ticket] = rules.INCARNATION, why
+            self._ignored[order.ticket] = Rule.INCARNATION, why
 
     def unreadable(self, ticket: int) -> None:
         """The learner sends this ticket in messages that cannot be read."""
@@ -191,7 +190,7 @@ class WatchedSession:
         silent_s = now - self.heard_heartbeat_s
         if silent_s > HEARTBEATS_LATE * self.run.heartbeat_s + LATE_S:
             raise Broken(
-                rules.HEARTBEAT,
+                Rule.HEARTBEAT,
                 f"a Heartbeat every {self.run.heartbeat_s:g} s (heartbeat_s of this session)",
                 f"none for {silent_s:.1f} s",
             )
@@ -199,7 +198,7 @@ class WatchedSession:
     def see(self, message: ToLearner, now: float) -> None:
         """Check one message of this session. Raises `Broken`."""
         if self.said_goodbye:
-            raise Broken(rules.AFTER_GOODBYE, "nothing after Goodbye", brief(message))
+            raise Broken(Rule.AFTER_GOODBYE, "nothing after Goodbye", brief(message))
         match message:
             case Heartbeat():
                 self._see_heartbeat(message, now)
@@ -216,10 +215,10 @@ class WatchedSession:
             case Evaluated() | EpisodeRows():
                 order = self.orders.get(message.ticket)
                 if not isinstance(order, Evaluate):
-                    raise Broken(rules.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
+                    raise Broken(Rule.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
                 self._see_played(message, order)
             case Goodbye() | Failure() if self._refused and not self._drains:  # else it may have been on its way
-                raise Broken(rules.AFTER_REFUSE, "no last words after Refuse", brief(message))
+                raise Broken(Rule.AFTER_REFUSE, "no last words after Refuse", brief(message))
             case Goodbye():
                 self._see_tickets(message.tickets)
                 self.said_goodbye = True
@@ -232,16 +231,16 @@ class WatchedSession:
         self.heartbeat = message
         if message.replies > self.replies:
             raise Broken(
-                rules.HEARTBEAT_REPLIES, f"at most {self.replies}, the last reply of this session", f"{message.replies}"
+                Rule.HEARTBEAT_REPLIES, f"at most {self.replies}, the last reply of this session", f"{message.replies}"
             )
         if before is not None and message.replies < before.replies:
-            raise Broken(rules.HEARTBEAT_REPLIES, f"{before.replies} or more, as before", f"{message.replies}")
+            raise Broken(Rule.HEARTBEAT_REPLIES, f"{before.replies} or more, as before", f"{message.replies}")
         if message.steps < self.steps:
-            raise Broken(rules.HEARTBEAT_STEPS, f"{self.steps} or more, as before", f"{message.steps}")
+            raise Broken(Rule.HEARTBEAT_STEPS, f"{self.steps} or more, as before", f"{message.steps}")
         self.steps = message.steps
         if list(message.versions) != sorted(self.versions.keys() & message.versions):
             sent = f"those sent: {sorted(self.versions)}" if self.versions else "none: no weights were sent in this session"
-            raise Broken(rules.HEARTBEAT_VERSIONS, f"versions in ascending order, of {sent}", f"{list(message.versions)}")
+            raise Broken(Rule.HEARTBEAT_VERSIONS, f"versions in ascending order, of {sent}", f"{list(message.versions)}")
         self._see_if_it_waits(message)
         self._see_tickets(message.tickets)
         self._see_if_all_are_listed(message)
@@ -250,19 +249,19 @@ class WatchedSession:
         expected = isinstance(self.run, WaitSpec)
         may_be_late = message.replies <= self._welcomed
         if message.waits != expected and not (message.waits and may_be_late):
-            raise Broken(rules.HEARTBEAT_WAITS, f"waits {expected} with a {type(self.run).__name__}", f"{message.waits}")
+            raise Broken(Rule.HEARTBEAT_WAITS, f"waits {expected} with a {type(self.run).__name__}", f"{message.waits}")
 
     def _see_tickets(self, tickets: Sequence[int]) -> None:
         known = self.descriptions.keys() | self.orders.keys() | self.permits.keys()
         if strange := [ticket for ticket in tickets if ticket not in known]:
             raise Broken(
-                rules.HEARTBEAT_TICKETS,
+                Rule.HEARTBEAT_TICKETS,
                 f"tickets of this session{f', among {sorted(known)[-5:]}' if known else ', which has none yet'}",
                 f"ticket {strange[0]}",
             )
         if finished := [ticket for ticket in tickets if ticket in self.answers]:
             raise Broken(
-                rules.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
+                Rule.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
             )
 
     def _see_if_all_are_listed(self, message: Heartbeat) -> None:
@@ -274,13 +273,13 @@ class WatchedSession:
         }
         if still := missing & self._missing:
             expected = f"ticket {max(still)}, which came before HeartbeatReply {message.replies} and is not finished"
-            raise Broken(self.rule_of_missing(max(still), rules.HEARTBEAT_TICKETS), expected, f"{list(message.tickets)}")
+            raise Broken(self.rule_of_missing(max(still), Rule.HEARTBEAT_TICKETS), expected, f"{list(message.tickets)}")
         self._missing = missing
 
     def rule_of_missing(self, ticket: int, otherwise: Rule) -> Rule:
         """The rule that is likely broken if a ticket leads to nothing: in a later session, a lane's first may seem old."""
         is_old = not self._is_first_session and ticket in self.permits and not self.permits[ticket].permit.sequence
-        return rules.FORGETS if is_old else otherwise
+        return Rule.FORGETS if is_old else otherwise
 
     def _is_open(self, ticket: int) -> bool:
         """Whether the client must hold this ticket."""
@@ -302,13 +301,13 @@ class WatchedSession:
         ticket = order.ticket
         is_answer = isinstance(message, Evaluated)
         if self._answered[ticket] == self._asked[ticket]:
-            rule = rules.EVALUATE_ONCE if is_answer else rules.ROWS_FIRST
+            rule = Rule.EVALUATE_ONCE if is_answer else Rule.ROWS_FIRST
             raise Broken(
                 rule, f"nothing of ticket {ticket} after its Evaluated, until the order comes again", brief(message)
             )
         if order.version not in self.versions:
             expected = f"no {type(message).__name__} before the Weights of version {order.version}"
-            raise Broken(rules.EVALUATE_VERSION, expected, brief(message))
+            raise Broken(Rule.EVALUATE_VERSION, expected, brief(message))
         played = self.played.get(ticket)
         if played is None or played.ended:
             played = self.played[ticket] = PlayedRows(order, self.run, self.versions[order.version])
@@ -317,48 +316,46 @@ class WatchedSession:
         played.see_answer(message)
         self._answered[ticket] += 1
         if self._results.setdefault(ticket, message) != message and not order.send_rows:
-            raise Broken(rules.EVALUATE_ONCE, f"the same answer to ticket {ticket} again", "another")
+            raise Broken(Rule.EVALUATE_ONCE, f"the same answer to ticket {ticket} again", "another")
         return None
 
     def _see_description(self, message: Described) -> None:
         ticket = message.ticket
         if ticket not in self.descriptions:
             raise Broken(
-                rules.DESCRIBE, f"the ticket of a Describe: {sorted(self.descriptions) or 'none yet'}", brief(message)
+                Rule.DESCRIBE, f"the ticket of a Describe: {sorted(self.descriptions) or 'none yet'}", brief(message)
             )
         self._answered[ticket] += 1
         asked, answered = self._asked[ticket], self._answered[ticket]
         if answered > asked:
             raise Broken(
-                rules.DESCRIBE, f"answers to ticket {ticket} as often as it was sent: {asked}", f"{answered} answers"
+                Rule.DESCRIBE, f"answers to ticket {ticket} as often as it was sent: {asked}", f"{answered} answers"
             )
         first = self._described.setdefault(ticket, message)
         if repr(message.description) != repr(first.description):
-            raise Broken(rules.DESCRIBE_AGAIN, "the same description again", "another")
+            raise Broken(Rule.DESCRIBE_AGAIN, "the same description again", "another")
 
     def _see_answer(self, message: Answer) -> None:
         order = self.orders.get(message.ticket)
         if order is None or isinstance(order, Evaluate):
             last = f"ticket {max(self.orders)} was the last order" if self.orders else "no order was sent in this session"
-            raise Broken(rules.ORDER_ONLY, f"no answer without an order ({last})", brief(message))
+            raise Broken(Rule.ORDER_ONLY, f"no answer without an order ({last})", brief(message))
         if isinstance(order, Call) != isinstance(message, Returned):
-            raise Broken(rules.ORDER_ANSWERED, f"the answer to a {type(order).__name__}", brief(message))
+            raise Broken(Rule.ORDER_ANSWERED, f"the answer to a {type(order).__name__}", brief(message))
         self._see_lane(message, order)
         if message.incarnation != order.incarnation:
             raise Broken(
-                rules.INCARNATION, f"incarnation {order.incarnation}, as in the order", f"incarnation {message.incarnation}"
+                Rule.INCARNATION, f"incarnation {order.incarnation}, as in the order", f"incarnation {message.incarnation}"
             )
         if isinstance(message, Stepped):
             assert isinstance(self.run, StepSpec)
             check_stepped(message, self.run)
-        self._is_first(message, rules.ORDER_ONLY, rules.ORDER_ONCE)
+        self._is_first(message, Rule.ORDER_ONLY, Rule.ORDER_ONCE)
 
     def _see_lane(self, message: Answer | Rollout, order: Order | Permit) -> None:
         if message.lane != order.lane:
             expected = f"lane {order.lane}, as in the {type(order).__name__} with ticket {order.ticket}"
-            raise Broken(
-                rules.LANES if isinstance(order, Permit) else rules.ORDER_ANSWERED, expected, f"lane {message.lane}"
-            )
+            raise Broken(Rule.LANES if isinstance(order, Permit) else Rule.ORDER_ANSWERED, expected, f"lane {message.lane}")
 
     def _is_first(self, message: Answer | Rollout, too_often: Rule, differs: Rule) -> bool:
         """Whether its ticket was not answered before. The rules: for too many answers, and for one that differs."""
@@ -375,25 +372,25 @@ class WatchedSession:
 
     def _see_rollout(self, message: Rollout) -> None:
         if not isinstance(self.run, RunSpec):
-            raise Broken(rules.TICKETS, "no rollout in a session whose copies are stepped on order", brief(message))
+            raise Broken(Rule.TICKETS, "no rollout in a session whose copies are stepped on order", brief(message))
         dealt = self.permits.get(message.ticket)
         if dealt is None:
-            raise Broken(rules.TICKETS, f"a ticket that was dealt: {sorted(self.permits) or 'none yet'}", brief(message))
+            raise Broken(Rule.TICKETS, f"a ticket that was dealt: {sorted(self.permits) or 'none yet'}", brief(message))
         permit, version = dealt
         self._see_lane(message, permit)
         if message.version != version:
             raise Broken(
-                rules.VERSION,
+                Rule.VERSION,
                 f"version {version}, which the Collect of ticket {permit.ticket} names",
                 f"version {message.version}",
             )
         if version not in self.versions:
-            raise Broken(rules.VERSION, f"no rollout before the Weights of version {version}", brief(message))
-        if not self._is_first(message, rules.ROLLOUT_ONCE, rules.ROLLOUT_ONCE):
+            raise Broken(Rule.VERSION, f"no rollout before the Weights of version {version}", brief(message))
+        if not self._is_first(message, Rule.ROLLOUT_ONCE, Rule.ROLLOUT_ONCE):
             return
         if message.sequence != permit.sequence:
             raise Broken(
-                rules.SEQUENCE,
+                Rule.SEQUENCE,
                 f"sequence {permit.sequence}, as in the permit with ticket {permit.ticket}",
                 f"sequence {message.sequence}",
             )
@@ -401,7 +398,7 @@ class WatchedSession:
         expected = self._next_sequence.get(place, 0)
         if message.sequence != expected:
             raise Broken(
-                rules.IN_ORDER,
+                Rule.IN_ORDER,
                 f"sequence {expected} first, of lane {place[0]}, incarnation {place[1]}",
                 f"sequence {message.sequence}",
             )
@@ -409,7 +406,7 @@ class WatchedSession:
         try:
             validate(message, self.run)
         except BadRollout as error:
-            rule = rules.SEATS if self.run.seats else rules.ROWS
+            rule = Rule.SEATS if self.run.seats else Rule.ROWS
             raise Broken(rule, "a rollout that keeps the row format", str(error)) from None
         rows = self._rows.setdefault(place, LaneRows(self.run))
         rows.see(message, self.versions[message.version])
@@ -432,11 +429,11 @@ def _bits(value: object) -> object:
 def check_stepped(message: Stepped, spec: StepSpec) -> None:
     """Raise `Broken` if the arrays are not those of the lane."""
     if why := wrong_rows(message, spec, axes=None):
-        raise Broken(rules.STEPPED_ARRAYS, "arrays of the lane", why)
+        raise Broken(Rule.STEPPED_ARRAYS, "arrays of the lane", why)
     if why := wrong_rows(message, spec, axes=("copy",)):
-        raise Broken(rules.IN_SPACE, "values of their spaces", why)
+        raise Broken(Rule.IN_SPACE, "values of their spaces", why)
     if message.infos.dtype != np.uint8 or message.infos.ndim != 1:
-        raise Broken(rules.STEPPED_ARRAYS, "infos uint8[bytes]", f"infos {message.infos.dtype}{list(message.infos.shape)}")
+        raise Broken(Rule.STEPPED_ARRAYS, "infos uint8[bytes]", f"infos {message.infos.dtype}{list(message.infos.shape)}")
 
 
 def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
