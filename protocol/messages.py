@@ -60,7 +60,7 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
     Hello keeps the number. So it also tells which process a Welcome answers (rules HELLO, HELLO_AGAIN)"""
     evaluates: bool = False
-    """true: the worker only plays evaluations, and gets no lane"""
+    """true: the worker only plays evaluations, and gets no lane (rule EVALUATES)"""
 
     @property
     def is_first_attempt(self) -> bool:
@@ -123,7 +123,7 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     """number of the rollout: they are collected in this order, from 0 in every incarnation"""
     opponent: Whole | None = None
     """who plays the other teams in the episodes that begin in it: the version of these weights, or −1 − k for
-    `RunSpec.scripted[k]`"""
+    `RunSpec.scripted[k]` (rule OPPONENT)"""
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):

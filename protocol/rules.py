@@ -60,6 +60,7 @@ class Rule(Enum):
     HELLO_AGAIN = auto()
     HELLO = auto()
     REAPPEARS = auto()
+    EVALUATES = auto()
 
     # Rollout
     EPISODE_ORDER = auto()
@@ -89,6 +90,9 @@ class Rule(Enum):
 
     # Reset
     OPTIONS = auto()
+
+    # Permit
+    OPPONENT = auto()
 
     # Episode
     EPISODES = auto()
@@ -176,6 +180,7 @@ class Rule(Enum):
     DESCRIBE = auto()
     DESCRIBE_AGAIN = auto()
     BEGINS = auto()
+    FIRST_DESCRIPTION = auto()
 
     # The ticket law
     ROUND = auto()

@@ -149,7 +149,7 @@ class _BuiltInActions:
         return action
 
     def columns(self, i: int) -> ActedRows:
-        log_prob = self._distribution.log_prob(self._params[i], self._action[i], self._noise[i])
+        log_prob = self._distribution.log_prob(self._params[i], self._action[i], self._noise[i])  # rule LOG_PROB
         return ActedRows(self._action[i], log_prob, ())
 
     def written(self, i: int) -> list[Array]:

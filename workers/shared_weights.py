@@ -25,7 +25,7 @@ ENTRY = struct.Struct("<7Q")  # first session, version, number of frames, their 
 SESSIONS = 1 << 24  # a learner has fewer; it draws the first of 2**48
 
 
-def is_of_learner(session: int, first_session: int) -> bool:
+def is_of_learner(session: int, first_session: int) -> bool:  # rule SHARED_OF_LEARNER
     """Whether this session is of the learner whose first session this is."""
     return 0 <= session - first_session < SESSIONS
 

@@ -188,13 +188,13 @@ class Worker:
         self._waited_s += self._clock() - began_s
         while self._handled_stop_requests < self._options.stop_requests():
             self._handled_stop_requests += 1
-            self._do(self._session.stop())
+            self._do(self._session.stop())  # rule STOP
         if (problem := self._link.problem) is not None and problem.final:
             self._do(self._session.refused(problem.line))
         if arrived:
             self._unheard_from_s = self._waited_s
             for message in self._link.receive():
-                if isinstance(message, BadMessage):
+                if isinstance(message, BadMessage):  # rule IGNORE_UNREADABLE
                     log.warning("the learner sent an unreadable message: %s", message)
                 else:
                     self._do(self._session.handle(message, self._clock()))
@@ -221,7 +221,7 @@ class Worker:
                     "no answer over the connection to %s for %.0f s; connecting again", self._link.address, CONNECT_AGAIN_S
                 )
             self._unheard_from_s = self._waited_s
-            self._link.connect_again()
+            self._link.connect_again()  # rule CONNECTION
 
     def _serve_shared_memory(self, timeout_s: float) -> float:
         """Execute the orders in shared memory, if it is used, until a message may have arrived. How long to wait for it."""
@@ -410,7 +410,7 @@ def identity(name: str, process_nonce: int | None = None, *, evaluates: bool = F
     except PackageNotFoundError:
         software = "millrace"
     software = f"{software}, python {platform.python_version()}"
-    nonce = int.from_bytes(os.urandom(6), "little") if process_nonce is None else process_nonce
+    nonce = int.from_bytes(os.urandom(6), "little") if process_nonce is None else process_nonce  # rule REAPPEARS
     return WorkerIdentity(name, socket.gethostname(), os.getpid(), nonce, software, evaluates)
 
 

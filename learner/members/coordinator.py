@@ -114,7 +114,7 @@ class Coordinator(ABC, Generic[M]):
         """What was lost on the way, then the reply."""
         lost = member.record_heartbeat(heartbeat)
         if member.state is MemberState.DRAINING:
-            return [(member.peer, Drain(one_line(self.membership.draining or "")))]
+            return [(member.peer, Drain(one_line(self.membership.draining or "")))]  # rule DRAIN_AGAIN
         out = self.membership.welcome_again(member, heartbeat)
         out += self._again(member, heartbeat, lost)
         member.replies += 1

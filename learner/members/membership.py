@@ -160,7 +160,7 @@ class Membership(Generic[M]):
 
     def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
         """The answer to a message of a session that has ended: join again, unless the worker leaves anyway."""
-        if isinstance(message, Hello | Alive | Goodbye | Failure):
+        if isinstance(message, Hello | Alive | Goodbye | Failure):  # rule UNKNOWN_SESSION
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
         self.events.append(RejoinRequested(name_for_people(peer), message.session, late))
@@ -172,7 +172,7 @@ class Membership(Generic[M]):
             self.events.append(NamelessHello(hello.worker, NAMELESS))
             return [(peer, Refuse(NAMELESS))], None
         why = ""
-        if hello.protocol != PROTOCOL_VERSION:
+        if hello.protocol != PROTOCOL_VERSION:  # rule OTHER_PROTOCOL
             why = f"protocol: expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
         elif hello.worker.encode() != worker_name(peer):
             why = f"name: expected {name_for_people(peer)!r}, as in its routing id, got {hello.worker[:40]!r}"
@@ -183,7 +183,7 @@ class Membership(Generic[M]):
         if refused == hello.process_nonce:
             return [(peer, Refuse(why))], None
         if self.draining is not None:
-            return [(peer, Drain(one_line(self.draining)))], None
+            return [(peer, Drain(one_line(self.draining)))], None  # rule HELLO_WHILE_DRAINING
         member, takeovers = self.members.get(peer), 0
         if member is None and len(self.members) >= MAX_MEMBERS:
             why = f"workers: expected at most {MAX_MEMBERS} at one learner"
@@ -191,7 +191,7 @@ class Membership(Generic[M]):
             return [(peer, Refuse(why))], None
         if member is not None:
             same_process = member.hello.process_nonce == hello.process_nonce
-            if same_process and hello.attempt == member.hello.attempt:
+            if same_process and hello.attempt == member.hello.attempt:  # rule REPEATED_HELLO
                 member.heard_s = now
                 return [self._welcome(member)], None
             if same_process and hello.attempt < member.hello.attempt:
@@ -200,6 +200,7 @@ class Membership(Generic[M]):
             if not same_process and takeovers >= MOST_TAKEOVERS:
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
                 self._remember_refusal(member, why)
+            # rule LATER_HELLO
             self.remove(member, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
         member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now, takeovers=takeovers)
         self._next_session += 1

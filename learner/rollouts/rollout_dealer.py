@@ -152,7 +152,7 @@ class RolloutDealer:
             self.ledger.transitions_duplicate += rollout.env_steps
             return False
         expected = ticket.peer, ticket.lane, ticket.version, ticket.sequence
-        if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:
+        if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:  # rule WRONG_ROLLOUT
             expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
             got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
             raise BadRollout(f"numbers: expected {expects}, got {got}")

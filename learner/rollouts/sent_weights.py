@@ -69,7 +69,7 @@ class WeightsHeld:
             return member.peer
         mine[version] = FromSupervisor()
         shared = self.by_supervisor.setdefault(supervisor, {})
-        if version in shared:
+        if version in shared:  # rule SHARED_WEIGHTS
             return None
         shared[version] = SentAfter(supervisor.replies)
         for oldest in list(shared)[:-SHARED_VERSIONS]:

@@ -9,7 +9,7 @@ from millrace.protocol.arrays import Doubles, Floats
 CLIP = np.float32(10.0)  # normalized observations are clipped to ±10
 
 
-def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:
+def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:  # rule NORMALIZED
     """(x − mean) / std, clipped to ±10, float32. It is computed in the dtype of x.
 
     So a wide observation keeps the digits by which it differs from the mean, however large both are.

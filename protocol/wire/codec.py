@@ -137,6 +137,7 @@ def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
     return message
 
 
+# rules FRAMES, LIMITS
 def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: int = 0, max_items: int = MAX_ITEMS) -> Any:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")

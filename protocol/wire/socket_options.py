@@ -53,7 +53,7 @@ def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Li
     socket.sndhwm = socket.rcvhwm = limits.messages
 
 
-def routing_id(name: str, token: Token | None) -> bytes:
+def routing_id(name: str, token: Token | None) -> bytes:  # rule ROUTING_ID
     """The name. With a key, a tag follows that nobody else can compute."""
     if token is None:
         return name.encode()

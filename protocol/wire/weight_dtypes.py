@@ -39,7 +39,7 @@ def to_wire_dtype(parameters: Floats, dtype: ActingDtype) -> Array:
     return rounded.view(np.uint16)[1::2].copy()
 
 
-def to_float32(parameters: Array) -> Floats:
+def to_float32(parameters: Array) -> Floats:  # rule ROUNDED
     """Received parameters [P] as float32. Raises `ValueError` for a dtype that is never sent."""
     match parameters.dtype.str:
         case "<f4":

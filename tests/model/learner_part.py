@@ -18,6 +18,7 @@ from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDea
 from millrace.learner.rollouts.sent_weights import Confirmed, SentAfter, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.messages import ToLearner, WorkerExit, versions_of
+from millrace.protocol.rules import Rule
 from tests.model import membership_part
 from tests.model.conversation import Content
 from tests.model.message_content import (
@@ -104,7 +105,7 @@ class Learner:
                 assert arrived.rollout is message, "a rollout that did not arrive was accepted"
                 self._accept(arrived)
         rejected = self.coordinator.rollouts.ledger.transitions_invalid
-        assert rejected == 0, "a rollout of a worker that does all right was rejected"
+        assert rejected == 0, f"{Rule.WRONG_ROLLOUT}: a rollout of a worker that does all right was rejected"
         return out + self._learn()
 
     def publish(self) -> list[Outgoing]:
@@ -176,7 +177,9 @@ class Learner:
         """Begin to gather the rollouts of the next update."""
         out = self.coordinator.begin_update()
         opened = len(self.coordinator.rollouts.rounds._versions)
-        assert opened == self.settings.max_lag + 1, "an update has begun and not all of its rounds are open"
+        assert opened == self.settings.max_lag + 1, (
+            f"{Rule.OPEN_ROUNDS}: an update has begun and not all of its rounds are open"
+        )
         return out + self._learn()
 
     def acts(self, number: int) -> int:
@@ -196,12 +199,14 @@ class Learner:
     def _accept(self, arrived: AcceptedRollout) -> None:
         rollout = arrived.rollout
         number, collected_in, sequences = self.accepted[rollout.lane]
-        assert arrived.incarnation >= number, "a lane went back to an earlier incarnation"
+        assert arrived.incarnation >= number, f"{Rule.LANE_MOVES}: a lane went back to an earlier incarnation"
         if arrived.incarnation > number:
             sequences = set()
         else:
-            assert collected_in == rollout.session, "two sessions collected the same incarnation of a lane"
-        assert rollout.sequence not in sequences, "a rollout was accepted twice"
+            assert collected_in == rollout.session, (
+                f"{Rule.LANE_MOVES}: two sessions collected the same incarnation of a lane"
+            )
+        assert rollout.sequence not in sequences, f"{Rule.SEQUENCE}: a rollout was accepted twice"
         self.accepted[rollout.lane] = arrived.incarnation, rollout.session, sequences | {rollout.sequence}
 
     def _learn(self) -> list[Outgoing]:
@@ -215,12 +220,12 @@ class Learner:
             return []
         assert ledger.transitions_used - before == len(taken), "an update counted another number of transitions"
         for rollout in (arrived.rollout for arrived in taken):
-            assert rollout.ticket not in self.used, "a ticket was used twice"
+            assert rollout.ticket not in self.used, f"{Rule.TICKET_NUMBERS}: a ticket was used twice"
             self.used.add(rollout.ticket)
             lag = coordinator.version - rollout.version
-            assert lag == self.lag, f"a rollout of lag {lag} was used, instead of {self.lag}"
+            assert lag == self.lag, f"{Rule.ROUND_VERSION}: a rollout of lag {lag} was used, instead of {self.lag}"
         lanes = [arrived.rollout.lane for arrived in taken]
-        assert lanes == list(range(self.settings.lanes)), "an update has not one rollout of each lane"
+        assert lanes == list(range(self.settings.lanes)), f"{Rule.ROUND}: an update has not one rollout of each lane"
         self.updating, self.lag = True, min(self.lag + 1, self.settings.max_lag)
         return []
 
@@ -233,17 +238,19 @@ class Learner:
         """Each lane has every open round once: due, with a worker, or waiting. A round acts as `lag_rule.py` says."""
         coordinator, rounds = self.coordinator, self.coordinator.rollouts.rounds
         opened = list(rounds._versions)
-        assert opened == list(range(rounds.next, rounds.next + len(opened))), "an open round is missing"
-        assert len(opened) <= self.settings.max_lag + 1, "more rounds are open than the lag allows"
+        assert opened == list(range(rounds.next, rounds.next + len(opened))), f"{Rule.OPEN_ROUNDS}: an open round is missing"
+        assert len(opened) <= self.settings.max_lag + 1, f"{Rule.OPEN_ROUNDS}: more rounds are open than the lag allows"
         versions = {number: self.acts(number) for number in opened}
-        assert rounds._versions == versions, "other weights act in a round than those that were the newest"
+        assert rounds._versions == versions, (
+            f"{Rule.ROUND_VERSION}: other weights act in a round than those that were the newest"
+        )
         self._check_opponents()
         found = [(each.lane, each.round, each.version) for each in coordinator.rollouts.held.values()]
         for number, of_round in coordinator.rollouts.ready.items():
             found += [(lane, number, arrived.rollout.version) for lane, arrived in of_round.items()]
         found += [(lane.number, number, versions[number]) for lane in coordinator.rollouts.lanes for number in lane.due]
         every = [(lane.number, *of_round) for lane in coordinator.rollouts.lanes for of_round in versions.items()]
-        assert sorted(found) == every, "a lane does not have every open round once, under its version"
+        assert sorted(found) == every, f"{Rule.OPEN_ROUNDS}: a lane does not have every open round once, under its version"
         for lane in coordinator.rollouts.lanes:
             mine = [(t.round, t.sequence) for t in coordinator.rollouts.held.values() if t.lane == lane.number]
             mine += [
@@ -252,8 +259,12 @@ class Learner:
                 if lane.number in of_round and of_round[lane.number].incarnation == lane.incarnation
             ]
             in_order = [sequence for _, sequence in sorted(mine)]
-            assert in_order == sorted(set(in_order)), "rollouts of a lane are not collected in the order of the rounds"
-            assert all(sequence < lane.dealt for sequence in in_order), "a sequence number will be dealt twice"
+            assert in_order == sorted(set(in_order)), (
+                f"{Rule.IN_ORDER}: rollouts of a lane are not collected in the order of the rounds"
+            )
+            assert all(sequence < lane.dealt for sequence in in_order), (
+                f"{Rule.SEQUENCE}: a sequence number will be dealt twice"
+            )
         assert self._needed().issubset({-1, *coordinator.weights.kept}), "weights that are needed are dropped"
 
     def _check_opponents(self) -> None:

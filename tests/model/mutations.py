@@ -21,6 +21,8 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, NoReturn
 
+from millrace.protocol.rules import Rule
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -44,211 +46,260 @@ HELD = "millrace.workers.conversation.held"
 class Mutation:
     """A mistake."""
 
+    breaks: Rule | None
+    """the rule of the wire document; None: a law of the learner alone, which its module's first lines say"""
     module: str
     right: str
     wrong: str
 
 
 MUTATIONS = {
-    "one round too far ahead": Mutation(ROUNDS, "self.next + 1 + self._max_lag)", "self.next + 2 + self._max_lag)"),
-    "rounds are opened twice": Mutation(ROUNDS, "range(self.next + len(self._versions), ", "range(self.next, "),
-    "a round that was taken stays open": Mutation(ROUNDS, "del self._versions[self.next]\n", "pass\n"),
+    "one round too far ahead": Mutation(
+        Rule.OPEN_ROUNDS, ROUNDS, "self.next + 1 + self._max_lag)", "self.next + 2 + self._max_lag)"
+    ),
+    "rounds are opened twice": Mutation(
+        Rule.OPEN_ROUNDS, ROUNDS, "range(self.next + len(self._versions), ", "range(self.next, "
+    ),
+    "a round that was taken stays open": Mutation(Rule.OPEN_ROUNDS, ROUNDS, "del self._versions[self.next]\n", "pass\n"),
     "the newest weights act in every open round": Mutation(
+        Rule.ROUND_VERSION,
         ROUNDS,
         "self._versions |= dict.fromkeys(opened, newest)",
         "self._versions = dict.fromkeys([*self._versions, *opened], newest)",
     ),
     "a round is dealt under the newest weights": Mutation(
-        ROLLOUTS, "version = self.rounds.version(round_number)", "version = max(self.rounds._versions.values())"
+        Rule.ROUND_VERSION,
+        ROLLOUTS,
+        "version = self.rounds.version(round_number)",
+        "version = max(self.rounds._versions.values())",
     ),
     "an update counts rollouts of later rounds": Mutation(
+        Rule.ROUND,
         ROLLOUTS,
         "if len(self.ready.get(self.rounds.next, ())) < len(self.lanes):",
         "if self.waiting() < len(self.lanes):",
     ),
     "an update takes the newest round": Mutation(
+        Rule.ROUND,
         ROLLOUTS,
         "in sorted(self.ready.pop(self.rounds.next).items())]",
         "in sorted(self.ready.pop(max(self.ready)).items())]",
     ),
     "a rollout is taken twice": Mutation(
-        ROLLOUTS, "self.ready.pop(self.rounds.next).items()", "self.ready[self.rounds.next].items()"
+        Rule.ROUND, ROLLOUTS, "self.ready.pop(self.rounds.next).items()", "self.ready[self.rounds.next].items()"
     ),
     "a rollout waits for the wrong round": Mutation(
-        ROLLOUTS, "self.ready.setdefault(ticket.round, {})", "self.ready.setdefault(self.rounds.next, {})"
+        Rule.ROUND, ROLLOUTS, "self.ready.setdefault(ticket.round, {})", "self.ready.setdefault(self.rounds.next, {})"
     ),
-    "a round is dealt again and again": Mutation(ROLLOUTS, "            lane.due.clear()\n", "            pass\n"),
+    "a round is dealt again and again": Mutation(
+        Rule.OPEN_ROUNDS, ROLLOUTS, "            lane.due.clear()\n", "            pass\n"
+    ),
     "the round of a lost ticket is not dealt again": Mutation(
-        ROLLOUTS, "insort(self._end(member, ticket).due, ticket.round)", "self._end(member, ticket)"
+        Rule.LOST_TICKETS, ROLLOUTS, "insort(self._end(member, ticket).due, ticket.round)", "self._end(member, ticket)"
     ),
-    "a lane whose ticket was lost is overlooked": Mutation(ROLLOUTS, "self._to_deal.add(ticket.lane)", "pass"),
+    "a lane whose ticket was lost is overlooked": Mutation(
+        Rule.LOST_TICKETS, ROLLOUTS, "self._to_deal.add(ticket.lane)", "pass"
+    ),
     "a late rollout is not counted": Mutation(
-        ROLLOUTS, "self.ledger.transitions_late += rollout.env_steps", "self.ledger.transitions_late += 0"
+        None, ROLLOUTS, "self.ledger.transitions_late += rollout.env_steps", "self.ledger.transitions_late += 0"
     ),
     "a repeated rollout is not counted": Mutation(
-        ROLLOUTS, "self.ledger.transitions_duplicate += rollout.env_steps", "self.ledger.transitions_duplicate += 0"
+        None, ROLLOUTS, "self.ledger.transitions_duplicate += rollout.env_steps", "self.ledger.transitions_duplicate += 0"
     ),
     "the arrival of a rollout is not recorded": Mutation(
-        ROLLOUTS, "self._end(member, ticket).arrived(rollout.sequence)", "self._end(member, ticket)"
+        Rule.ARRIVED, ROLLOUTS, "self._end(member, ticket).arrived(rollout.sequence)", "self._end(member, ticket)"
     ),
     "a lost Collect is not sent again": Mutation(
-        COORDINATOR, "self.rollouts.send(member, lost) + self.evaluation", "self.evaluation"
+        Rule.ORDER_AGAIN, COORDINATOR, "self.rollouts.send(member, lost) + self.evaluation", "self.evaluation"
     ),
     "lost weights are not sent again": Mutation(
-        WEIGHTS, "for version in lost for message in", "for version in lost[:0] for message in"
+        Rule.WEIGHTS_AGAIN, WEIGHTS, "for version in lost for message in", "for version in lost[:0] for message in"
     ),
     "weights that may be under way are sent again": Mutation(
-        WEIGHTS, "if replies >= heartbeat.replies:", "if replies > heartbeat.replies:"
+        Rule.SENT_BEFORE, WEIGHTS, "if replies >= heartbeat.replies:", "if replies > heartbeat.replies:"
     ),
     "weights that are sent again are not noted": Mutation(
+        Rule.SENT_BEFORE,
         WEIGHTS,
         "for message in self._send(member, version, None)]",
         "for message in [(member.peer, self.kept[version])]]",
     ),
     "weights that a heartbeat does not list count as held": Mutation(
-        WEIGHTS, "case _ if version in heartbeat.versions:", "case _:"
+        Rule.WEIGHTS_AGAIN, WEIGHTS, "case _ if version in heartbeat.versions:", "case _:"
     ),
     "a Collect is sent again without the weights that it names": Mutation(
-        COORDINATOR, "out + self.weights.after(orders, self.members)", "out + orders"
+        Rule.WEIGHTS_AFTER, COORDINATOR, "out + self.weights.after(orders, self.members)", "out + orders"
     ),
-    "weights are never sent": Mutation(WEIGHTS, "in sorted(order.versions - self.held.versions(peer)):", "in ():"),
+    "weights are never sent": Mutation(
+        Rule.WEIGHTS_AFTER, WEIGHTS, "in sorted(order.versions - self.held.versions(peer)):", "in ():"
+    ),
     "weights are sent with every order": Mutation(
-        WEIGHTS, "sorted(order.versions - self.held.versions(peer))", "sorted(order.versions)"
+        Rule.WEIGHTS_AFTER, WEIGHTS, "sorted(order.versions - self.held.versions(peer))", "sorted(order.versions)"
     ),
-    "weights are sent before the order that names them": Mutation(WEIGHTS, "return out + weights", "return weights + out"),
     "the newest weights are sent to whoever holds a ticket": Mutation(
-        WEIGHTS, "[(receiver, self.kept[version])]", "[(receiver, self.kept[max(self.kept)])]"
+        Rule.WEIGHTS_AFTER, WEIGHTS, "[(receiver, self.kept[version])]", "[(receiver, self.kept[max(self.kept)])]"
     ),
-    "the learner keeps only the newest weights": Mutation(WEIGHTS, "if version in needed}", "if False}"),
-    "the learner keeps all weights": Mutation(WEIGHTS, "if version in needed}", "if True}"),
-    "heartbeats are answered with the same number": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
-    "tickets of a lost worker are kept": Mutation(COORDINATOR, "for number in list(member.tickets):", "for number in ():"),
-    "what a lost worker held counts as held": Mutation(COORDINATOR, "self.weights.held.forget(member.peer)", "pass"),
-    "two tickets of a lane have one sequence number": Mutation(LANES, "self.dealt += 1", "self.dealt = 1"),
+    "the learner keeps only the newest weights": Mutation(None, WEIGHTS, "if version in needed}", "if False}"),
+    "the learner keeps all weights": Mutation(None, WEIGHTS, "if version in needed}", "if True}"),
+    "heartbeats are answered with the same number": Mutation(
+        Rule.SENT_BEFORE, MEMBERS, "member.replies += 1", "member.replies += 0"
+    ),
+    "tickets of a lost worker are kept": Mutation(
+        Rule.LOST_TICKETS, COORDINATOR, "for number in list(member.tickets):", "for number in ():"
+    ),
+    "what a lost worker held counts as held": Mutation(None, COORDINATOR, "self.weights.held.forget(member.peer)", "pass"),
+    "two tickets of a lane have one sequence number": Mutation(Rule.SEQUENCE, LANES, "self.dealt += 1", "self.dealt = 1"),
     "sequence numbers go on in the next incarnation": Mutation(
+        Rule.SEQUENCE,
         LANES,
         "            self.dealt = 0\n            self.next_sequence = 0\n",
         "            self.next_sequence = 0\n",
     ),
     "a checkpoint repeats an incarnation": Mutation(
-        ROLLOUTS, "lane.incarnation + (lane.dealt > 0) for", "lane.incarnation + 0 for"
+        Rule.SEQUENCE, ROLLOUTS, "lane.incarnation + (lane.dealt > 0) for", "lane.incarnation + 0 for"
     ),
     "lanes are placed after tickets are dealt": Mutation(
-        COORDINATOR, "out = self._placement.place(self.members.values())", "out: list[Outgoing] = []"
+        Rule.LANE_MOVES, COORDINATOR, "out = self._placement.place(self.members.values())", "out: list[Outgoing] = []"
     ),
     "a repeated Welcome starts the session again": Mutation(
-        SESSION, "self.state is WorkerState.READY and message.session == self.session", "False"
+        Rule.REPEATED_WELCOME, SESSION, "self.state is WorkerState.READY and message.session == self.session", "False"
     ),
     "a worker that joins again repeats its Hello": Mutation(
-        SESSION, "self._attempt += 1", "self._attempt = self.identity.process_nonce + 1"
+        Rule.REJOIN, SESSION, "self._attempt += 1", "self._attempt = self.identity.process_nonce + 1"
     ),
-    "finished work stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
-    "a worker takes work while it works": Mutation(SESSION, "self._current.in_progress = work is not None", "pass"),
-    "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
+    "finished work stays in progress": Mutation(Rule.LOWEST_VERSION_FIRST, SESSION, "current.in_progress = False", "pass"),
+    "a worker takes work while it works": Mutation(
+        Rule.LOWEST_VERSION_FIRST, SESSION, "self._current.in_progress = work is not None", "pass"
+    ),
+    "replies to heartbeats are not counted": Mutation(Rule.HEARTBEAT_REPLIES, SESSION, "current.replies = number", "pass"),
     "a worker acts under the newest weights": Mutation(
+        Rule.VERSION,
         SESSION,
         "RolloutTask(session, self.weights[version], assignments, ",
         "RolloutTask(session, self.weights[max(self.weights)], assignments, ",
     ),
     "a worker drops weights that a ticket names": Mutation(
-        SESSION, "kept = self.asked_versions().union(listed)", "kept = listed"
+        Rule.HOLDS_WEIGHTS, SESSION, "kept = self.asked_versions().union(listed)", "kept = listed"
     ),
     "a worker drops weights when a lane closes": Mutation(
+        Rule.HOLDS_WEIGHTS,
         SESSION,
         "return [CloseLanes(released)] if released else []",
         "self.keep_weights(())\n        return [CloseLanes(released)] if released else []",
     ),
     "a worker drops weights when newer ones come": Mutation(
+        Rule.HOLDS_WEIGHTS,
         SESSION,
         "current.weights.setdefault(version, message)",
         "current.weights.setdefault(version, message), current.keep_weights([max(current.weights)])",
     ),
     "a worker drops weights when a ticket ends": Mutation(
+        Rule.HOLDS_WEIGHTS,
         SESSION,
         "        current.in_progress = False\n        return [*map",
         "        current.keep_weights(())\n        current.in_progress = False\n        return [*map",
     ),
     "a worker keeps all weights": Mutation(
+        Rule.HOLDS_WEIGHTS,
         SESSION,
         "for version, weights in self.weights.items() if version in kept}",
         "for version, weights in self.weights.items()}",
     ),
     "new weights replace all others": Mutation(
-        SESSION, "current.weights.setdefault(version, message)", "current.weights = {version: message}"
+        Rule.HOLDS_WEIGHTS, SESSION, "current.weights.setdefault(version, message)", "current.weights = {version: message}"
     ),
     "a Collect confirms nothing": Mutation(
+        Rule.ROLLOUT_ONCE,
         SESSION,
         "current.rollouts.forget_received(received)\n                again",
         "again",
     ),
     "an asked-for rollout is not sent again": Mutation(
-        SESSION, "return [SendMessage(answer) for answer in again if answer is not None]", "return []"
+        Rule.ROLLOUT_ONCE, SESSION, "return [SendMessage(answer) for answer in again if answer is not None]", "return []"
     ),
     "a finished ticket is forgotten": Mutation(
-        HELD, " or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):", ":"
+        Rule.RECEIVED, HELD, " or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):", ":"
     ),
     "a rollout that has not arrived is forgotten": Mutation(
-        HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"
+        Rule.ROLLOUT_ONCE,
+        HELD,
+        "rollout.sequence < of_lane.next_sequence or",
+        "rollout.sequence <= of_lane.next_sequence or",
     ),
     "a rollout is collected before an earlier one has come": Mutation(
-        HELD, "if asked.sequence == lane.sequence and ", "if "
+        Rule.IN_ORDER, HELD, "if asked.sequence == lane.sequence and ", "if "
     ),
-    "a rollout starts without its weights": Mutation(HELD, " and asked.versions.issubset(versions):", ":"),
+    "a rollout starts without its weights": Mutation(Rule.VERSION, HELD, " and asked.versions.issubset(versions):", ":"),
     "a rollout starts without the weights of its opponent": Mutation(
-        HELD, "asked.versions.issubset(versions):", "asked.version in versions:"
+        Rule.OPPONENTS, HELD, "asked.versions.issubset(versions):", "asked.version in versions:"
     ),
     "a worker drops the weights of opponents": Mutation(
+        Rule.HOLDS_WEIGHTS,
         HELD,
         "return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}",
         "return {asked.version for lane in self._lanes.values() for asked in lane.asked.values()}",
     ),
-    "an order does not list the weights that its worker keeps": Mutation(WEIGHTS, "keep=tuple(sorted(keep))", "keep=()"),
+    "an order does not list the weights that its worker keeps": Mutation(
+        Rule.KEEP, WEIGHTS, "keep=tuple(sorted(keep))", "keep=()"
+    ),
     "only the weights that act are sent after an order": Mutation(
-        WEIGHTS, "sorted(order.versions -", "sorted({order.version} -"
+        Rule.WEIGHTS_AFTER, WEIGHTS, "sorted(order.versions -", "sorted({order.version} -"
     ),
     "the weights of opponents do not count as named": Mutation(
-        WEIGHTS, "versions_of(order.version, [permit.opponent]) for", "{order.version} for"
+        Rule.KEEP, WEIGHTS, "versions_of(order.version, [permit.opponent]) for", "{order.version} for"
     ),
     "what the earlier tickets of a worker name is forgotten": Mutation(
-        WEIGHTS, "outstanding | _by_ticket(order)", "_by_ticket(order)"
+        Rule.KEEP, WEIGHTS, "outstanding | _by_ticket(order)", "_by_ticket(order)"
     ),
-    "the weights of opponents are dropped": Mutation(COORDINATOR, "needed.update(opponents.versions)", "pass"),
+    "the weights of opponents are dropped": Mutation(None, COORDINATOR, "needed.update(opponents.versions)", "pass"),
     "an opponent is forgotten while a version can meet it": Mutation(
-        POOL, " - settings.window - settings.max_lag", " - settings.window"
+        None, POOL, " - settings.window - settings.max_lag", " - settings.window"
     ),
-    "an opponent is drawn from versions that came later": Mutation(POOL, " if each <= version]", "]"),
-    "an order does not name its opponent": Mutation(ROLLOUTS, "each.sequence, each.opponent)", "each.sequence)"),
+    "an opponent is drawn from versions that came later": Mutation(None, POOL, " if each <= version]", "]"),
+    "an order does not name its opponent": Mutation(
+        Rule.OPPONENT, ROLLOUTS, "each.sequence, each.opponent)", "each.sequence)"
+    ),
     "later rollouts are collected first": Mutation(
-        HELD, "version = min(startable, default=-1)", "version = max(startable, default=-1)"
+        Rule.LOWEST_VERSION_FIRST, HELD, "version = min(startable, default=-1)", "version = max(startable, default=-1)"
     ),
-    "rollouts of a lane are not counted": Mutation(HELD, "self.sequence += kept", "pass"),
-    "the lane of a lost worker is not placed anew": Mutation(PLACEMENT, "self._unplaced |= member.lanes", "pass"),
-    "a silent worker is never removed": Mutation(MEMBERSHIP, "if now - member.alive_s > timeout_s]", "if False]"),
+    "rollouts of a lane are not counted": Mutation(Rule.IN_ORDER, HELD, "self.sequence += kept", "pass"),
+    "the lane of a lost worker is not placed anew": Mutation(
+        Rule.LOST_TICKETS, PLACEMENT, "self._unplaced |= member.lanes", "pass"
+    ),
+    "a silent worker is never removed": Mutation(
+        Rule.WORKER_TIMEOUT, MEMBERSHIP, "if now - member.alive_s > timeout_s]", "if False]"
+    ),
     "messages of an earlier session are accepted": Mutation(
-        SESSION, 'getattr(message, "session", self.session) != self.session:', "False:"
+        Rule.OTHER_SESSION, SESSION, 'getattr(message, "session", self.session) != self.session:', "False:"
     ),
     "heartbeats are always due": Mutation(
+        Rule.HEARTBEAT,
         SESSION,
         " or now < self.due_s:\n            return []\n        self.due_s",
         ":\n            return []\n        self.due_s",
     ),
     "heartbeats are never due": Mutation(
+        Rule.HEARTBEAT,
         SESSION,
         " or now < self.due_s:\n            return []\n        self.due_s",
         " or True:\n            return []\n        self.due_s",
     ),
     "heartbeats at half the rate needed": Mutation(
+        Rule.HEARTBEAT,
         SESSION,
         "self.due_s = now + self.run.heartbeat_s",
         "self.due_s = now + 2 * self.run.heartbeat_s",
     ),
-    "a lost Release is never said again": Mutation(SESSION, "return current.release_unlisted(received)", "return []"),
+    "a lost Release is never said again": Mutation(
+        Rule.UNLISTED, SESSION, "return current.release_unlisted(received)", "return []"
+    ),
     "a lane reopened on a new incarnation keeps the old lane's state": Mutation(
+        Rule.INCARNATION,
         HELD,
         "lane = self._lanes[number] = self._kind(incarnation)",
         "lane = self._lanes[number] = lane or self._kind(0)\n            lane.incarnation = incarnation",
     ),
-    "a lane keeps its incarnation": Mutation(LANES, "self.incarnation += 1", "self.incarnation += 0"),
+    "a lane keeps its incarnation": Mutation(Rule.LANE_MOVES, LANES, "self.incarnation += 1", "self.incarnation += 0"),
 }
 
 

@@ -123,7 +123,10 @@ class Search:
         return number
 
     def _check_liveness(self, following: array[int]) -> None:
-        """Every state leads to the target, if the next state is always the one that is given here."""
+        """Every state leads to the target, if the next state is always the one that is given here.
+
+        Nothing else shows that rule WORKER_TIMEOUT is broken.
+        """
         end = len(self.states)
         jump = np.full(end + 1, end, dtype=np.int32)
         jump[: len(following)] = following

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.sent_weights import SentAfter
 from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
+from millrace.protocol.rules import Rule
 from tests.model import learner_part, process_part, worker_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner, first_learner
@@ -90,27 +91,33 @@ class WeightsRule:
         held = after.coordinator.weights.held
         for peer, message in out:
             if isinstance(message, Collect | Evaluate):
-                assert set(message.keep) == held.versions(peer), "an order lists other weights than count as held"
+                assert set(message.keep) == held.versions(peer), (
+                    f"{Rule.KEEP}: an order lists other weights than count as held"
+                )
                 versions = {message.version}
                 for each in message.permits if isinstance(message, Collect) else ():
                     opponent = after.coordinator.rollouts.held[each.ticket].opponent
-                    assert each.opponent == opponent, "an order names another opponent than its ticket"
+                    assert each.opponent == opponent, f"{Rule.OPPONENT}: an order names another opponent than its ticket"
                     versions |= set() if opponent is None else {opponent}
                 named |= {(message.session, version) for version in versions}
-                assert versions <= held.versions(peer), "an order is sent without its weights"
+                assert versions <= held.versions(peer), f"{Rule.WEIGHTS_AFTER}: an order is sent without its weights"
             if isinstance(message, Weights):
                 member = after.coordinator.members[peer]
                 which = member.session, message.version
-                assert which in named, "weights are sent that no order has named"
+                assert which in named, f"{Rule.WEIGHTS_AFTER}: weights are sent that no order has named"
                 if which in sent_at:
-                    assert after.settings.faults, "an order waits for weights although nothing was lost"
+                    assert after.settings.faults, (
+                        f"{Rule.WEIGHTS_AFTER}: an order waits for weights although nothing was lost"
+                    )
                     shown = isinstance(self._heard, Heartbeat) and message.version not in self._heard.versions
-                    assert shown, "weights are sent again although they were not lost"
-                    assert sent_at[which] < self._heard.replies, "weights are sent again although they may be under way"
+                    assert shown, f"{Rule.WEIGHTS_AGAIN}: weights are sent again although they were not lost"
+                    assert sent_at[which] < self._heard.replies, (
+                        f"{Rule.SENT_BEFORE}: weights are sent again although they may be under way"
+                    )
                 standing = held.by_worker.get(peer, {}).get(message.version)
-                assert isinstance(standing, SentAfter), "weights are sent and not noted"
+                assert isinstance(standing, SentAfter), f"{Rule.SENT_BEFORE}: weights are sent and not noted"
                 assert standing.replies >= member.replies - isinstance(self._heard, Heartbeat), (
-                    "weights are sent and not noted"
+                    f"{Rule.SENT_BEFORE}: weights are sent and not noted"
                 )
                 sent_at[which] = standing.replies
         heard = self._heard
@@ -118,7 +125,9 @@ class WeightsRule:
             if isinstance(heard, Heartbeat) and member.session == heard.session:
                 for version, standing in held.by_worker.get(peer, {}).items():
                     under_way = isinstance(standing, SentAfter) and standing.replies >= heard.replies
-                    assert under_way or version in heard.versions, "weights that a worker lacks count as held"
+                    assert under_way or version in heard.versions, (
+                        f"{Rule.WEIGHTS_AGAIN}: weights that a worker lacks count as held"
+                    )
 
 
 def _after(learner: L, event: Event, heard: Any, now: float) -> tuple[L, list[Outgoing]]:

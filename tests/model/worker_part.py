@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from millrace.protocol.messages import Collect, Describe, Evaluate, HeartbeatReply, ToLearner, ToWorker
+from millrace.protocol.rules import Rule
 from millrace.workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
 from millrace.workers.conversation.session import (
     EvaluationTask,
@@ -59,12 +60,18 @@ class Worker(Process):
         held = self.session._current
         replies, before = held.replies, set(held.weights)
         effects = self.session.handle(message, now)
-        assert (before & _asked(held)).issubset(held.weights), "a worker drops weights that its tickets name"
+        assert (before & _asked(held)).issubset(held.weights), (
+            f"{Rule.HOLDS_WEIGHTS}: a worker drops weights that its tickets name"
+        )
         if isinstance(message, Collect | Evaluate) and message.session == self.session.session:
-            assert {*message.keep, *_asked(held)}.issuperset(held.weights), "a worker keeps weights that no order lists"
+            assert {*message.keep, *_asked(held)}.issuperset(held.weights), (
+                f"{Rule.HOLDS_WEIGHTS}: a worker keeps weights that no order lists"
+            )
         if isinstance(message, HeartbeatReply) and held.replies > replies:
             listed = {each.lane for each in message.received}
-            assert all(lane.lane in listed for lane in held.lanes()), "a worker keeps a lane that is not its own"
+            assert all(lane.lane in listed for lane in held.lanes()), (
+                f"{Rule.UNLISTED}: a worker keeps a lane that is not its own"
+            )
         return self.turn(effects, now)
 
     def finish(self, now: float) -> list[ToLearner]:
@@ -75,7 +82,7 @@ class Worker(Process):
         held = self.session._current
         before = set(held.weights)
         effects = self.session.work_ended(answers)
-        assert set(held.weights) == before, "a worker drops weights when a ticket ends"
+        assert set(held.weights) == before, f"{Rule.HOLDS_WEIGHTS}: a worker drops weights when a ticket ends"
         return self.turn(effects, now)
 
     def _begin(self, work: RolloutTask | EvaluationTask | Describe) -> list[ToLearner]:
@@ -87,10 +94,14 @@ class Worker(Process):
             lanes = held.rollouts._lanes
             for each in work.assignments:
                 lane = lanes[each.lane]
-                assert each.sequence == lane.sequence, "rollouts of a lane are not collected in their order"
+                assert each.sequence == lane.sequence, (
+                    f"{Rule.IN_ORDER}: rollouts of a lane are not collected in their order"
+                )
                 expected = (each.sequence, version, each.opponent)
-                assert lane.asked[each.ticket] == expected, "other weights act than the order names"
-                assert held.weights.keys() >= _versions(lane.asked[each.ticket]), "a rollout starts without its weights"
+                assert lane.asked[each.ticket] == expected, f"{Rule.VERSION}: other weights act than the order names"
+                assert held.weights.keys() >= _versions(lane.asked[each.ticket]), (
+                    f"{Rule.OPPONENTS}: a rollout starts without its weights"
+                )
             startable = [
                 asked.version
                 for lane in lanes.values()
@@ -98,7 +109,9 @@ class Worker(Process):
                 if asked.sequence == lane.sequence and _versions(asked) <= held.weights.keys()
             ]
             lowest = [each for each in startable if each == min(startable)]
-            assert [version] * len(work.assignments) == lowest, "others are collected than all of the lowest version"
+            assert [version] * len(work.assignments) == lowest, (
+                f"{Rule.LOWEST_VERSION_FIRST}: others are collected than all of the lowest version"
+            )
         return []
 
     def turn(self, effects: list[WorkerEffect], now: float) -> list[ToLearner]:
@@ -109,13 +122,13 @@ class Worker(Process):
             effects = effects + current.work_ended([])
         work = current.next_work()
         if work is not None:
-            assert self.task is None, "a worker does two pieces of work at the same time"
+            assert self.task is None, f"{Rule.LOWEST_VERSION_FIRST}: a worker does two pieces of work at the same time"
             assert isinstance(work, RolloutTask | EvaluationTask | Describe)
             effects = effects + [SendMessage(said) for said in self._begin(work)]
         effects = effects + current.tick(now)
         rounds = 1 + self.settings.max_lag
         most, held = self.settings.lanes * rounds, held_count(current)
-        assert held <= most, f"a worker holds {held} rollouts, of at most {most}"
+        assert held <= most, f"{Rule.ARRIVED}: a worker holds {held} rollouts, of at most {most}"
         versions = len(current._current.weights)
         most = (
             rounds
@@ -123,7 +136,7 @@ class Worker(Process):
             + bool(self.settings.opponents) * most
             + len({order.version for order in current._current.evaluations.asked.values()})
         )
-        assert versions <= most, f"a worker holds {versions} versions, of at most {most}"
+        assert versions <= most, f"{Rule.HOLDS_WEIGHTS}: a worker holds {versions} versions, of at most {most}"
         sent: list[ToLearner] = []
         for effect in effects:
             if isinstance(effect, SendMessage):

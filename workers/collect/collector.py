@@ -109,7 +109,7 @@ class Collector:
         self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse, opponents: Opponents
     ) -> list[Rollout]:
         lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
-        for lane, assignment in zip(lanes, assignments, strict=True):
+        for lane, assignment in zip(lanes, assignments, strict=True):  # rule ATTRIBUTES
             lane.set_attributes(self.env_attributes, pulse)
             self._meet(lane, None if assignment.opponent is None else opponents(assignment.opponent))
         states = [lane.state if lane.seats is None else lane.seats.state_before(lane.state) for lane in lanes]
@@ -174,7 +174,7 @@ class Collector:
         check_acted(lane.number, "log_prob", acted.log_prob, rows.obs, axes)
         rows.pass_on()
         sent = lane.sent
-        return Rollout(
+        return Rollout(  # rules TICKETS, LANES, SEQUENCE
             session=session,
             lane=assignment.lane,
             ticket=assignment.ticket,

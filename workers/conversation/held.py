@@ -43,6 +43,7 @@ class Held(Generic[AskedT, AnsweredT]):
     asked: dict[int, AskedT] = field(default_factory=dict, init=False)
     answered: dict[int, AnsweredT] = field(default_factory=dict, init=False)  # oldest first
 
+    # rules ROLLOUT_ONCE, ORDER_ONCE, EVALUATE_ONCE, DESCRIBE_AGAIN
     def take(self, ticket: int, asked: AskedT) -> AnsweredT | None:
         """Take what is asked. Returns an answer to send again, if any."""
         if ticket not in self.answered:
@@ -60,14 +61,14 @@ class Held(Generic[AskedT, AnsweredT]):
 class HeldEvaluations(Held[Evaluate, Evaluated]):
     """Evaluations. They belong to no lane. One evaluation is of one version, and has higher tickets than those before it."""
 
-    def take(self, ticket: int, asked: Evaluate) -> Evaluated | None:
+    def take(self, ticket: int, asked: Evaluate) -> Evaluated | None:  # rule EVALUATE_ENDS
         """Take an order. The evaluations before that of the highest ticket are over: what is left of them is dropped."""
         answer = super().take(ticket, asked)
         newest = max(self.asked, default=ticket)
         self.asked = {n: order for n, order in self.asked.items() if order.version == self.asked[newest].version}
         return answer
 
-    def next(self, versions: Collection[int]) -> Evaluate | None:
+    def next(self, versions: Collection[int]) -> Evaluate | None:  # rules EVALUATE_VERSION, OPPONENTS
         """The oldest whose weights are held."""
         due = [ticket for ticket, order in self.asked.items() if order.versions.issubset(versions)]
         return self.asked[min(due)] if due else None
@@ -121,7 +122,7 @@ class _HeldLanes(Generic[LaneT]):
     def __init__(self) -> None:
         self._lanes: dict[int, LaneT] = {}
 
-    def _opened(self, number: int, incarnation: int) -> LaneT | None:
+    def _opened(self, number: int, incarnation: int) -> LaneT | None:  # rule INCARNATION
         """The lane in this incarnation; None if it has a later one."""
         lane = self._lanes.get(number)
         if lane is None or incarnation > lane.incarnation:
@@ -198,13 +199,14 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
 
     _kind = RolloutLane
 
-    def take(self, permit: Permit, version: int) -> Rollout | None:
+    def take(self, permit: Permit, version: int) -> Rollout | None:  # rule RECEIVED
         """Take a ticket to collect under this version. Returns a rollout to send again, if any."""
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
             return None  # a late repeat: the learner has this rollout
         return lane.take(permit.ticket, Permitted(permit.sequence, version, permit.opponent))
 
+    # rules IN_ORDER, VERSION, LOWEST_VERSION_FIRST
     def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
         """The next rollouts of the lanes whose weights are held: the lowest version of them, and those under it.
 
@@ -223,7 +225,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         """The versions that are asked for."""
         return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}
 
-    def forget_received(self, received: Sequence[Received]) -> None:
+    def forget_received(self, received: Sequence[Received]) -> None:  # rule ROLLOUT_ONCE
         """Drop the rollouts that the learner has received."""
         for of_lane in received:
             lane = self._lanes.get(of_lane.lane)
@@ -246,7 +248,7 @@ class HeldOrders(_HeldLanes[OrderLane]):
 
     _kind = OrderLane
 
-    def take(self, order: Order) -> Answer | None:
+    def take(self, order: Order) -> Answer | None:  # rules ORDER_OLD, ORDER_ONCE
         """Take an order that has arrived. Returns an answer to send again, if any."""
         lane = self._opened(order.lane, order.incarnation)
         if lane is None or order.ticket < lane.newest:

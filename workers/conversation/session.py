@@ -150,7 +150,7 @@ class WorkerIdentity:
     evaluates: bool = False
     """whether it only plays evaluations"""
 
-    def hello(self, attempt: int) -> Hello:
+    def hello(self, attempt: int) -> Hello:  # rules HELLO, PROTOCOL
         """The Hello of this attempt to join. Attempts are counted from the nonce: no two processes have the same one."""
         return Hello(
             PROTOCOL_VERSION,
@@ -190,7 +190,7 @@ class _SessionState:
     in_progress: bool = False  # whether a piece of work is
     replies: int = 0  # number of the last HeartbeatReply
 
-    def unfinished(self) -> tuple[int, ...]:
+    def unfinished(self) -> tuple[int, ...]:  # rule HEARTBEAT_TICKETS
         """Tickets that are not yet collected or executed."""
         return (*self.descriptions.asked, *self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())
 
@@ -198,7 +198,7 @@ class _SessionState:
         """The lanes of this worker."""
         return (*self.rollouts.lanes(), *self.orders.lanes())
 
-    def next_work(self, session: int) -> Work | None:
+    def next_work(self, session: int) -> Work | None:  # rule EVALUATIONS_FIRST
         """The next piece of work: a description, else an evaluation, else rollouts to collect together, else an order."""
         if (description := self.descriptions.next()) is not None:
             return description
@@ -217,7 +217,7 @@ class _SessionState:
         """Versions that are asked for and not held."""
         return self.asked_versions().difference(self.weights)
 
-    def keep_weights(self, listed: Sequence[int]) -> None:
+    def keep_weights(self, listed: Sequence[int]) -> None:  # rule HOLDS_WEIGHTS
         """Drop the weights that an order does not list. A late copy of an order drops none that are asked for."""
         kept = self.asked_versions().union(listed)
         self.weights = {version: weights for version, weights in self.weights.items() if version in kept}
@@ -233,12 +233,12 @@ class _SessionState:
                 return self.descriptions.keep(answer)
         return self.orders.keep(answer)
 
-    def release(self, lanes: Sequence[LaneIncarnation]) -> list[WorkerEffect]:
+    def release(self, lanes: Sequence[LaneIncarnation]) -> list[WorkerEffect]:  # rule RELEASE
         """Drop these lanes."""
         released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
         return [CloseLanes(released)] if released else []
 
-    def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:
+    def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:  # rule UNLISTED
         """Drop the lanes that the learner does not list: their Release was lost.
 
         Only a new HeartbeatReply may do so: a copy of an old message does not list the lanes that came after it.
@@ -299,7 +299,7 @@ class Session:
             case Describe() if isinstance(self.run, WaitSpec):
                 again = [current.descriptions.take(message.ticket, message)]
             case Weights(version):
-                current.weights.setdefault(version, message)
+                current.weights.setdefault(version, message)  # rule HELD_ALREADY
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
                 current.rollouts.forget_received(received)
                 again = [current.rollouts.take(permit, version) for permit in permits]
@@ -311,7 +311,7 @@ class Session:
                 again = [current.orders.take(message)]
             case Release(_, lanes):
                 return current.release(lanes)
-            case HeartbeatReply(_, number, received) if number > current.replies:
+            case HeartbeatReply(_, number, received) if number > current.replies:  # rule LATE_REPLY
                 current.replies = number
                 current.rollouts.forget_received(received)
                 return current.release_unlisted(received)
@@ -328,14 +328,14 @@ class Session:
                 if now < self.due_s:
                     return []
                 self.due_s = now + self._backoff_s
-                self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
+                self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)  # rule HELLO_AGAIN
                 return [SendMessage(self.identity.hello(self._attempt))]
         assert self.run is not None
-        if now - self._unanswered_s > self.run.learner_timeout_s:
+        if now - self._unanswered_s > self.run.learner_timeout_s:  # rule SILENT
             return self._rejoin(LearnerSilent(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
         return self.heartbeat_if_due(now)
 
-    def heartbeat_if_due(self, now: float) -> list[WorkerEffect]:
+    def heartbeat_if_due(self, now: float) -> list[WorkerEffect]:  # rule HEARTBEAT
         """A Heartbeat, if one is due. It changes nothing else, so it may be sent at any moment."""
         if self.run is None or self.state not in (WorkerState.READY, WorkerState.DRAINING) or now < self.due_s:
             return []
@@ -345,9 +345,9 @@ class Session:
         heartbeat = Heartbeat(
             session=self.session,
             replies=current.replies,
-            versions=tuple(sorted(current.weights)),
+            versions=tuple(sorted(current.weights)),  # rule HEARTBEAT_VERSIONS
             tickets=current.unfinished(),
-            steps=statistics.steps,
+            steps=statistics.steps,  # rule HEARTBEAT_STEPS
             stages=dict(statistics.stages),
             resident_bytes=statistics.resident_bytes,
             note=statistics.note,
@@ -371,11 +371,11 @@ class Session:
         failure = Failure(self.session, error, last_text(traceback), lane, of_policy)
         return self._leave(WorkerFailed(), 1, error, failure)
 
-    def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:
+    def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:  # rule DECLINED
         """Leave a run in which this worker cannot take part, or (with another exit code) not now."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
-    def refused(self, reason: str) -> list[WorkerEffect]:
+    def refused(self, reason: str) -> list[WorkerEffect]:  # rules REFUSE, AFTER_REFUSE
         """Leave, because the learner, or its endpoint, rejects this worker for good."""
         return self._leave(Refuse(reason), 2, reason)
 
@@ -408,7 +408,7 @@ class Session:
 
     # ---------------------------------------------------------------- inside
 
-    def _join(self, now: float) -> None:
+    def _join(self, now: float) -> None:  # rules REJOIN, FORGETS
         """Start to join, as if for the first time."""
         self._attempt += 1
         self._joining_s = self.due_s = now
@@ -416,18 +416,19 @@ class Session:
         self._current = _SessionState()
 
     def _welcome(self, message: Welcome, now: float) -> list[WorkerEffect]:
-        if message.attempt != self._attempt:
+        if message.attempt != self._attempt:  # rule WELCOME_ATTEMPT
             return []  # the answer to an earlier Hello
         if self.state is WorkerState.READY and message.session == self.session:
             return self._welcome_again(message.run, now)
         self.state = TABLE[self.state][type(message)]
         self._current = _SessionState()
-        self.run, self.session = message.run, message.session
+        self.run, self.session = message.run, message.session  # rule SESSION
         self._unanswered_s = math.inf
         self.due_s = now + message.run.heartbeat_s
         self._join_timeout_s = self._rejoin_timeout_s
         return [StartSession(message.run)]
 
+    # rules REPEATED_WELCOME, BEGINS
     def _welcome_again(self, run: WaitSpec | RunSpec | StepSpec, now: float) -> list[WorkerEffect]:
         """The session goes on. The run may have begun, for which this worker waits; else it is a repeat."""
         if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):
@@ -451,12 +452,13 @@ class Session:
         self._reason = reason
         return [Leave(0, reason)] if self.state is WorkerState.LEFT else self._leave_if_drained()
 
-    def _leave_if_drained(self) -> list[WorkerEffect]:
+    def _leave_if_drained(self) -> list[WorkerEffect]:  # rule DRAIN
         if self.state is not WorkerState.DRAINING or self._current.in_progress:
             return []
         goodbye = Goodbye(self.session, self._reason, self._current.unfinished())
         return self._leave(WorkFinished(), 0, self._reason, goodbye)
 
+    # rule AFTER_GOODBYE
     def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[WorkerEffect]:
         """Leave, once. The last message is said only within a session."""
         if self.state is WorkerState.LEFT:

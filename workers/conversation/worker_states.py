@@ -46,12 +46,12 @@ class WorkerFailed:
     """Event: the environment, or this worker, raised."""
 
 
-# The next state. A message that is not listed is ignored in that state.
+# The next state. A message that is not listed is ignored in that state (rules STAYS, REFUSE).
 TABLE: dict[WorkerState, dict[type, WorkerState]] = {
-    WorkerState.JOINING: {
+    WorkerState.JOINING: {  # rule JOINING_IGNORES
         Welcome: WorkerState.READY,
         Refuse: WorkerState.LEFT,
-        Drain: WorkerState.LEFT,
+        Drain: WorkerState.LEFT,  # rule DRAIN_JOINING
         LearnerSilent: WorkerState.LEFT,
         StopRequested: WorkerState.LEFT,
         WorkerFailed: WorkerState.LEFT,
@@ -67,17 +67,17 @@ TABLE: dict[WorkerState, dict[type, WorkerState]] = {
         Release: WorkerState.READY,
         HeartbeatReply: WorkerState.READY,
         Welcome: WorkerState.READY,
-        Rejoin: WorkerState.JOINING,
+        Rejoin: WorkerState.JOINING,  # rule REJOIN
         Refuse: WorkerState.LEFT,
-        Drain: WorkerState.DRAINING,
-        LearnerSilent: WorkerState.JOINING,
-        StopRequested: WorkerState.DRAINING,
+        Drain: WorkerState.DRAINING,  # rule DRAIN
+        LearnerSilent: WorkerState.JOINING,  # rule SILENT
+        StopRequested: WorkerState.DRAINING,  # rule STOP
         WorkerFailed: WorkerState.LEFT,
     },
-    WorkerState.DRAINING: {
+    WorkerState.DRAINING: {  # rule DRAINING_IGNORES
         Weights: WorkerState.DRAINING,  # the next Heartbeat lists them; else the learner would send them after each
         HeartbeatReply: WorkerState.DRAINING,
-        Rejoin: WorkerState.LEFT,
+        Rejoin: WorkerState.LEFT,  # rule DRAINING_LEAVES
         Refuse: WorkerState.LEFT,
         LearnerSilent: WorkerState.LEFT,
         StopRequested: WorkerState.LEFT,

@@ -106,7 +106,7 @@ class EvaluationCopies(EnvCopies, Protocol):
         ...
 
 
-def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
+def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
     """Raise `UsageError` unless the copies have the spaces of the run's policy, and its agents."""
     observation = copies.observation_space
     action = copies.action_space
@@ -124,7 +124,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:
         )
 
 
-def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]:
+def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]:  # rule INDEPENDENT
     """A reset seed for each copy of a lane."""
     return [env_seed(seed, Purpose.COPIES, lane, incarnation, copy) for copy in range(copies)]
 

@@ -88,6 +88,7 @@ class EnvLoop:
         self._step_functions = [env.step for env in self.envs]
         self._stepping = stepping
         self._all = range(len(self.envs))
+        # rules NEXT_STEP, SAME_STEP, DISABLED
         self._next_step = autoreset == "NextStep"
         self._same_step = autoreset == "SameStep"
 
@@ -102,14 +103,14 @@ class EnvLoop:
         """Start episodes in these copies, with a seed for each, and options for each if any are given."""
         infos: CopyInfos = []
         keywords: Iterable[Mapping[str, Any]] = [{"options": each} for each in options] or repeat({}, len(seeds))
-        for n, seed, further in zip(copies, seeds, keywords, strict=True):
+        for n, seed, further in zip(copies, seeds, keywords, strict=True):  # rule SEEDED
             pulse()
             try:
                 with self._activity.during(RESETTING):
                     into[n], info = reset_answer(self.envs[n].reset(seed=seed, **further))
             except BaseException as error:
                 raise CopyFailed(n, "reset") from error
-            self.reward[n] = 0.0
+            self.reward[n] = 0.0  # rule AFTER_RESET
             self.terminated[n] = False
             self.truncated[n] = False
             if info:

@@ -16,6 +16,7 @@ from millrace.protocol.specs import Leaf
 from millrace.workers.copies.env_errors import environment_failed
 
 
+# rule IN_SPACE
 def check_observed(lane: int | None, leaves: Sequence[Leaf], obs: Sequence[Array], axes: Axes, first_step: int = 0) -> None:
     """Check observations [rows, N, *leaf]."""
     for leaf, array in zip(leaves, obs, strict=True):

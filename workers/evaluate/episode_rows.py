@@ -60,7 +60,7 @@ class RowSender:
         self._bytes += action.nbytes + 10
         was_last_frame = bool(self._frames) and self._frames_so_far == MOST_FRAMES
         if terminated or truncated or was_last_frame or self._bytes >= CHUNK_BYTES:
-            self._flush()
+            self._flush()  # rule ROWS_FIRST
 
     def _flush(self) -> None:
         spec = self._policy
@@ -68,7 +68,7 @@ class RowSender:
         actions, rewards, terminated, truncated = zip(*self._rows, strict=True)
         has_frames = len(self._frames) == len(self._obs)
         self._send(
-            EpisodeRows(
+            EpisodeRows(  # rule EPISODE_ROWS
                 session=order.session,
                 ticket=order.ticket,
                 episode=self.episode,

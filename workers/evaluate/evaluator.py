@@ -75,7 +75,7 @@ class Evaluator:
         self._opponents = KnownOpponents(run)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
-    def play(
+    def play(  # rule EVALUATE
         self, order: Evaluate, send: SendRows, pulse: Pulse, held: Mapping[int, Weights] = MappingProxyType({})
     ) -> Evaluated:
         """Play one episode for each seed. `send` gets the rows, if the order asks for them. `held`: weights of opponents.
@@ -107,7 +107,7 @@ class Evaluator:
         run = self._run
         k = len(order.seeds)
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
-        drawn = generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
+        drawn = generator(order.seeds[0], Purpose.PLAYED_ACTIONS)  # rule EVALUATE_SEEDS
         lane = Lane(run, copies, order.seeds, drawn, number=None, most_steps=order.most_steps)
         lane.others = others
         lane.reset(pulse)
@@ -119,7 +119,7 @@ class Evaluator:
             senders = [RowSender(order, n, run.policy, send) for n in range(k)]
         for sender in senders:
             self._observe(sender, of_lane, 0, copies)
-        actions = _PlayedActions(run, self._runner.acting, rows, greedy=order.greedy)
+        actions = _PlayedActions(run, self._runner.acting, rows, greedy=order.greedy)  # rule GREEDY
         found: dict[int, EndedEpisode] = {}
         while lane.playing.any():
             playing = np.flatnonzero(lane.playing).tolist()
@@ -134,7 +134,7 @@ class Evaluator:
                     self._send_row(senders[n], of_lane, actions.chosen, cut=n in found and found[n].cut)
             rows.begin_again()
         ended = [found[n] for n in range(k)]
-        return Evaluated(
+        return Evaluated(  # rule CUT
             order.session, order.ticket, tuple(each.episode for each in ended), tuple(each.cut for each in ended)
         )
 

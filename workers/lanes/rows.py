@@ -122,11 +122,11 @@ class RowsOfLane:
 
     def begin(self) -> None:
         """No row is written yet."""
-        self.resets[0] = ~self.lane.playing
+        self.resets[0] = ~self.lane.playing  # rules FIRST_VALID, FIRST_RESETS
         self.ended.clear()
         self._facts.clear()
 
-    def pass_on(self) -> None:
+    def pass_on(self) -> None:  # rule CONTINUES
         """Leave to the lane what its next rows begin with."""
         self.lane.obs = tuple(array[-1].copy() for array in self.obs)
         self.lane.state = self.state.copy()
@@ -155,7 +155,7 @@ class RowsOfLane:
         """Step the copies with actions [N · A, *action], and write what they return."""
         lane = self.lane
         try:
-            if lane.autoresets:
+            if lane.autoresets:  # rules ROWS, LAST_OBSERVATION
                 result = lane.copies.step(actions, pulse)
                 write_numbers(self._numbers, t, (result.reward, result.terminated, result.truncated))
                 lane.writer.write(self._joined, t + 1, result.leaves)
@@ -243,7 +243,7 @@ class RowsOfLane:
         if not lane.autoresets:
             self._cut(t, now_s)
 
-    def _count_seats(self, t: int, seats: Seats) -> Bools:
+    def _count_seats(self, t: int, seats: Seats) -> Bools:  # rule SEATS
         """What row t means for seats: whether the episode of each copy [N] is over.
 
         Where an episode begins, the policy's state is set to zeros, and another opponent may come.

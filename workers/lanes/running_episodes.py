@@ -54,11 +54,12 @@ class RunningEpisodes:
         """The first episodes of all copies begin with a reset."""
         self.began_s = [now_s] * len(self.began_s)
 
-    def add(self, rewards: Array, playing: Bools) -> None:
+    def add(self, rewards: Array, playing: Bools) -> None:  # rule EPISODES
         """One step of these copies [N], with rewards [N, A], which are 0 for seats that got none."""
         self.returns += rewards
         self.lengths += playing
 
+    # rule EPISODE_ORDER
     def add_rows(self, reward: Array, resets: Bools, step_end_s: Sequence[float], facts: FactsOfRows) -> list[EndedEpisode]:
         """T steps of copies with one agent each. Returns the episodes that ended, ordered by step, then by copy.
 

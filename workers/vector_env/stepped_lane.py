@@ -71,6 +71,7 @@ class SteppedLane:
         self._writer = ObservationWriter(spec.leaves, len(rows.reward), spec.seats)
         self._joined = self._writer.joined(array[None] for array in rows.obs)
 
+    # rules RESET_SOME, OPTIONS
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> CopyInfos:
         """Start episodes in these copies, with a seed for each. `options`: a list with those of each, or those of all."""
         each = options if isinstance(options, list) else [options] * len(copies)
@@ -85,7 +86,7 @@ class SteppedLane:
         except CopyFailed as error:
             raise CopyFailed(error.copy, f"step {step}", error.line) from error
 
-    def _of_each(self, actions: Sequence[Array]) -> Iterable[Any]:
+    def _of_each(self, actions: Sequence[Array]) -> Iterable[Any]:  # rule OWN_ROW
         """The action of each copy."""
         return map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
 

@@ -56,7 +56,7 @@ class Stepper:
         self._awake = SpinWait()
         self._spin_s = 0.0  # how long to spin before the next wait for the wake pipe
 
-    def execute(self, order: Order, pulse: Pulse) -> Answer:
+    def execute(self, order: Order, pulse: Pulse) -> Answer:  # rules ORDER_ANSWERED, ORDER_ONLY
         """The answer to the order. Raises `EnvironmentFailed`, and what `pulse` raises; the lane is then closed."""
         try:
             with self.lanes.in_use():
@@ -174,7 +174,7 @@ def _array(data: bytes) -> npt.NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8)
 
 
-def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:
+def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:  # rule STEPPED_ARRAYS
     """The answer, with its own copies of the arrays, because it may be sent again."""
     return Stepped(
         session=order.session,
@@ -198,7 +198,7 @@ def _private_name(order: Call, arguments: Any) -> str:
     return next((name for name in names if name.startswith("_")), "")
 
 
-def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned:
+def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned:  # rule RETURNED
     """The attribute's values or results. If it raises, the answer holds the exception."""
     results: list[Any] = []
     error = detail = ""

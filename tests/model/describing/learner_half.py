@@ -16,6 +16,7 @@ from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.messages import Rejoin, WorkerExit
+from millrace.protocol.rules import Rule
 from tests.model import learner_part, membership_part
 from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner
@@ -60,8 +61,12 @@ def event(
     out = _in_lobby(coordinator, event, message, now)
     asked = sum(bool(member.tickets) for member in coordinator.members.values())
     wanted = min(coordinator._at_once, len(coordinator.members))
-    assert coordinator.described or asked == wanted, f"{asked} workers are asked to describe, instead of {wanted}"
-    assert settings.faults or coordinator._at_once == 1, "several workers are asked although none was lost"
+    assert coordinator.described or asked == wanted, (
+        f"{Rule.ONE_DESCRIBES}: {asked} workers are asked to describe, instead of {wanted}"
+    )
+    assert settings.faults or coordinator._at_once == 1, (
+        f"{Rule.ONE_DESCRIBES}: several workers are asked although none was lost"
+    )
     return (_saved(coordinator, settings, now), None), _checked(out, settings)
 
 
@@ -86,7 +91,9 @@ def _taken_over(coordinator: DescribeCoordinator, settings: Describing, now: flo
     )
     out = made.take_over(coordinator.membership, now)
     before = {peer: member.session for peer, member in coordinator.members.items()}
-    assert {peer: member.session for peer, member in made.members.items()} == before, "a worker has lost its session"
+    assert {peer: member.session for peer, member in made.members.items()} == before, (
+        f"{Rule.BEGINS}: a worker has lost its session"
+    )
     learner = Learner(settings, made)
     learner.updating = True
     return learner, out
@@ -94,7 +101,7 @@ def _taken_over(coordinator: DescribeCoordinator, settings: Describing, now: flo
 
 def _checked(out: list[Outgoing], settings: Describing) -> list[Outgoing]:
     if not settings.faults:
-        assert not any(isinstance(message, Rejoin) for _, message in out), "a worker is told to join again"
+        assert not any(isinstance(message, Rejoin) for _, message in out), f"{Rule.BEGINS}: a worker is told to join again"
     return out
 
 

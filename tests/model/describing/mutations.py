@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from millrace.protocol.rules import Rule
 from tests.model.mutations import HELD, MEMBERSHIP, SESSION, Mutation, play
 
 if TYPE_CHECKING:
@@ -17,38 +18,45 @@ if TYPE_CHECKING:
 COORDINATOR = "millrace.learner.members.describe_coordinator"
 
 MUTATIONS = {
-    "all workers describe": Mutation(COORDINATOR, "in free[: max(0, self._at_once - asked)]", "in free"),
+    "all workers describe": Mutation(Rule.ONE_DESCRIBES, COORDINATOR, "in free[: max(0, self._at_once - asked)]", "in free"),
     "a worker that is asked counts as free": Mutation(
-        COORDINATOR, "member.tickets[self._tickets] = member.replies\n", "pass\n"
+        Rule.ONE_DESCRIBES, COORDINATOR, "member.tickets[self._tickets] = member.replies\n", "pass\n"
     ),
     "a lost order to describe is not sent again": Mutation(
-        COORDINATOR, "return [self._order(member)] if lost else []", "return []"
+        Rule.ORDER_AGAIN, COORDINATOR, "return [self._order(member)] if lost else []", "return []"
     ),
-    "a description is not taken": Mutation(COORDINATOR, "self.described = described\n", "pass\n"),
+    "a description is not taken": Mutation(Rule.FIRST_DESCRIPTION, COORDINATOR, "self.described = described\n", "pass\n"),
     "nobody is asked in place of a lost worker": Mutation(
-        COORDINATOR, "if self._unknown is None or", "if self._at_once > 1 or self._unknown is None or"
+        Rule.ONE_DESCRIBES, COORDINATOR, "if self._unknown is None or", "if self._at_once > 1 or self._unknown is None or"
     ),
     "the Welcome that brings the run is not sent again": Mutation(
-        MEMBERSHIP, "return [self._welcome(member)] if lost else []", "return []"
+        Rule.WELCOME_AGAIN, MEMBERSHIP, "return [self._welcome(member)] if lost else []", "return []"
     ),
     "the run begins in other sessions": Mutation(
-        MEMBERSHIP, "            member.tickets = {}\n", "            member.tickets = {}\n            member.session += 1\n"
+        Rule.BEGINS,
+        MEMBERSHIP,
+        "            member.tickets = {}\n",
+        "            member.tickets = {}\n            member.session += 1\n",
     ),
     "replies are counted anew when the run begins": Mutation(
-        MEMBERSHIP, "            member.tickets = {}\n", "            member.tickets, member.replies = {}, 0\n"
+        Rule.BEGINS, MEMBERSHIP, "            member.tickets = {}\n", "            member.tickets, member.replies = {}, 0\n"
     ),
     "no environment is described": Mutation(
-        SESSION, "case Describe() if isinstance(self.run, WaitSpec):", "case Describe() if False:"
+        Rule.DESCRIBE, SESSION, "case Describe() if isinstance(self.run, WaitSpec):", "case Describe() if False:"
     ),
     "the second Welcome is taken for a repeat": Mutation(
-        SESSION, "if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):", "if True:"
+        Rule.BEGINS, SESSION, "if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):", "if True:"
     ),
     "a late copy of the first Welcome ends the run": Mutation(
-        SESSION, "if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):", "if False:"
+        Rule.REPEATED_WELCOME, SESSION, "if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):", "if False:"
     ),
-    "a worker does not say that it waits": Mutation(SESSION, "waits=isinstance(self.run, WaitSpec)", "waits=False"),
-    "a description is not sent": Mutation(SESSION, "return self.descriptions.keep(answer)", "return False"),
-    "a description that is asked for again is made again": Mutation(HELD, "if ticket > newest:", "if ticket >= newest:"),
+    "a worker does not say that it waits": Mutation(
+        Rule.HEARTBEAT_WAITS, SESSION, "waits=isinstance(self.run, WaitSpec)", "waits=False"
+    ),
+    "a description is not sent": Mutation(Rule.DESCRIBE, SESSION, "return self.descriptions.keep(answer)", "return False"),
+    "a description that is asked for again is made again": Mutation(
+        Rule.DESCRIBE_AGAIN, HELD, "if ticket > newest:", "if ticket >= newest:"
+    ),
 }
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from millrace.learner.members.describe_coordinator import FIRST_TICKET
 from millrace.protocol.messages import Describe, ToLearner, ToWorker
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import WaitSpec
 from millrace.workers.conversation.session import EvaluationTask, RolloutTask
 from tests.model import worker_part
@@ -48,8 +49,8 @@ class DescribingWorker(Worker):
     def _begin(self, work: RolloutTask | EvaluationTask | Describe) -> list[ToLearner]:
         assert self.session is not None
         waits = isinstance(self.session.run, WaitSpec)
-        assert waits == isinstance(work, Describe), "a worker that waits does other work than to describe"
-        assert not (self.made and waits), "an environment is described twice"
+        assert waits == isinstance(work, Describe), f"{Rule.DESCRIBE}: a worker that waits does other work than to describe"
+        assert not (self.made and waits), f"{Rule.DESCRIBE_AGAIN}: an environment is described twice"
         self.made = self.made or waits
         return super()._begin(work)
 

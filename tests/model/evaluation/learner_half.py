@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer
 from millrace.protocol.messages import EpisodeRows, ToLearner
+from millrace.protocol.rules import Rule
 from tests.model import learner_part
 from tests.model.conversation import Content
 from tests.model.learner_part import Learner
@@ -91,8 +92,8 @@ class EvaluatingLearner(Learner):
 
     def _take_rows(self, episode: int, rows: EpisodeRows) -> None:
         answer = self._now_received
-        assert not isinstance(answer, EpisodeRows), "rows counted before their answer had come"
-        assert rows.session == getattr(answer, "session", None), "rows and answer are of two sessions"
+        assert not isinstance(answer, EpisodeRows), f"{Rule.ROWS_FIRST}: rows counted before their answer had come"
+        assert rows.session == getattr(answer, "session", None), f"{Rule.ROWS_FIRST}: rows and answer are of two sessions"
         self.rows.append((episode, rows.first_step))
 
     def _gather(self) -> list[Outgoing]:
@@ -123,7 +124,9 @@ class EvaluatingLearner(Learner):
         played = [one.episode.reward for one in self.coordinator.evaluation.end()]
         assert played == [seed + version / 1000 for seed in plan.seeds], f"other episodes than those asked for: {played}"
         every = [(episode, step) for episode in range(len(plan.seeds)) for step in range(EPISODE_STEPS)]
-        assert sorted(self.rows) == (every if plan.send_rows else []), "other rows than those of the episodes"
+        assert sorted(self.rows) == (every if plan.send_rows else []), (
+            f"{Rule.ROWS_FIRST}: other rows than those of the episodes"
+        )
         self.rows = []
 
 

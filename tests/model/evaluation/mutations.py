@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from millrace.protocol.rules import Rule
 from tests.model.mutations import COORDINATOR, HELD, PLACEMENT, SESSION, WEIGHTS, Mutation, play
 
 if TYPE_CHECKING:
@@ -16,81 +17,110 @@ if TYPE_CHECKING:
 TICKETS = "millrace.learner.rollouts.evaluation_dealer"
 
 MUTATIONS = {
-    "an evaluation of the version before": Mutation(TICKETS, "version=self.version,", "version=max(0, self.version - 1),"),
+    "an evaluation of the version before": Mutation(
+        None, TICKETS, "version=self.version,", "version=max(0, self.version - 1),"
+    ),
     "a ticket that was put back is lost": Mutation(
-        TICKETS, "heapq.heappush(self._undealt, self._end(number))", "self._end(number)"
+        None, TICKETS, "heapq.heappush(self._undealt, self._end(number))", "self._end(number)"
     ),
     "tickets for rollouts are dealt during an evaluation": Mutation(
+        None,
         COORDINATOR,
         "if self.evaluation.beside or not self.evaluation.pending:",
         "if True:",
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
+        Rule.WEIGHTS_AFTER,
         COORDINATOR,
         "        return self.weights.after(out, self.members)",
         "        return out if self.evaluation.pending else self.weights.after(out, self.members)",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
-        WEIGHTS, "return {order.ticket: order.versions}", "return {order.ticket: set()}"
+        Rule.WEIGHTS_AGAIN, WEIGHTS, "return {order.ticket: order.versions}", "return {order.ticket: set()}"
     ),
-    "a lost order to evaluate is not sent again": Mutation(COORDINATOR, " + self.evaluation.send(member, lost)", ""),
+    "a lost order to evaluate is not sent again": Mutation(
+        Rule.ORDER_AGAIN, COORDINATOR, " + self.evaluation.send(member, lost)", ""
+    ),
     "the evaluation's tickets of a lost worker are kept": Mutation(
-        COORDINATOR, "dealer.lose(member, number)", "dealer is self.rollouts and dealer.lose(member, number)"
+        None, COORDINATOR, "dealer.lose(member, number)", "dealer is self.rollouts and dealer.lose(member, number)"
     ),
-    "two evaluations number their tickets alike": Mutation(TICKETS, "self._first += len(self._seeds)", "pass"),
-    "a ticket of an evaluation is dealt twice": Mutation(TICKETS, "heapq.heappop(self._undealt)", "self._undealt[0]"),
+    "two evaluations number their tickets alike": Mutation(
+        Rule.TICKET_NUMBERS, TICKETS, "self._first += len(self._seeds)", "pass"
+    ),
+    "a ticket of an evaluation is dealt twice": Mutation(
+        Rule.TICKET_NUMBERS, TICKETS, "heapq.heappop(self._undealt)", "self._undealt[0]"
+    ),
     "an answer leaves its ticket with the worker": Mutation(
-        TICKETS, "        del member.tickets[number]\n        self._rows", "        self._rows"
+        None, TICKETS, "        del member.tickets[number]\n        self._rows", "        self._rows"
     ),
-    "rows of a lost worker are kept": Mutation(TICKETS, "self._rows.pop((number - self._first, member.peer), None)", "pass"),
-    "an answer counts without its rows": Mutation(TICKETS, "!= [one.length for one in answer.episodes]:", "== []:"),
+    "rows of a lost worker are kept": Mutation(
+        None, TICKETS, "self._rows.pop((number - self._first, member.peer), None)", "pass"
+    ),
+    "an answer counts without its rows": Mutation(
+        Rule.ROWS_FIRST, TICKETS, "!= [one.length for one in answer.episodes]:", "== []:"
+    ),
     "an evaluation that was played again is forgotten": Mutation(
-        TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(answer.ticket)  # a message"
+        None, TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(answer.ticket)  # a message"
     ),
-    "an answer to an order to evaluate is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
-    "an order to evaluate is executed when it is repeated": Mutation(HELD, "if ticket not in self.answered:", "if True:"),
-    "an evaluation under any weights": Mutation(HELD, "if order.versions.issubset(versions)]", "if True]"),
+    "an answer to an order to evaluate is not sent again": Mutation(
+        Rule.EVALUATE_ONCE, HELD, "return self.answered.get(ticket)", "return None"
+    ),
+    "an order to evaluate is executed when it is repeated": Mutation(
+        Rule.EVALUATE_ONCE, HELD, "if ticket not in self.answered:", "if True:"
+    ),
+    "an evaluation under any weights": Mutation(
+        Rule.EVALUATE_VERSION, HELD, "if order.versions.issubset(versions)]", "if True]"
+    ),
     "an executed order to evaluate stays": Mutation(
-        HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
+        Rule.EVALUATE_VERSION, HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
     ),
-    "an answer is kept although rows belong to it": Mutation(HELD, "(order.send_rows or order.send_frames):", "False:"),
-    "a worker that evaluates takes other work": Mutation(SESSION, "self._current.in_progress = work is not None", "pass"),
+    "an answer is kept although rows belong to it": Mutation(
+        Rule.EVALUATE_ONCE, HELD, "(order.send_rows or order.send_frames):", "False:"
+    ),
+    "a worker that evaluates takes other work": Mutation(
+        Rule.LOWEST_VERSION_FIRST, SESSION, "self._current.in_progress = work is not None", "pass"
+    ),
     "an evaluation of an earlier session goes on": Mutation(
-        SESSION, "return self.state not in goes_on or work.session != self.session", "return False"
+        Rule.FORGETS, SESSION, "return self.state not in goes_on or work.session != self.session", "return False"
     ),
     "a worker that only evaluates gets a lane": Mutation(
-        PLACEMENT, "(each for each in active if not each.hello.evaluates)", "active"
+        Rule.EVALUATES, PLACEMENT, "(each for each in active if not each.hello.evaluates)", "active"
     ),
-    "all play an evaluation beside training": Mutation(TICKETS, "if member.hello.evaluates or not self.beside]", "if True]"),
+    "all play an evaluation beside training": Mutation(
+        None, TICKETS, "if member.hello.evaluates or not self.beside]", "if True]"
+    ),
     "only those that only evaluate ever play": Mutation(
-        TICKETS, "if member.hello.evaluates or not self.beside]", "if member.hello.evaluates]"
+        None, TICKETS, "if member.hello.evaluates or not self.beside]", "if member.hello.evaluates]"
     ),
     "rollouts wait for an evaluation beside training": Mutation(
-        COORDINATOR, "if self.evaluation.beside or not self.evaluation.pending:", "if not self.evaluation.pending:"
+        None, COORDINATOR, "if self.evaluation.beside or not self.evaluation.pending:", "if not self.evaluation.pending:"
     ),
     "an evaluation waits for a lost worker that only evaluates": Mutation(
-        COORDINATOR, "self.evaluation.all_play()\n", "pass\n"
+        None, COORDINATOR, "self.evaluation.all_play()\n", "pass\n"
     ),
     "all play an evaluation although a worker is there that only evaluates": Mutation(
-        COORDINATOR, "if any(member.hello.evaluates for member in self.membership.active()):", "if False:"
+        None, COORDINATOR, "if any(member.hello.evaluates for member in self.membership.active()):", "if False:"
     ),
-    "the weights of a pending evaluation are not kept": Mutation(COORDINATOR, "needed.add(self.evaluation.version)", "pass"),
+    "the weights of a pending evaluation are not kept": Mutation(
+        None, COORDINATOR, "needed.add(self.evaluation.version)", "pass"
+    ),
     "what a worker has dropped counts as held": Mutation(
+        Rule.KEEP,
         WEIGHTS,
         "for version, standing in mine.items() if version in versions}",
         "for version, standing in mine.items()}",
     ),
     "weights that a ticket names count as dropped": Mutation(
-        WEIGHTS, "self.held.keep_only(peer, keep)", "self.held.keep_only(peer, order.versions)"
+        Rule.KEEP, WEIGHTS, "self.held.keep_only(peer, keep)", "self.held.keep_only(peer, order.versions)"
     ),
     "a worker drops weights that an evaluation names": Mutation(
-        SESSION, "self.rollouts.versions() | self.evaluations.versions()", "self.rollouts.versions()"
+        Rule.HOLDS_WEIGHTS, SESSION, "self.rollouts.versions() | self.evaluations.versions()", "self.rollouts.versions()"
     ),
     "an evaluation that is over goes on when the next one begins": Mutation(
-        HELD, "if order.version == self.asked[newest].version}", "if True}"
+        Rule.EVALUATE_ENDS, HELD, "if order.version == self.asked[newest].version}", "if True}"
     ),
     "a late order of an earlier evaluation ends the next one": Mutation(
-        HELD, "newest = max(self.asked, default=ticket)", "newest = min(self.asked, default=ticket)"
+        Rule.EVALUATE_ENDS, HELD, "newest = max(self.asked, default=ticket)", "newest = min(self.asked, default=ticket)"
     ),
 }
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from millrace.protocol.messages import Describe, Evaluate, ToLearner, ToWorker
+from millrace.protocol.rules import Rule
 from millrace.workers.conversation.session import EvaluationTask, RolloutTask
 from tests.model import worker_part
 from tests.model.conversation import Content
@@ -41,8 +42,12 @@ class EvaluatingWorker(Worker):
         before = set(self.session._current.evaluations.asked) if isinstance(message, Evaluate) else set()
         out = super().handle(message, now)
         asked = {} if self.session is None else self.session._current.evaluations.asked
-        assert len({order.version for order in asked.values()}) <= 1, "a worker holds orders of two evaluations"
-        assert not before or max({*before, *asked}) in asked, "an order of an earlier evaluation has ended a later one"
+        assert len({order.version for order in asked.values()}) <= 1, (
+            f"{Rule.EVALUATE_ENDS}: a worker holds orders of two evaluations"
+        )
+        assert not before or max({*before, *asked}) in asked, (
+            f"{Rule.EVALUATE_ENDS}: an order of an earlier evaluation has ended a later one"
+        )
         return out
 
     def finish(self, now: float) -> list[ToLearner]:
@@ -53,8 +58,12 @@ class EvaluatingWorker(Worker):
         first_rows = super()._begin(work)
         if isinstance(work, EvaluationTask):
             order = work.order
-            assert work.weights.version == order.version, "an evaluation under other weights than those of its order"
-            assert (order.session, order.ticket) not in self.played, "an order to evaluate was played twice"
+            assert work.weights.version == order.version, (
+                f"{Rule.EVALUATE_VERSION}: an evaluation under other weights than those of its order"
+            )
+            assert (order.session, order.ticket) not in self.played, (
+                f"{Rule.EVALUATE_ONCE}: an order to evaluate was played twice"
+            )
             if not order.send_rows:
                 self.played.add((order.session, order.ticket))
             first_rows += _rows(order, 0)

@@ -27,6 +27,7 @@ from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.errors import NoWorkers, WorkerLost
 from millrace.protocol.messages import Answer, LaneIncarnation
+from millrace.protocol.rules import Rule
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.model.settings import TICK_S
 from tests.model.vector_env.order_content import NEW, Copy, executed, make_order, state_in
@@ -148,7 +149,7 @@ class Caller:
             age = self.ages[order.ticket] = min(self.ages.get(order.ticket, 0) + 1, self.oldest)
             member = self.coordinator.owner(order.lane)
             heard = member is not None and self.now - member.heard_s <= TICK_S
-            assert age < self.oldest or not heard, "a worker that is heard does not answer"
+            assert age < self.oldest or not heard, f"{Rule.ORDER_AGAIN}: a worker that is heard does not answer"
         self.turn()
 
     # ---------------------------------------------------------------- inside
@@ -164,12 +165,16 @@ class Caller:
         sent = self.send_recv._sent.sent[lane]
         assert not isinstance(answer, bytes)
         incarnation, before = self.copies.get(lane, (-1, NEW))
-        assert answer.incarnation <= self.coordinator.lanes[lane].incarnation, "a result of a later incarnation"
-        assert answer.incarnation >= incarnation, "a result of an earlier incarnation"
+        assert answer.incarnation <= self.coordinator.lanes[lane].incarnation, (
+            f"{Rule.INCARNATION}: a result of a later incarnation"
+        )
+        assert answer.incarnation >= incarnation, f"{Rule.INCARNATION}: a result of an earlier incarnation"
         before = before if answer.incarnation == incarnation else NEW
         kind, seed = self.kind(lane, sent) if sent.asked is not Asked.CALL else ("call", 0)
         expected = executed(make_order(kind, seed)(0, 0, LaneIncarnation(lane, answer.incarnation)), before)
-        assert state_in(answer) == expected, f"lane {lane}: expected the result {expected}, got {state_in(answer)}"
+        assert state_in(answer) == expected, (
+            f"{Rule.ORDER_ONCE}: lane {lane}: expected the result {expected}, got {state_in(answer)}"
+        )
         self.copies[lane] = answer.incarnation, expected
         if kind == "reset":
             self.told.discard(lane)

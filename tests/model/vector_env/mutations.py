@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from millrace.protocol.rules import Rule
 from tests.model.mutations import HELD, SESSION, Mutation, play
 
 if TYPE_CHECKING:
@@ -25,37 +26,43 @@ SEND_RECV = "millrace.learner.vector_env.send_recv"
 
 MUTATIONS = {
     "a lost order is not sent again": Mutation(
-        COORDINATOR, "return [(member.peer, self.orders[ticket]) for ticket in lost]", "return []"
+        Rule.ORDER_AGAIN, COORDINATOR, "return [(member.peer, self.orders[ticket]) for ticket in lost]", "return []"
     ),
-    "heartbeats of a vector environment are answered alike": Mutation(MEMBERS, "member.replies += 1", "member.replies += 0"),
-    "a lost lane is not reported": Mutation(COORDINATOR, "if self.lanes[lane].started:", "if False:"),
-    "an order does not start its lane": Mutation(COORDINATOR, "record.started = True", "pass"),
+    "heartbeats of a vector environment are answered alike": Mutation(
+        Rule.SENT_BEFORE, MEMBERS, "member.replies += 1", "member.replies += 0"
+    ),
+    "a lost lane is not reported": Mutation(None, COORDINATOR, "if self.lanes[lane].started:", "if False:"),
+    "an order does not start its lane": Mutation(None, COORDINATOR, "record.started = True", "pass"),
     "the orders of a lost worker are kept": Mutation(
-        COORDINATOR, "            del self.orders[ticket]\n", "            pass\n"
+        None, COORDINATOR, "            del self.orders[ticket]\n", "            pass\n"
     ),
     "an answer leaves its order open": Mutation(
-        COORDINATOR, "del self.orders[message.ticket], member.tickets[message.ticket]", "pass"
+        None, COORDINATOR, "del self.orders[message.ticket], member.tickets[message.ticket]", "pass"
     ),
-    "an order that was sent waits on": Mutation(HUB, "del self._waiting_orders[lane]", "pass"),
-    "a lane is stepped before its loss is reported": Mutation(SEND_RECV, "if lane in unreported:", "if False:"),
-    "new copies are stepped before they are reset": Mutation(SEND_RECV, "if lane in awaiting_reset:", "if False:"),
+    "an order that was sent waits on": Mutation(None, HUB, "del self._waiting_orders[lane]", "pass"),
+    "a lane is stepped before its loss is reported": Mutation(None, SEND_RECV, "if lane in unreported:", "if False:"),
+    "new copies are stepped before they are reset": Mutation(None, SEND_RECV, "if lane in awaiting_reset:", "if False:"),
     "a reset that lost its worker is not sent again": Mutation(
-        SEND_RECV, "self._parts.hub.send_order(lane, reset.order())", "pass"
+        None, SEND_RECV, "self._parts.hub.send_order(lane, reset.order())", "pass"
     ),
     "a lane comes back before its answer": Mutation(
-        SENT, "dict.fromkeys(lanes, sent)", 'dict.fromkeys(lanes, sent); self._results |= dict.fromkeys(lanes, b"")'
+        None, SENT, "dict.fromkeys(lanes, sent)", 'dict.fromkeys(lanes, sent); self._results |= dict.fromkeys(lanes, b"")'
     ),
-    "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),
-    "a lane whose loss was reported is not reset": Mutation(LOST, "self.expect_reset(reported)", "pass"),
-    "a repeated order is executed again": Mutation(HELD, "order.ticket > lane.newest:", "order.ticket >= lane.newest:"),
-    "an answer is not sent again": Mutation(HELD, "return self.answered.get(ticket)", "return None"),
+    "a lane that was reset is reset again": Mutation(None, LOST, "self._awaiting_reset -= lanes", "pass"),
+    "a lane whose loss was reported is not reset": Mutation(None, LOST, "self.expect_reset(reported)", "pass"),
+    "a repeated order is executed again": Mutation(
+        Rule.ORDER_ONCE, HELD, "order.ticket > lane.newest:", "order.ticket >= lane.newest:"
+    ),
+    "an answer is not sent again": Mutation(Rule.ORDER_ONCE, HELD, "return self.answered.get(ticket)", "return None"),
     "two processes count their attempts to join alike": Mutation(
-        SESSION, "self._attempt = identity.process_nonce", "self._attempt = 0"
+        Rule.HELLO, SESSION, "self._attempt = identity.process_nonce", "self._attempt = 0"
     ),
-    "an executed order stays": Mutation(HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"),
-    "an answer is not kept": Mutation(HELD, "self.answered[answer.ticket] = answer", "pass"),
-    "replies to heartbeats are not counted": Mutation(SESSION, "current.replies = number", "pass"),
-    "an answered order stays in progress": Mutation(SESSION, "current.in_progress = False", "pass"),
+    "an executed order stays": Mutation(
+        Rule.ORDER_ONCE, HELD, "self.asked.pop(answer.ticket, None)", "self.asked.get(answer.ticket)"
+    ),
+    "an answer is not kept": Mutation(Rule.ORDER_ONCE, HELD, "self.answered[answer.ticket] = answer", "pass"),
+    "replies to heartbeats are not counted": Mutation(Rule.HEARTBEAT_REPLIES, SESSION, "current.replies = number", "pass"),
+    "an answered order stays in progress": Mutation(Rule.ORDER_ANSWERED, SESSION, "current.in_progress = False", "pass"),
 }
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from millrace.protocol.messages import Answer, Call, Reset, Step, ToLearner
+from millrace.protocol.rules import Rule
 from millrace.workers.conversation.held import OrderLane
 from millrace.workers.conversation.session import CloseLanes, Leave, SendMessage, SharedOrders, StartSession, WorkerEffect
 from tests.model import process_part
@@ -68,7 +69,7 @@ class Worker(Process):
             assert self.work is None, "a worker executes two orders at the same time"
             assert isinstance(order, Reset | Step | Call)
             life, state = self.copies.get(order.lane, (order.incarnation, NEW))
-            assert (order.session, order.ticket) != self.newest, "an order was executed twice"
+            assert (order.session, order.ticket) != self.newest, f"{Rule.ORDER_ONCE}: an order was executed twice"
             state = executed(order, state if life == order.incarnation else NEW)
             self.newest = order.session, order.ticket
             self.copies[order.lane] = order.incarnation, state
@@ -110,7 +111,7 @@ def saved(worker: Worker, now: float) -> Content:
 def _lane(number: int, lane: OrderLane) -> Content:
     order = next(map(order_content, lane.asked.values()), None)
     kept = next((content_of(each, 0) for each in lane.answered.values()), None)
-    assert {*lane.asked, *lane.answered} == {lane.newest}, "a worker holds another order than the newest"
+    assert {*lane.asked, *lane.answered} == {lane.newest}, f"{Rule.ORDER_OLD}: a worker holds another order than the newest"
     return number, incarnation(number, lane.incarnation), ticket(lane.newest), order, kept
 
 

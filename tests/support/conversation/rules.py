@@ -5,6 +5,7 @@ from __future__ import annotations
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.rules import Rule
 
 
 def waiting_rollouts(coordinator: TicketCoordinator) -> list[AcceptedRollout]:
@@ -24,24 +25,32 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool 
     """The ledger balances, a lane has one owner, and each ticket is with the owner of its lane."""
     rollouts, members, ledger = coordinator.rollouts, coordinator.members, coordinator.rollouts.ledger
     check_ledger(coordinator)
-    assert ledger.outstanding <= len(rollouts.lanes) * (1 + max_lag), "more tickets than the bound allows"
+    assert ledger.outstanding <= len(rollouts.lanes) * (1 + max_lag), (
+        f"{Rule.OPEN_ROUNDS}: more tickets than the bound allows"
+    )
     owners = sorted((number, member.peer) for member in members.values() for number in member.lanes)
     known = [(lane.number, lane.owner) for lane in rollouts.lanes if lane.owner is not None]
-    assert owners == known, "a lane has two owners, or its owner does not know"
+    assert owners == known, f"{Rule.LANE_MOVES}: a lane has two owners, or its owner does not know"
     mine: list[set[int]] = [set() for _ in rollouts.lanes]
     for number, each in rollouts.held.items():
         mine[each.lane].add(number)
     assert mine == [lane.outstanding for lane in rollouts.lanes], "a lane does not know its tickets"
-    assert all(not lane.due or lane.number in rollouts._to_deal for lane in rollouts.lanes), "a lane gets no more tickets"
+    assert all(not lane.due or lane.number in rollouts._to_deal for lane in rollouts.lanes), (
+        f"{Rule.LOST_TICKETS}: a lane gets no more tickets"
+    )
     for number, each in rollouts.held.items():
-        assert number in members[each.peer].tickets, "an outstanding ticket is with nobody"
-        assert rollouts.lanes[each.lane].owner == each.peer, "a ticket of a lane that its worker does not own"
+        assert number in members[each.peer].tickets, f"{Rule.LOST_TICKETS}: an outstanding ticket is with nobody"
+        assert rollouts.lanes[each.lane].owner == each.peer, (
+            f"{Rule.LANE_MOVES}: a ticket of a lane that its worker does not own"
+        )
     held = sorted([*rollouts.held, *coordinator.evaluation.held, *coordinator.evaluation.second])
-    assert held == sorted(number for member in members.values() for number in member.tickets), "a ticket has two holders"
+    assert held == sorted(number for member in members.values() for number in member.tickets), (
+        f"{Rule.TICKET_NUMBERS}: a ticket has two holders"
+    )
     processes = {(member.hello.worker, member.hello.process_nonce): member for member in members.values()}
     assert coordinator.membership._of_process == processes, "the processes are not those of the members"
     for member in members.values():
-        assert not (member.lanes and member.hello.evaluates), "a worker that only evaluates has a lane"
+        assert not (member.lanes and member.hello.evaluates), f"{Rule.EVALUATES}: a worker that only evaluates has a lane"
     check_evaluation(coordinator, shares=shares)
 
 
