@@ -32,6 +32,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec, StepS
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
+from tests.support.conversation.example_messages import example, example_of_session
 
 SESSION = 77
 CARTPOLE = EnvSpec("CartPole-v1")
@@ -43,23 +44,30 @@ FEW = (Received(0, 0, 1), Received(1, 0, 3, (5, 6)))
 
 
 def messages(lanes: int) -> list[ToWorker]:
-    """Every type of message, in an order in which a client obeys them. With one lane of a run, that has one copy."""
+    """Messages in an order in which a client obeys them. With one lane of a run, that has one copy."""
     weights = np.linspace(-1, 1, acting_size(POLICY), dtype=np.float32)
     return [
         Welcome(SESSION, 1, WaitSpec()),
         Describe(SESSION, 20, CARTPOLE),
         Welcome(SESSION, 1, STEP),
-        Reset(SESSION, 1, 0, 0, (0, 1), (5, None), OPTIONS),
-        Step(SESSION, 2, 0, 0, (np.array([0, 1]),)),
-        Step(SESSION, 3, 1, 2, (np.array([1, 1]),)),
-        Call(SESSION, 4, 0, 0, (0,), "spec", False, OPTIONS),
+        example(Reset, session=SESSION, ticket=1, copies=(0, 1), seeds=(5, None), options=OPTIONS),
+        example(Step, session=SESSION, ticket=2, actions=(np.array([0, 1]),)),
+        example(Step, session=SESSION, ticket=3, lane=1, incarnation=2, actions=(np.array([1, 1]),)),
+        example(Call, session=SESSION, ticket=4, copies=(0,), name="spec", given=OPTIONS),
         Release(SESSION, (LaneIncarnation(0, 0),)),
         HeartbeatReply(SESSION, 1, FEW),
         Rejoin(SESSION),
         Welcome(SESSION, 2, RunSpec(CARTPOLE, POLICY, rollout_steps=64, copies=lanes, lanes=lanes, seed=1)),
-        Collect(SESSION, 3, (Permit(10, 0, 0, 0), Permit(11, 1, 1, 0))[:lanes], FEW[:lanes], (3,)),
+        example(
+            Collect,
+            session=SESSION,
+            version=3,
+            permits=(example(Permit, ticket=10), example(Permit, ticket=11, lane=1, incarnation=1))[:lanes],
+            received=FEW[:lanes],
+            keep=(3,),
+        ),
         Weights(3, weights, np.zeros(0, np.float32)),
-        Evaluate(SESSION, 12, 4, (1, 2), True, 30, False, False),
+        example(Evaluate, session=SESSION, ticket=12, version=4, seeds=(1, 2), greedy=True, most_steps=30),
         Weights(4, to_wire_dtype(weights, "bfloat16"), np.zeros(0, np.float32)),
         HeartbeatReply(SESSION, 2, FEW[:1]),
         Drain("the run is over"),
@@ -71,7 +79,8 @@ def messages(lanes: int) -> list[ToWorker]:
 def corpus(lanes: int = 2) -> bytes:
     """For each message: the number of its frames, then the length and the bytes of each. Numbers are `<u4`."""
     parts, told = [], messages(lanes)
-    assert {type(message) for message in told} == set(get_args(ToWorker))
+    kinds = {type(message) for message in told}
+    told += [example_of_session(kind, SESSION) for kind in get_args(ToWorker) if kind not in kinds]
     for message in told:
         frames = encode(message)
         parts.append(struct.pack("<I", len(frames)))

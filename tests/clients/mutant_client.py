@@ -54,6 +54,7 @@ from millrace.workers.collect import collector
 from millrace.workers.conversation.held import Held, HeldEvaluations
 from millrace.workers.conversation.session import Session
 from millrace.workers.worker import Worker, WorkerOptions, identity
+from tests.support.conversation.example_messages import example
 
 replace = msgspec.structs.replace
 FLAT = np.zeros(0, np.uint8)
@@ -223,7 +224,18 @@ class Mutant(WorkerLink):
                 N = run.lanes[0]
                 obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in run.observation)
                 flags = np.zeros(N, bool)
-                self.say(Stepped(session, 1, 0, 0, obs, np.zeros(N), flags, flags, FLAT))
+                self.say(
+                    example(
+                        Stepped,
+                        session=session,
+                        ticket=1,
+                        obs=obs,
+                        reward=np.zeros(N),
+                        terminated=flags,
+                        truncated=flags,
+                        infos=FLAT,
+                    )
+                )
             case "never begins", Welcome() if message.session == self.session:
                 return []
             case "begins again at a repeated Welcome", Welcome() if message.session == self.session:

@@ -20,13 +20,14 @@ from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Heartbeat, Hello, WorkerExit
+from millrace.protocol.messages import Evaluate, Evaluated, Heartbeat, Hello, WorkerExit
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.rollout import Episode
 from millrace.protocol.specs import PolicySpec
 from millrace.protocol.wire.codec import Buffer, decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
@@ -74,7 +75,7 @@ class FourWorkers(FakeLink):
     def __init__(self, killed: bytes) -> None:
         super().__init__()
         self.killed, self.exits = killed, list[WorkerExit]()
-        self.inbox += [(f"w{n}".encode(), Hello(PROTOCOL_VERSION, f"w{n}", "host", n, n, "fake", 1)) for n in range(4)]
+        self.inbox += [(f"w{n}".encode(), example(Hello, worker=f"w{n}", pid=n, process_nonce=n)) for n in range(4)]
 
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
         message = decode_to_worker([bytes(frame) for frame in frames])
@@ -83,7 +84,18 @@ class FourWorkers(FakeLink):
             self.exits = [WorkerExit(peer.decode(), nonce, "was killed by SIGKILL", failed=True)]
         elif isinstance(message, Evaluate):
             episodes = tuple(Episode(float(seed), 2, 0.0) for seed in message.seeds)
-            self.inbox.append((peer, Evaluated(message.session, message.ticket, episodes, (False,) * len(episodes))))
+            self.inbox.append(
+                (
+                    peer,
+                    example(
+                        Evaluated,
+                        session=message.session,
+                        ticket=message.ticket,
+                        episodes=episodes,
+                        cut=(False,) * len(episodes),
+                    ),
+                )
+            )
         return True
 
     def ended(self) -> list[WorkerExit]:
@@ -114,12 +126,14 @@ class Endless(FakeLink):
 
     def __init__(self) -> None:
         super().__init__()
-        self.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+        self.inbox.append((b"w0", example(Hello)))
 
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
         message = decode_to_worker([bytes(frame) for frame in frames])
         if isinstance(message, Evaluate):
-            self.inbox.append((peer, Heartbeat(message.session, 0, (0,), (message.ticket,), 31_000, {}, 0)))
+            self.inbox.append(
+                (peer, example(Heartbeat, session=message.session, versions=(0,), tickets=(message.ticket,), steps=31_000))
+            )
         return True
 
 

@@ -29,6 +29,7 @@ from millrace.protocol.specs import PolicySpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import no_pulse, run_around, with_env
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN
 
@@ -115,7 +116,7 @@ def test_sampled_actions_agree_with_a_coin_of_the_environment_in_half_of_the_ste
     if not own:
         policy.load(np.array([1, 0, 0, 0], np.float32), np.ones(1, np.float32))
     evaluator = Evaluator(msgspec.structs.replace(COIN, policy=COIN.policy if own else EXPLORES), policy)
-    order = Evaluate(3, 70, 0, (7,), False, STEPS, False, False)
+    order = example(Evaluate, session=3, ticket=70, seeds=(7,), most_steps=STEPS)
     (episode,) = evaluator.play(order, lambda rows: None, no_pulse).episodes
     assert abs(episode.reward - STEPS / 2) < 5 * (STEPS / 4) ** 0.5  # the chance of more is below 1e-6
 
@@ -135,7 +136,9 @@ def test_no_two_generators_of_a_run_coincide(monkeypatch: pytest.MonkeyPatch) ->
     of_episodes = [episode_seeds(seed, 2, p) for p in (Purpose.EPISODES, Purpose.EVALUATION, Purpose.CONFIRMATION)]
     for played in ((seed,), (recorded,)):
         guess.streams.clear()
-        Evaluator(COIN, guess).play(Evaluate(3, 70, 0, played, False, 1, False, False), lambda rows: None, no_pulse)
+        Evaluator(COIN, guess).play(
+            example(Evaluate, session=3, ticket=70, seeds=played, most_steps=1), lambda rows: None, no_pulse
+        )
         streams[f"actions of the episode {played}"] = guess.streams[0]
     assert Coin.began.pop(-2) == streams["seed"]
     streams |= {f"env copy {n}": began for n, began in enumerate(Coin.began)}

@@ -24,6 +24,7 @@ from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
 from millrace.workers.conversation.held import Assignment
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import SESSION, VERSION, no_pulse, random_collector, random_weights
 from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
 
@@ -132,8 +133,10 @@ def rollout_of(form: str, columns: Sequence[str], **changes: Any) -> tuple[Rollo
     def flags(of: str) -> Array:
         return np.array([[letter in of for letter in column] for column in columns]).T
 
-    rollout = Rollout(
-        session=1, lane=0, ticket=0, version=0, sequence=5,
+    rollout = example(
+        Rollout,
+        session=1,
+        sequence=5,
         obs=(np.zeros((T + 1, C, 1), np.float32),),
         action=np.zeros((T, C), np.int64),
         log_prob=np.zeros((T, C), np.float32),
@@ -143,7 +146,7 @@ def rollout_of(form: str, columns: Sequence[str], **changes: Any) -> tuple[Rollo
         valid=flags(VALID)[:-1],
         state=np.zeros((C, 0), np.float32),
         resets=flags(RESETS)[:, ::seats],
-    )  # fmt: skip
+    )
     return with_as_many_episodes(rollout, run), run
 
 

@@ -39,6 +39,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.wire import codec, message_sizes, socket_options
 from millrace.protocol.wire import compression as packing
 from millrace.workers.conversation import held, session, worker_states
+from tests.support.conversation.example_messages import example
 
 DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
@@ -69,8 +70,15 @@ RECORDS: tuple[type, ...] = (
     specs.ActionSpec,
 )
 EXAMPLES = (
-    Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 78),
-    Collect(1234605616436508, 3, (Permit(40, 0, 1, 11),), (Received(0, 1, 9, (10,)),), (2, 3)),
+    example(Hello, pid=7, process_nonce=77, software="millrace", attempt=78),
+    example(
+        Collect,
+        session=1234605616436508,
+        version=3,
+        permits=(example(Permit, ticket=40, incarnation=1, sequence=11),),
+        received=(Received(0, 1, 9, (10,)),),
+        keep=(2, 3),
+    ),
     Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32)),
 )
 # Fields that mean the same wherever they stand, or whose name says it all: used where the code adds nothing to the name.

@@ -28,6 +28,7 @@ from millrace.protocol.rollout import Episode
 from millrace.protocol.space_spec import MAX_DEPTH, MAX_ELEMENTS, MAX_LEAVES, MAX_SEATS
 from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
 
 ROOT = Path(__file__).parents[2]
@@ -177,7 +178,9 @@ def collected(make: Callable[[], Any]) -> str:
 def evaluated(make: Callable[[], Any], frames: bool = False) -> str:
     """The same in an evaluation."""
     run = run_on(make)
-    order = Evaluate(1, 1, 0, (3, 4), greedy=True, most_steps=50, send_rows=True, send_frames=frames)
+    order = example(
+        Evaluate, session=1, ticket=1, seeds=(3, 4), greedy=True, most_steps=50, send_rows=True, send_frames=frames
+    )
     try:
         Evaluator(run, random_policy(run.policy)).play(order, lambda rows: None, no_pulse)
     except EnvironmentFailed as error:

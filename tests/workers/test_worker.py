@@ -50,6 +50,7 @@ from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import Slots
 from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
 from millrace.workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
@@ -114,8 +115,13 @@ BUFFERS = np.ones(buffer_size(RUN.policy), np.float32)
 
 def said_to_a_worker(run: RunSpec, parameters: Array = PARAMETERS) -> list[ToWorker]:
     """To join, collect one rollout and leave."""
-    permits, received = (Permit(0, 0, 0, 0),), (Received(0, 0, 0),)
-    return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received, ()), Drain("done")]
+    permits, received = (example(Permit),), (Received(0, 0, 0),)
+    return [
+        Welcome(1, 1, run),
+        Weights(0, parameters, BUFFERS),
+        example(Collect, session=1, permits=permits, received=received),
+        Drain("done"),
+    ]
 
 
 class Watching(FakeLink):
@@ -277,7 +283,9 @@ def test_each_rollout_of_a_worker_acts_under_the_weights_that_its_order_names() 
     parameters = PARAMETERS, -PARAMETERS
     link = DrainsAfterTwo([Welcome(1, 1, RUN)])
     for version, each in enumerate(parameters):
-        order = Collect(1, version, (Permit(version, version, 0, 0),), received, ())
+        order = example(
+            Collect, session=1, version=version, permits=(example(Permit, ticket=version, lane=version),), received=received
+        )
         link.messages += [Weights(version, each, BUFFERS), order]
     assert work(link).exit_code == 0
     rollouts = [message for message in link.heard() if isinstance(message, Rollout)]

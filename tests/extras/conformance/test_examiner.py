@@ -37,7 +37,6 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.keys.keys import Key, Token
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Collect,
     Describe,
     Described,
@@ -60,15 +59,23 @@ from millrace.protocol.messages import (
 from millrace.protocol.rules import Rule
 from millrace.protocol.specs import Leaf, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 SETTINGS = Settings(EnvSpec("CartPole-v1"))
 STEPPED = StepSpec((EnvSpec("own"),), (0, 0), (2,), (Leaf("", "multibinary", (), "int8"),), ())
-STEPPED_ANSWER = Stepped(
-    1, 7, 0, 0, (np.ones(2, np.int8),), np.zeros(2), np.zeros(2, bool), np.zeros(2, bool), np.zeros(0, np.uint8)
+STEPPED_ANSWER = example(
+    Stepped,
+    session=1,
+    ticket=7,
+    obs=(np.ones(2, np.int8),),
+    reward=np.zeros(2),
+    terminated=np.zeros(2, bool),
+    truncated=np.zeros(2, bool),
+    infos=np.zeros(0, np.uint8),
 )
 TAGGED = b"w\0" + hashlib.blake2b(b"w", key=b"k" * 32, digest_size=16).hexdigest().encode()
-HELLO = Hello(PROTOCOL_VERSION, "w", "host", 1, 70, "test", 71)
+HELLO = example(Hello, worker="w", process_nonce=70, software="test", attempt=71)
 
 
 def examiner(*scripts: Callable[[Learner], Script[None]], limit_s: float = 300.0) -> Examiner:
@@ -157,7 +164,7 @@ def welcomed(script: Callable[[Learner], Script[None]] = in_a_session) -> tuple[
 
 
 def beat(session: int, replies: int = 0) -> Heartbeat:
-    return Heartbeat(session, replies, (), (), 0, {}, 0, waits=True)
+    return example(Heartbeat, session=session, replies=replies, waits=True)
 
 
 def test_a_heartbeat_that_is_missing_breaks_a_rule() -> None:
@@ -234,7 +241,7 @@ def watch_of(*versions: int) -> WatchedSession:
 @pytest.mark.parametrize("versions", [(5, 3), (3, 3), (3, 4)])
 def test_a_heartbeat_lists_versions_that_were_sent_in_ascending_order(versions: tuple[int, ...]) -> None:
     with pytest.raises(Broken) as broken:
-        watch_of(5, 3).see(Heartbeat(1, 0, versions, (), 0, {}, 0), 0.1)
+        watch_of(5, 3).see(example(Heartbeat, session=1, versions=versions), 0.1)
     assert (broken.value.rule, broken.value.got) == (Rule.HEARTBEAT_VERSIONS, str([*versions]))
 
 
@@ -248,7 +255,7 @@ def test_a_heartbeat_lists_versions_that_were_sent_in_ascending_order(versions: 
 )
 def test_a_rollout_is_that_of_its_permit(sent: tuple[int, ...], version: int, sequence: int, rule: Rule) -> None:
     watch = watch_of(*sent)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0),), (), (3,)))
+    watch.sent(example(Collect, session=1, version=3, permits=(example(Permit, ticket=7),), keep=(3,)))
     with pytest.raises(Broken) as broken:
         watch.see(fake_rollout(1, 0, 7, version, sequence), 0.1)
     assert broken.value.rule is rule
@@ -256,7 +263,15 @@ def test_a_rollout_is_that_of_its_permit(sent: tuple[int, ...], version: int, se
 
 def test_a_rollout_does_not_come_before_an_earlier_one_of_its_lane() -> None:
     watch = watch_of(3)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 0, 0), Permit(8, 0, 0, 1)), (), (3,)))
+    watch.sent(
+        example(
+            Collect,
+            session=1,
+            version=3,
+            permits=(example(Permit, ticket=7), example(Permit, ticket=8, sequence=1)),
+            keep=(3,),
+        )
+    )
     with pytest.raises(Broken) as broken:
         watch.see(fake_rollout(1, 0, 8, 3, 1), 0.1)
     assert (broken.value.rule, broken.value.got) == (Rule.IN_ORDER, "sequence 1")
@@ -264,7 +279,15 @@ def test_a_rollout_does_not_come_before_an_earlier_one_of_its_lane() -> None:
 
 def test_a_permit_of_a_lower_incarnation_is_not_answered() -> None:
     watch = watch_of(3)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 0, 1, 0)), (), (3,)))
+    watch.sent(
+        example(
+            Collect,
+            session=1,
+            version=3,
+            permits=(example(Permit, ticket=7, incarnation=2), example(Permit, ticket=8, incarnation=1)),
+            keep=(3,),
+        )
+    )
     with pytest.raises(Broken) as broken:
         watch.see(fake_rollout(1, 0, 8, 3, 0), 0.1)
     assert broken.value.rule is Rule.INCARNATION
@@ -272,7 +295,15 @@ def test_a_permit_of_a_lower_incarnation_is_not_answered() -> None:
 
 def test_a_lane_is_listed_with_what_has_arrived_until_it_is_released() -> None:
     watch = watch_of(3)
-    watch.sent(Collect(1, 3, (Permit(7, 0, 2, 0), Permit(8, 1, 0, 0)), (), (3,)))
+    watch.sent(
+        example(
+            Collect,
+            session=1,
+            version=3,
+            permits=(example(Permit, ticket=7, incarnation=2), example(Permit, ticket=8, lane=1)),
+            keep=(3,),
+        )
+    )
     watch._next_sequence[0, 2] = 1
     assert watch.received() == (Received(0, 2, 1), Received(1, 0, 0))
     watch.confirms = False
@@ -287,19 +318,19 @@ def test_a_lane_is_listed_with_what_has_arrived_until_it_is_released() -> None:
 def test_a_ticket_is_listed_from_the_reply_after_it_until_it_is_answered(kind: str) -> None:
     watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0) if kind == "order" else watch_of(3)
     sent: dict[str, ToWorker] = {
-        "order": Step(1, 7, 0, 0, ()),
-        "permit": Collect(1, 3, (Permit(7, 0, 0, 1),), (), (3,)),
-        "evaluation": Evaluate(1, 7, 3, (1,), True, 9, False, False),
+        "order": example(Step, session=1, ticket=7),
+        "permit": example(Collect, session=1, version=3, permits=(example(Permit, ticket=7, sequence=1),), keep=(3,)),
+        "evaluation": example(Evaluate, session=1, ticket=7, version=3, greedy=True, most_steps=9),
     }
     watch.sent(watch.reply(1))
     watch.sent(sent[kind])
     for replies, tickets in ((1, ()), (1, ()), (1, (7,))):  # the ticket may be on its way
-        watch.see(Heartbeat(1, replies, (), tickets, 0, {}, 0), 0.1)
+        watch.see(example(Heartbeat, session=1, replies=replies, tickets=tickets), 0.1)
     watch.sent(watch.reply(2))
     for tickets in ((), (7,), ()):  # two threads of the client may be late by one Heartbeat
-        watch.see(Heartbeat(1, 2, (), tickets, 0, {}, 0), 0.2)
+        watch.see(example(Heartbeat, session=1, replies=2, tickets=tickets), 0.2)
     with pytest.raises(Broken) as broken:
-        watch.see(Heartbeat(1, 2, (), (), 0, {}, 0), 0.3)
+        watch.see(example(Heartbeat, session=1, replies=2), 0.3)
     assert (broken.value.rule, broken.value.got) == (Rule.HEARTBEAT_TICKETS, "[]")
 
 
@@ -308,19 +339,19 @@ def test_a_ticket_need_not_be_listed(why: str) -> None:
     watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0)
     if why == "drained":
         watch.sent(Drain(""))
-    watch.sent(Step(1, 7, 0, 0, ()))
+    watch.sent(example(Step, session=1, ticket=7))
     match why:
         case "answered":
             watch.see(STEPPED_ANSWER, 0.1)
         case "lost":
             watch.loses()
         case "superseded":
-            watch.sent(Step(1, 8, 0, 0, ()))
+            watch.sent(example(Step, session=1, ticket=8))
         case "of a released lane":
             watch.sent(Release(1, (LaneIncarnation(0, 0),)))
     watch.sent(watch.reply(1))
     for _ in range(3):
-        watch.see(Heartbeat(1, 1, (), (8,) if why == "superseded" else (), 0, {}, 0), 0.2)
+        watch.see(example(Heartbeat, session=1, replies=1, tickets=(8,) if why == "superseded" else ()), 0.2)
 
 
 def test_with_keys_a_routing_id_is_the_name_and_the_tag_of_the_client() -> None:
@@ -334,7 +365,7 @@ def test_with_keys_a_routing_id_is_the_name_and_the_tag_of_the_client() -> None:
 
 def test_an_answer_that_is_sent_again_is_the_same() -> None:
     watch = WatchedSession(Welcome(1, 71, STEPPED), 0.0)
-    order = Step(1, 7, 0, 0, ())
+    order = example(Step, session=1, ticket=7)
     for _ in range(3):
         watch.sent(order)
     watch.see(STEPPED_ANSWER, 0.1)
@@ -370,7 +401,7 @@ def test_a_description_answers_an_order(ticket: int) -> None:
 
 def test_a_heartbeat_says_that_the_worker_waits_until_it_must_have_heard_of_the_run() -> None:
     watch = WatchedSession(Welcome(1, 71, WaitSpec()), 0.0)
-    late = Heartbeat(1, 0, (), (), 0, {}, 0, waits=True)
+    late = example(Heartbeat, session=1, waits=True)
     watch.see(late, 0.1)
     with pytest.raises(Broken) as broken:
         watch.see(msgspec.structs.replace(late, waits=False), 0.2)
@@ -409,7 +440,7 @@ def test_a_reply_that_was_never_sent_is_noticed() -> None:
 def test_what_another_worker_of_the_command_says_is_not_looked_at() -> None:
     test, _ = welcomed()
     test.handle(Heard(b"other", beat(5)), 0.2)
-    test.handle(Heard(b"other", Hello(PROTOCOL_VERSION, "other", "host", 2, 80, "test", 81)), 0.2)
+    test.handle(Heard(b"other", example(Hello, worker="other", pid=2, process_nonce=80, software="test", attempt=81)), 0.2)
     assert not test.results
 
 

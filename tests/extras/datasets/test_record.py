@@ -41,6 +41,7 @@ from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import PolicySpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
+from tests.support.conversation.example_messages import example
 from tests.support.examples import examples
 from tests.support.in_process.collectors import TOY, no_pulse, random_policy, run_of
 from tests.support.in_process.described import described
@@ -75,11 +76,11 @@ def lives(ends: list[list[list[int]]], steps: int) -> Iterator[tuple[int, Rollou
             seen = obs[at.start : at.stop + 1].copy()
             yield (
                 incarnation,
-                Rollout(
+                example(
+                    Rollout,
                     session=1,
                     lane=3,
                     ticket=sequence,
-                    version=0,
                     sequence=sequence,
                     obs=(seen, seen[..., 3].astype(np.int64)),
                     action=(10 * seen[:-1, :, 2] + seen[:-1, :, 3]).astype(np.int64),

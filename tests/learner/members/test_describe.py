@@ -26,7 +26,6 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     TOLD_TO_STOP,
     Alive,
     Collect,
@@ -48,6 +47,7 @@ from millrace.protocol.specs import StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.plain_values import pack
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
@@ -76,7 +76,7 @@ def of_three(env: DescribedEnv) -> None:
 
 
 def hello(name: bytes, nonce: int = 1, attempt: int = 1) -> Hello:
-    return Hello(PROTOCOL_VERSION, name.decode(), "host", 1, nonce, "fake", nonce + attempt)
+    return example(Hello, worker=name.decode(), process_nonce=nonce, attempt=nonce + attempt)
 
 
 def join(made: DescribeCoordinator, name: bytes, nonce: int = 1) -> int:
@@ -103,7 +103,7 @@ def describes(
 
 
 def beat(session: int, replies: int, tickets: tuple[int, ...] = ()) -> Heartbeat:
-    return Heartbeat(session, replies, (), tickets, 0, {}, 0, waits=True)
+    return example(Heartbeat, session=session, replies=replies, tickets=tickets, waits=True)
 
 
 # -------------------------------------------------------------------------------------------------- the pure half
@@ -149,7 +149,7 @@ def test_each_worker_that_was_asked_and_is_lost_doubles_the_number_that_describe
     sessions = [join(made, b"w%d" % number) for number in range(8)]
     asked = []
     for lost in range(3):
-        failure = Failure(sessions[lost], "OSError: no display", "", None)
+        failure = example(Failure, session=sessions[lost], error="OSError: no display")
         asked.append([int(peer[1:]) for peer, _ in made.receive(b"w%d" % lost, failure, 1.0)])
     assert asked == [[1, 2], [3, 4, 5], [6, 7]]
 
@@ -331,7 +331,9 @@ def test_a_worker_that_must_leave_says_nothing_of_the_environment(decliners_to_e
 def test_failures_are_told_and_the_worker_may_come_back() -> None:
     made = coordinator()
     for nonce in (1, 2):
-        made.receive(A, Failure(join(made, A, nonce), "OSError: no display", "where\nit was", None), 1.0)
+        made.receive(
+            A, example(Failure, session=join(made, A, nonce), error="OSError: no display", traceback="where\nit was"), 1.0
+        )
     failed = EnvironmentRaised("w0", "host", "OSError: no display", "where\nit was")
     assert [event for event in made.events if isinstance(event, Failed)] == [failed, failed]
     assert made.unsuitable is None
@@ -446,7 +448,7 @@ def _heartbeats(link: FakeLink) -> tuple[()]:
     for frames in link.sent:
         message = decode_to_worker([bytes(frame) for frame in frames])
         if isinstance(message, Welcome):
-            link.inbox.append((A, Heartbeat(message.session, 0, (), (), 0, {}, 0)))
+            link.inbox.append((A, example(Heartbeat, session=message.session)))
             link.now += 0.5
     return ()
 

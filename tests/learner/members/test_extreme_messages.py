@@ -26,7 +26,6 @@ from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Alive,
     Answer,
     Collect,
@@ -51,6 +50,7 @@ from millrace.protocol.rollout import rollout_bytes
 from millrace.protocol.wire.codec import Buffer, decode_to_learner, decode_to_observer, decode_to_worker, encode
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC, step, stepped
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.extreme_messages import MARK, SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
@@ -96,7 +96,7 @@ class Conversation(FakeLink):
         while self.sayings:
             name, frames = self.sayings.pop(0)
             if name not in self.sessions:
-                yield name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, next(self.nonces), "fake", 1)
+                yield name.encode(), example(Hello, worker=name, process_nonce=next(self.nonces))
             session = self.sessions.get(name, 0)
             self.in_session += session > 0
             try:
@@ -150,10 +150,10 @@ class Honest:
 
     def says(self) -> Iterator[ToLearner]:
         if not self.session:
-            yield Hello(PROTOCOL_VERSION, self.name, "host", 1, SECRET_NONCE, "fake", 1)
+            yield example(Hello, worker=self.name, process_nonce=SECRET_NONCE)
             return
         held = tuple(permit.ticket for permit, _ in self.permits)
-        yield Heartbeat(self.session, 0, tuple(sorted(self.versions)), held, self.sent, {}, 0)
+        yield example(Heartbeat, session=self.session, versions=tuple(sorted(self.versions)), tickets=held, steps=self.sent)
         if self.permits:
             permit, version = self.permits.pop(0)
             yield fake_rollout(self.session, permit.lane, permit.ticket, version, permit.sequence)
@@ -225,12 +225,12 @@ def answers(turns: int, say: Say) -> list[bytes]:
 
     link.poll = poll  # type: ignore[method-assign]
     for name in ("w0", "w1"):
-        link.inbox.append((name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, SECRET_NONCE, "fake", 1)))
+        link.inbox.append((name.encode(), example(Hello, worker=name, process_nonce=SECRET_NONCE)))
     hub.wait_for(2, 5.0)
     for turn in range(turns):
         for number in (0, 1):
             session = hub.coordinator.members[b"w%d" % number].session
-            link.inbox.append((b"w%d" % number, Heartbeat(session, 0, (), tuple(hub.coordinator.orders), 0, {}, 0)))
+            link.inbox.append((b"w%d" % number, example(Heartbeat, session=session, tickets=tuple(hub.coordinator.orders))))
         if turn:
             say(link, turn)
         for lane in (0, 1):
@@ -290,10 +290,21 @@ def test_every_field_at_extreme_values_changes_no_answer_of_a_vector_environment
 
 
 FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
-    lambda nonce: [Hello(PROTOCOL_VERSION, HOSTILE, "h" * 1_000, 2**31, nonce, "s", 1)],
+    lambda nonce: [example(Hello, worker=HOSTILE, host="h" * 1_000, pid=2**31, process_nonce=nonce, software="s")],
     lambda nonce: [Goodbye(SESSION, "x" * 1_000, (0, 1))],
-    lambda nonce: [Heartbeat(SESSION, 2**53, (0, 2**53), tuple(range(1_000)), 2**53, {"step": 1e9}, 2**53)],
-    lambda nonce: [Failure(SESSION, "boom", "t" * 64_000, nonce % 3)],
+    lambda nonce: [
+        example(
+            Heartbeat,
+            session=SESSION,
+            replies=2**53,
+            versions=(0, 2**53),
+            tickets=tuple(range(1_000)),
+            steps=2**53,
+            stages={"step": 1e9},
+            resident_bytes=2**53,
+        )
+    ],
+    lambda nonce: [example(Failure, session=SESSION, error="boom", traceback="t" * 64_000, lane=nonce % 3)],
     lambda nonce: [Inquire()],
     lambda nonce: [Alive((), ())],
     lambda nonce: [fake_rollout(SESSION, nonce % 2, nonce, nonce % 5, nonce)],

@@ -21,7 +21,6 @@ from millrace.learner.rollouts.lag_statistics import MOST_WORKERS, LagStatistics
 from millrace.learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from millrace.protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Evaluated,
     Failure,
     Goodbye,
@@ -40,6 +39,7 @@ from millrace.protocol.wire.codec import decode_to_learner, decode_to_observer, 
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.extreme_messages import SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, SEATS, fake_rollout, run_spec, seated_rollout
 from tests.support.conversation.fake_link import FakeLink
@@ -69,7 +69,7 @@ class Noisy:
 
 
 def hello(name: str, nonce: int = 1, host: str = "host", attempt: int = 1) -> Hello:
-    return Hello(PROTOCOL_VERSION, name, host, 1, nonce, "fake", nonce + attempt)
+    return example(Hello, worker=name, host=host, process_nonce=nonce, attempt=nonce + attempt)
 
 
 def logged(caplog: pytest.LogCaptureFixture) -> int:
@@ -124,7 +124,7 @@ def test_of_a_failure_that_would_fill_the_log_only_the_line_is_logged(caplog: py
     noisy = Noisy()
     for number in range(5):
         session = noisy.joins("spare", number)
-        noisy.hears("spare", Failure(session, "boom", "y" * (30_000 + number), None))
+        noisy.hears("spare", example(Failure, session=session, error="boom", traceback="y" * (30_000 + number)))
     broke = [line for line in caplog.messages if "boom" in line and "(host)" in line]
     assert ["\n    yyy" in line for line in broke] == [True, True, False, False, False]
     assert "its traceback is left out" in broke[2]
@@ -168,11 +168,15 @@ def test_what_is_kept_of_workers_that_left_is_limited() -> None:
     for number in range(REMEMBERED + 500):
         name = f"w{number}"
         session = noisy.joins(name)
-        noisy.hears(name, Heartbeat(session, 0, (0,), (), 2**53, {"step": 1e9}, 0), fake_rollout(session, 0, 9, 0, 0))
+        noisy.hears(
+            name,
+            example(Heartbeat, session=session, versions=(0,), steps=2**53, stages={"step": 1e9}),
+            fake_rollout(session, 0, 9, 0, 0),
+        )
     honest = noisy.joins("honest", 2)
     for _ in range(20):
         noisy.link.now += 0.4
-        noisy.hears("honest", Heartbeat(honest, 0, (0,), (), 0, {}, 0))
+        noisy.hears("honest", example(Heartbeat, session=honest, versions=(0,)))
     logging.disable(logging.NOTSET)
     assert set(noisy.coordinator.members) == {b"honest"}
     assert len(stages._removed_for_silence) == REMEMBERED
@@ -185,11 +189,31 @@ def test_the_stages_of_a_process_that_joins_again_are_counted_once() -> None:
     learner = Learner(lanes=1)
     learner.joins(b"a")
     learner.now = 60.0
-    learner.says(b"a", Heartbeat(learner.session(b"a"), 0, (0,), tuple(learner.tickets(b"a")), 1, {"step": 10.0}, 0))
+    learner.says(
+        b"a",
+        example(
+            Heartbeat,
+            session=learner.session(b"a"),
+            versions=(0,),
+            tickets=tuple(learner.tickets(b"a")),
+            steps=1,
+            stages={"step": 10.0},
+        ),
+    )
     learner.says(b"a", hello("a", 4_001, attempt=2))
     for now, step_s, all_s in ((61.0, 10.5, 10.0), (100.0, 30.5, 30.0), (101.0, 0.0, 10.0)):  # what falls is not believed
         learner.now = now
-        learner.says(b"a", Heartbeat(learner.session(b"a"), 0, (0,), tuple(learner.tickets(b"a")), 1, {"step": step_s}, 0))
+        learner.says(
+            b"a",
+            example(
+                Heartbeat,
+                session=learner.session(b"a"),
+                versions=(0,),
+                tickets=tuple(learner.tickets(b"a")),
+                steps=1,
+                stages={"step": step_s},
+            ),
+        )
         assert learner.coordinator.membership.stages() == {"step": all_s}
 
 
@@ -253,8 +277,8 @@ def test_a_flood_is_read_for_a_limited_time_and_an_honest_worker_is_not_taken_fo
         return hears(peer, message, now)
 
     noisy.coordinator.receive = slowly  # type: ignore[method-assign, assignment]
-    flood = [(b"spare", cast(ToLearner, Heartbeat(7, 0, (0,), (), 0, {}, 0)))] * 1_000
-    noisy.link.inbox += [*flood, (b"honest", Heartbeat(1, 0, (0,), (), 0, {}, 0))]
+    flood = [(b"spare", cast(ToLearner, example(Heartbeat, session=7, versions=(0,))))] * 1_000
+    noisy.link.inbox += [*flood, (b"honest", example(Heartbeat, session=1, versions=(0,)))]
     while noisy.link.inbox:
         began_s, left = noisy.link.now, len(noisy.link.inbox)
         noisy.hub.pulse()
@@ -302,7 +326,7 @@ def test_an_error_in_the_learner_costs_its_sender_the_membership_and_nothing_els
 
     noisy.coordinator.receive = raises  # type: ignore[method-assign, assignment]
     for _ in range(3):
-        noisy.hears("spare", Heartbeat(2, 0, (0,), (), 0, {}, 0))
+        noisy.hears("spare", example(Heartbeat, session=2, versions=(0,)))
     assert set(noisy.coordinator.members) == {b"honest"}
     refusal = Refuse("its Heartbeat led to an error in the learner: ZeroDivisionError")
     assert [decode_to_worker(frames) for frames in noisy.link.sent[-3:]] == [refusal] * 3
@@ -321,8 +345,8 @@ def test_what_a_worker_held_whose_message_led_to_an_error_is_dealt_again() -> No
         return hears(peer, message, now)
 
     noisy.coordinator.receive = raises  # type: ignore[method-assign, assignment]
-    noisy.hears("honest", Heartbeat(1, 0, (0,), (), 0, {}, 0))
-    noisy.hears("spare", Heartbeat(spare, 0, (), (), 0, {}, 0))
+    noisy.hears("honest", example(Heartbeat, session=1, versions=(0,)))
+    noisy.hears("spare", example(Heartbeat, session=spare))
     assert [ticket.peer for ticket in noisy.coordinator.rollouts.held.values()] == [b"spare"]
 
 
@@ -330,9 +354,9 @@ def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
     noisy = Noisy(max_env_failures=0)
     for number in range(10):
         session = noisy.joins("spare", number)
-        noisy.hears("spare", Failure(session, "boom", "", 0))
+        noisy.hears("spare", example(Failure, session=session, error="boom", lane=0))
     noisy.hub._turn(0.0)
-    noisy.hears("honest", Failure(1, "boom", "", 0))
+    noisy.hears("honest", example(Failure, session=1, error="boom", lane=0))
     with pytest.raises(EnvironmentFailed, match="boom; failure 1 in a row; max_env_failures allows 0 in a row"):
         noisy.hub._turn(0.0)
 
@@ -342,7 +366,11 @@ def test_failures_after_env_steps_end_the_run_if_there_are_too_many_within_an_ho
     noisy = Noisy(max_env_failures=1)  # of one env copy: two within the first hour
     for nonce, later_s in ((2, apart_s), (3, 0.0), (4, 0.0)):
         session = noisy.joins("honest", nonce)
-        noisy.hears("honest", Heartbeat(session, 0, (0,), (), 1, {}, 0), Failure(session, "boom", "", 0))
+        noisy.hears(
+            "honest",
+            example(Heartbeat, session=session, versions=(0,), steps=1),
+            example(Failure, session=session, error="boom", lane=0),
+        )
         noisy.link.now += later_s
     if ends:
         with pytest.raises(EnvironmentFailed, match="boom; failure 2 within an hour; max_env_failures allows 1 "):
@@ -356,7 +384,7 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
     noisy = Noisy(max_env_failures=1)
     for nonce in range(2, 12):
         session = noisy.joins("honest", nonce)
-        noisy.hears("honest", Failure(session, "boom", "", 0))
+        noisy.hears("honest", example(Failure, session=session, error="boom", lane=0))
         session = noisy.joins("honest", 100 * nonce)
         ((number, ticket),) = noisy.coordinator.rollouts.held.items()
         if between == "a rollout":
@@ -366,7 +394,9 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
         elif between != "nothing":
             noisy.hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
             (asked,) = noisy.coordinator.evaluation.held
-            noisy.hears("honest", Evaluated(session, asked, (Episode(0.0, 1, 0.0),), (False,)))
+            noisy.hears(
+                "honest", example(Evaluated, session=session, ticket=asked, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
+            )
             noisy.coordinator.evaluation.end()
     if between == "nothing":
         with pytest.raises(EnvironmentFailed, match="boom; failure 2 in a row; max_env_failures allows 1 in a row"):
@@ -380,7 +410,7 @@ def test_a_failure_is_told_once_and_the_same_traceback_is_not_repeated(caplog: p
     for nonce, traceback in enumerate(("line 1", "line 1", "line 2", "line 1"), 2):
         session = noisy.joins("honest", nonce)
         caplog.clear()
-        noisy.hears("honest", Failure(session, "boom", traceback, 0))
+        noisy.hears("honest", example(Failure, session=session, error="boom", traceback=traceback, lane=0))
         (told,) = (record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)
         if nonce == 3:
             assert told == "worker honest (host): boom; its traceback is the same as the one before"
@@ -390,7 +420,7 @@ def test_a_failure_is_told_once_and_the_same_traceback_is_not_repeated(caplog: p
 
 def test_a_worker_cannot_blame_a_policy_that_is_not_the_users() -> None:
     noisy = Noisy(max_env_failures=0)
-    noisy.hears("honest", Failure(1, "boom", "", None, of_policy=True))
+    noisy.hears("honest", example(Failure, session=1, error="boom", of_policy=True))
     with pytest.raises(EnvironmentFailed, match="boom; failure 1 in a row; max_env_failures allows 0 in a row"):
         noisy.hub._turn(0.0)
 
@@ -398,7 +428,7 @@ def test_a_worker_cannot_blame_a_policy_that_is_not_the_users() -> None:
 def test_a_worker_that_fails_before_lanes_are_placed_counts() -> None:
     learner = Learner(lanes=2, publish=False)
     learner.joins(b"a")
-    learner.says(b"a", Failure(learner.session(b"a"), "no such module", "", None))
+    learner.says(b"a", example(Failure, session=learner.session(b"a"), error="no such module"))
     (raised,) = [event for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
     assert not raised.spare
 
@@ -454,8 +484,10 @@ def test_invented_stage_names_are_not_kept() -> None:
     noisy = Noisy()
     for nonce in range(5):
         session = noisy.joins("a", nonce)
-        as_bytes(noisy, "a", Heartbeat(session, 0, (0,), (), 0, {f"stage {n}": 1.0 for n in range(45_000)}, 0))  # type: ignore[misc]
-        as_bytes(noisy, "a", Heartbeat(session, 0, (0,), (), 0, {"[/red]": 1.0}, 0))  # type: ignore[dict-item]
+        as_bytes(
+            noisy, "a", example(Heartbeat, session=session, versions=(0,), stages={f"stage {n}": 1.0 for n in range(45_000)})
+        )
+        as_bytes(noisy, "a", example(Heartbeat, session=session, versions=(0,), stages={"[/red]": 1.0}))
     assert noisy.coordinator.membership.stages() == {}
     assert noisy.coordinator.rollouts.ledger.messages_bad == 10
 
@@ -503,7 +535,7 @@ def test_rollouts_with_any_resets_are_counted_and_lead_to_no_error(seats: tuple[
         rollouts.late(message)  # neither of them may trust it
         rollouts.reject(noisy.coordinator.members[b"spare"], message)
         noisy.hears("spare", message)
-        noisy.hears("honest", Heartbeat(1, 0, (0,), (0,), 0, {}, 0))
+        noisy.hears("honest", example(Heartbeat, session=1, versions=(0,), tickets=(0,)))
         session = noisy.joins("spare", number + 2)
     assert len(said) > 100
     assert all("\n" not in line and len(line) < 1_000 for line in said)

@@ -29,6 +29,7 @@ from millrace.protocol.errors import NoWorkers
 from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Status, ToLearner
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
 
@@ -48,7 +49,7 @@ class Served:
         link = cast(LearnerLink, self.link)
         processes = FakeProcesses(of_ended=self._ended, of_activities=self._running, of_left=self._left)
         self.server = MemberServer(link, self.coordinator, self, processes, settings, lambda: self.link.now)
-        self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+        self.link.inbox.append((b"w0", example(Hello)))
         self.server.listen(POLL_S)
 
     def status(self, now: float) -> Status:
@@ -111,7 +112,7 @@ def flood(served: Served) -> None:
     def receive() -> Iterator[tuple[bytes, ToLearner]]:
         while True:
             served.link.now += 0.001
-            yield b"loud", Heartbeat(7, 0, (), (), 0, {}, 0)
+            yield b"loud", example(Heartbeat, session=7)
 
     served.link.receive = receive  # type: ignore[method-assign]
     served.link.poll = lambda timeout_s: True  # type: ignore[method-assign]
@@ -159,7 +160,7 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
         worker_timeout_s=TIMEOUT_S,
         clock=lambda: link.now,
     )
-    link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+    link.inbox.append((b"w0", example(Hello)))
     hub.wait_for(1, TIMEOUT_S)
     link.now += 1000.0
     with pytest.raises(NoWorkers):
@@ -175,7 +176,7 @@ def test_the_last_messages_of_a_process_that_has_ended_are_received(before: int)
     """Also if they come one by one, some after it is known that the process has ended."""
     served = Served()
     served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
-    late: list[ToLearner] = [*[Heartbeat(1, 0, (), (), 0, {}, 0)] * before, Goodbye(1, "told to stop", ())]
+    late: list[ToLearner] = [*[example(Heartbeat, session=1)] * before, Goodbye(1, "told to stop", ())]
     waiting = served.link.poll
 
     def one_at_a_time(timeout_s: float) -> bool:
@@ -231,7 +232,7 @@ def test_a_wait_ends_when_it_has_found_no_worker_all_the_time() -> None:
         served.server.check_members(TIMEOUT_S)
         served.link.now += TIMEOUT_S - 1
         served.server.check_members(TIMEOUT_S)
-        served.says(b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, attempt, "fake", 1))
+        served.says(b"w0", example(Hello, process_nonce=attempt))
         served.server.check_members(TIMEOUT_S)
     served.says(b"w0", Goodbye(3, "told to stop", ()))
     served.server.check_members(TIMEOUT_S)
@@ -249,10 +250,10 @@ def test_how_workers_come_and_go_is_a_warning_only_if_somebody_should_look(caplo
         return " ".join(record.levelname for record in caplog.records)
 
     def hello(attempt: int) -> Hello:
-        return Hello(PROTOCOL_VERSION, "w1", "host", 1, 1, "fake", attempt)
+        return example(Hello, worker="w1", attempt=attempt)
 
     served = Served()
-    assert level(Heartbeat(7, 0, (), (), 0, {}, 0)) == "INFO", "it joins again"
+    assert level(example(Heartbeat, session=7)) == "INFO", "it joins again"
     assert level(hello(1)) == "INFO"
     assert level(Goodbye(2, "told to stop", ())) == "WARNING"
     assert level(hello(2)) == "INFO"
@@ -260,14 +261,14 @@ def test_how_workers_come_and_go_is_a_warning_only_if_somebody_should_look(caplo
     assert level(Goodbye(3, "done", ())) == "INFO"
     served = Served(ServerSettings(log_joins=False, log_tracebacks=False))
     assert level(hello(1)) == "", "it joins the run in a moment"
-    assert level(Failure(2, "boom", "its traceback", None)) == "INFO WARNING"
+    assert level(example(Failure, session=2, error="boom", traceback="its traceback")) == "INFO WARNING"
     assert caplog.messages == ["worker w1 (host): boom", "worker w1 failed"], "whoever raises the error shows its traceback"
 
 
 def test_what_a_connection_had_sent_that_a_newer_one_replaced_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
     """ZeroMQ takes the routing id from the older connection, so its Hellos are read from one without a name."""
     caplog.set_level(logging.INFO)
-    served, hello = Served(), Hello(PROTOCOL_VERSION, "w1", "host", 1, 1, "fake", 1)
+    served, hello = Served(), example(Hello, worker="w1")
     caplog.clear()
     served.says(b"\0\0\0\0\1", hello)
     assert "(the last one was refused: its connection has no routing id" in str(served.server.no_workers(2, 1.0))
@@ -282,7 +283,7 @@ def test_what_became_of_workers_is_said_where_one_is_missing() -> None:
     served.link.keyring, served.link.refused = SimpleNamespace(allowed=()), 3
     says = str(served.server.no_workers(2, 1.0))
     assert says.endswith("1 joined (3 were not let in; the log says why); start one: millrace worker fake --token FILE")
-    served.says(b"w1", Hello(PROTOCOL_VERSION + 1, "w1", "host", 1, 1, "fake", 1))
+    served.says(b"w1", example(Hello, protocol=PROTOCOL_VERSION + 1, worker="w1"))
     assert "1 joined (the last one was refused: protocol: expected" in str(served.server.no_workers(2, 1.0))
 
 
@@ -308,7 +309,7 @@ def test_a_wait_ends_at_once_when_nobody_is_left_who_could_work(caplog: pytest.L
 def test_new_members_of_one_key_are_limited() -> None:
     served = Served()
     served.server._joins.admits = lambda source, now: False  # type: ignore[method-assign]
-    served.says(b"w1", Hello(PROTOCOL_VERSION, "w1", "host", 1, 1, "fake", 1))
+    served.says(b"w1", example(Hello, worker="w1"))
     assert list(served.coordinator.members) == [b"w0"]
 
 
@@ -316,5 +317,5 @@ def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() 
     served = Served()
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers at fake, 1 joined; start one: millrace worker fake"):
         served.server.wait_for(2, 1.0, lambda: served.server.listen(POLL_S))
-    served.link.inbox.append((b"w0", Heartbeat(1, 0, (), (), 0, {}, 0)))
+    served.link.inbox.append((b"w0", example(Heartbeat, session=1)))
     served.server.wait_for(1, 1.0, lambda: served.server.listen(POLL_S))

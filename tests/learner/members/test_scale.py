@@ -12,6 +12,7 @@ import pytest
 from millrace.learner.members.key_revocation import KeyRevocation
 from millrace.protocol.messages import Heartbeat
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import process_ends
 
 FEW, MANY = 8, 512
@@ -70,7 +71,7 @@ def test_a_rollout_costs_as_much_whatever_the_number_of_workers(max_lag: int) ->
 def test_an_account_costs_as_much_whatever_the_number_of_workers() -> None:
     def of_account(learner: Learner) -> int:
         (ticket,) = learner.tickets(b"w1")
-        account = Heartbeat(learner.session(b"w1"), 0, (1,), (ticket,), 0, {}, 0)
+        account = example(Heartbeat, session=learner.session(b"w1"), versions=(1,), tickets=(ticket,))
         return lines(lambda: learner.coordinator.receive(b"w1", account, learner.now))
 
     assert of_account(crowd(MANY)) <= of_account(crowd(FEW)) + 5

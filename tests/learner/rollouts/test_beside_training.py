@@ -11,9 +11,10 @@ from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstil
 from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Evaluate, Heartbeat, Hello, Weights, WorkerExit
+from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Hello, Weights, WorkerExit
 from tests.learner.rollouts.test_evaluation_dealer import answer, orders, plan
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of, permits
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, process_ends
 
 A, B, E, F = b"a", b"b", b"e", b"f"
@@ -23,7 +24,7 @@ class BesideLearner(Learner):
     """A learner with workers that only evaluate, and shorthand for evaluations beside training."""
 
     def evaluator_joins(self, peer: bytes) -> list[Outgoing]:
-        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", 1, 77, "fake", 78, evaluates=True))
+        return self.says(peer, example(Hello, worker=peer.decode(), process_nonce=77, attempt=78, evaluates=True))
 
     def begins(self, *seeds: int) -> list[Outgoing]:
         return self.balanced(self.coordinator.begin_evaluation(plan(*seeds), beside=True))
@@ -74,7 +75,12 @@ def test_only_those_who_collect_wait_for_training() -> None:
     learner.now = 60.0
     for peer in (A, E):
         spent: Stages = {"wait": 20.0, "evaluate": 10.0}
-        learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), tuple(learner.tickets(peer)), 0, spent, 0))
+        learner.says(
+            peer,
+            example(
+                Heartbeat, session=learner.session(peer), versions=(0,), tickets=tuple(learner.tickets(peer)), stages=spent
+            ),
+        )
     assert learner.coordinator.membership.stages() == {"wait": 20.0, "evaluate": 20.0}
 
 
@@ -148,7 +154,7 @@ def test_their_env_steps_are_progress_only_while_the_learner_waits_for_an_evalua
     watch.begin(learner.now)
     assert watch.check(learner.now, 0, evaluating=evaluating) is None
     learner.now += 60.0
-    learner.says(E, Heartbeat(learner.session(E), 0, (0,), (), 9, {}, 0))
+    learner.says(E, example(Heartbeat, session=learner.session(E), versions=(0,), steps=9))
     assert watch.check(learner.now, 0, evaluating=evaluating) is None
     verdict = watch.check(learner.now + 39.0, 0, evaluating=evaluating)
     assert verdict is None
@@ -169,7 +175,13 @@ def test_claims_do_not_keep_an_evaluation_from_a_second_worker_and_only_an_answe
             learner.now += 10.0
             steps += 1
             learner.says(
-                E, Heartbeat(learner.session(E), 0, tuple(learner.coordinator.members[E].tickets), (), steps, {}, 0)
+                E,
+                example(
+                    Heartbeat,
+                    session=learner.session(E),
+                    versions=tuple(learner.coordinator.members[E].tickets),
+                    steps=steps,
+                ),
             )
             found.append(watch.check(learner.now, steps, evaluating=True))
         return [verdict for verdict in found if verdict is not None]

@@ -17,6 +17,7 @@ from millrace.protocol.bounds import LARGEST
 from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
 from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of, permits
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows, process_ends, spoiled
 
 A, B = b"a", b"b"
@@ -40,7 +41,13 @@ def orders(outs: Sequence[Outgoing]) -> list[Evaluate]:
 def answer(order: Evaluate) -> Evaluated:
     """Each episode is as long as its seed says, and that of seed 1 was cut."""
     episodes = tuple(Episode(0.0, seed, 0.0) for seed in order.seeds if seed is not None)
-    return Evaluated(order.session, order.ticket, episodes, tuple(seed == 1 for seed in order.seeds))
+    return example(
+        Evaluated,
+        session=order.session,
+        ticket=order.ticket,
+        episodes=episodes,
+        cut=tuple(seed == 1 for seed in order.seeds),
+    )
 
 
 @pytest.mark.parametrize(("episodes", "max_steps", "most_steps"), [(10, 5_000, 500), (10, 5, 1), (1, 10 * LARGEST, LARGEST)])
@@ -101,7 +108,7 @@ def asked(learner: Learner) -> Evaluate:
 def against(order: Evaluate, opponents: Sequence[int | None], score: float = 0.5) -> Evaluated:
     played = zip(order.seeds, opponents, strict=True)
     episodes = tuple(Episode(0.0, seed, 0.0, (score,), opponent) for seed, opponent in played if seed is not None)
-    return Evaluated(order.session, order.ticket, episodes, (False,) * len(episodes))
+    return example(Evaluated, session=order.session, ticket=order.ticket, episodes=episodes, cut=(False,) * len(episodes))
 
 
 def test_opponents_take_turns_and_each_meets_all_teams() -> None:

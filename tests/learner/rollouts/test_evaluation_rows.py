@@ -19,6 +19,7 @@ from millrace.protocol.rows.played import reason_to_reject
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import fake_rows
 
 A, B = b"a", b"b"
@@ -50,7 +51,13 @@ class Played:
         return EpisodeRows(**{**fields, "terminated": np.zeros(1, bool), **changes})
 
     def answer(self, length: int) -> Evaluated:
-        return Evaluated(self.order.session, self.order.ticket, (Episode(0.0, length, 0.0),), (False,))
+        return example(
+            Evaluated,
+            session=self.order.session,
+            ticket=self.order.ticket,
+            episodes=(Episode(0.0, length, 0.0),),
+            cut=(False,),
+        )
 
     def strikes(self, peer: bytes = A) -> int:
         return self.learner.coordinator.members[peer].strikes

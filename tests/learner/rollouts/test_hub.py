@@ -17,11 +17,12 @@ from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import RunError
 from millrace.protocol.logs.long_wait import AGAIN_S, FIRST_S
-from millrace.protocol.messages import PROTOCOL_VERSION, Evaluated, Heartbeat, Hello, Weights
+from millrace.protocol.messages import Evaluated, Heartbeat, Hello, Weights
 from millrace.protocol.rollout import Episode, rollout_bytes
 from millrace.protocol.wire.codec import decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
@@ -41,9 +42,9 @@ def hub_with_a_worker(
         processes,
         clock=lambda: link.now,
     )
-    link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+    link.inbox.append((b"w0", example(Hello)))
     hub.wait_for(1)
-    return link, hub, Heartbeat(1, 0, (), (), 0, {}, 0)
+    return link, hub, example(Heartbeat, session=1)
 
 
 def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
@@ -54,7 +55,7 @@ def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
 @pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2")])
 def test_weights_are_rounded_and_encoded_once_for_all_workers(dtype: ActingDtype, sent: str) -> None:
     link, hub, _ = hub_with_a_worker(dtype, lanes=2)
-    link.inbox.append((b"w1", Hello(PROTOCOL_VERSION, "w1", "host", 2, 2, "fake", 1)))
+    link.inbox.append((b"w1", example(Hello, worker="w1", pid=2, process_nonce=2)))
     hub.wait_for(2)
     parameters = np.array([1.00001, -2.0], np.float32)
     link.sent.clear()
@@ -82,12 +83,12 @@ def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixtur
     """As after a restart of the learner, from every worker that went on saying Heartbeat."""
     link, hub, _ = hub_with_a_worker()
     caplog.set_level(logging.INFO)
-    link.inbox += [(b"w1", Heartbeat(7, number, (), (), 0, {}, 0)) for number in range(100)]
+    link.inbox += [(b"w1", example(Heartbeat, session=7, replies=number)) for number in range(100)]
     link.now += PULSE_S
     hub.pulse()
     assert [record.getMessage() for record in caplog.records] == ["worker w1 was told to join again: its session had ended"]
     link.now += 100
-    link.inbox.append((b"w1", Heartbeat(7, 100, (), (), 0, {}, 0)))
+    link.inbox.append((b"w1", example(Heartbeat, session=7, replies=100)))
     hub.pulse()
     assert caplog.records[-1].getMessage().endswith("had ended (99 more like this since the last line)")
 
@@ -154,7 +155,7 @@ def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
     link, hub, heartbeat = hub_with_a_worker(
         processes=FakeProcesses(of_stepping=lambda: [Member(b"w9", w9, 1, 0, heard_s=link.now)])
     )
-    w9 = Hello(PROTOCOL_VERSION, "w9", "far", 1, 1, "fake", 1)
+    w9 = example(Hello, worker="w9", host="far")
     hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
     began_s = link.now
     seen: list[str] = []
@@ -201,7 +202,7 @@ def test_only_an_answer_that_is_used_shows_that_the_environment_works() -> None:
     hub._failures.evaluated = shown.append  # type: ignore[method-assign, assignment]
     hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
     (ticket,) = hub.coordinator.evaluation.held
-    answer = Evaluated(1, ticket, (Episode(0.0, 1, 0.0),), (False,))
+    answer = example(Evaluated, session=1, ticket=ticket, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
     strangers = [(b"w7", answer), (b"w0", msgspec.structs.replace(answer, ticket=ticket + 1))]
     for peer, message in [*strangers, (b"w0", answer)]:
         assert shown == []

@@ -11,8 +11,9 @@ from millrace.learner.members.member import SUPERVISOR_WORD_S
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings
 from millrace.protocol.alive import SHARED_VERSIONS, Alive, WorkerActivity
-from millrace.protocol.messages import PROTOCOL_VERSION, Collect, HeartbeatReply, Hello, Weights
+from millrace.protocol.messages import Collect, HeartbeatReply, Hello, Weights
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import process_ends
 
 A, B, C, SUPERVISOR = b"a", b"b", b"c", b"supervisor"
@@ -121,7 +122,7 @@ def test_workers_of_a_supervisor_that_shares_no_more_get_weights_directly(how: s
 def test_weights_go_to_no_supervisor_of_another_key() -> None:
     learner = Learner()
     peer = b"a\0tag\0aa"
-    learner.says(peer, Hello(PROTOCOL_VERSION, "a", "host", 1, NONCE, "fake", NONCE + 1))
+    learner.says(peer, example(Hello, worker="a", process_nonce=NONCE, attempt=NONCE + 1))
     learner.deliver_all()
     learner.take()
     assert speaks(learner, 0, b"a", b"supervisor\0tag\0bb") == []

@@ -20,13 +20,14 @@ from millrace.learner.rollouts.run_status import progress_now, status
 from millrace.learner.run_folder.json_log import JsonLines, progress_line
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.errors import RunError
-from millrace.protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello, Inquire, Status
+from millrace.protocol.messages import Goodbye, Heartbeat, Hello, Inquire, Status
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.terminal import progress_view
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import process_ends
 
 PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)
@@ -40,7 +41,18 @@ def told(learner: Learner, waiting: str = "") -> Status:
 def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
     seen = learner.coordinator.members[peer].replies
     held = tuple(learner.tickets(peer))
-    learner.says(peer, Heartbeat(learner.session(peer), seen, (0,), held, steps, {}, resident))
+    learner.says(
+        peer,
+        example(
+            Heartbeat,
+            session=learner.session(peer),
+            replies=seen,
+            versions=(0,),
+            tickets=held,
+            steps=steps,
+            resident_bytes=resident,
+        ),
+    )
 
 
 def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> None:
@@ -70,7 +82,7 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
 
 
 def late(learner: Learner, peer: bytes, actions: int) -> None:
-    learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), (), 0, {}, 0, actions))
+    learner.says(peer, example(Heartbeat, session=learner.session(peer), versions=(0,), late_actions=actions))
 
 
 def test_late_actions_are_counted_once_also_when_a_worker_joins_again() -> None:
@@ -238,7 +250,7 @@ def test_it_shows_how_many_workers_could_have_a_lane(workers: int) -> None:
     learner = Learner(lanes=2)
     for number in range(workers):
         learner.joins(b"w%d" % number)
-    learner.says(b"e", Hello(PROTOCOL_VERSION, "e", "host", 1, 77, "fake", 78, evaluates=True))
+    learner.says(b"e", example(Hello, worker="e", process_nonce=77, attempt=78, evaluates=True))
     assert f"workers: {workers} here, 2 wanted (one for each lane)" in as_table(told(learner)).splitlines()
 
 

@@ -16,9 +16,10 @@ from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
 from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit
 from millrace.protocol.call_timeouts import OUR_CODE, CallTimeouts, Doing
-from millrace.protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
+from millrace.protocol.messages import Drain, Heartbeat, Hello
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec, spoiled
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
@@ -90,7 +91,7 @@ def test_who_uses_another_key_is_not_believed(key: bytes, believed: bool) -> Non
     """With keys, a peer is its routing id and its key."""
     learner = Learner()
     peer = b"a\0tag\0aa"
-    learner.says(peer, Hello(PROTOCOL_VERSION, "a", "host", 1, NONCE, "fake", 1))
+    learner.says(peer, example(Hello, worker="a", process_nonce=NONCE))
     speaker = b"supervisor\0tag\0" + key if key else SUPERVISOR
     learner.now += TIMEOUT_S - 0.5
     speaks(learner, activity(), speaker)
@@ -187,7 +188,7 @@ def watch(learner: Learner, timeouts: CallTimeouts = TIMEOUTS) -> StallWatch:
 
 def beats(learner: Learner, peer: bytes, steps: int) -> None:
     held = tuple(learner.tickets(peer))
-    learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), held, steps, {}, 0))
+    learner.says(peer, example(Heartbeat, session=learner.session(peer), versions=(0,), tickets=held, steps=steps))
 
 
 def test_a_run_in_which_nothing_happens_stands_still() -> None:

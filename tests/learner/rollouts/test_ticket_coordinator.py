@@ -56,6 +56,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.specs import OwnPolicySpec
 from millrace.protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec, spoiled
 from tests.support.conversation.rules import check_ledger
 
@@ -100,7 +101,9 @@ class Learner:
 
     def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Outgoing]:
         nonce = 1000 * len(host) + pid
-        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, nonce, "fake", nonce + attempt))
+        return self.says(
+            peer, example(Hello, worker=peer.decode(), host=host, pid=pid, process_nonce=nonce, attempt=nonce + attempt)
+        )
 
     def session(self, peer: bytes) -> int:
         return self.coordinator.members[peer].session
@@ -147,7 +150,9 @@ class Learner:
         member = self.coordinator.members[peer]
         seen = member.replies if replies is None else replies
         weights = sorted(self.holds(peer)) if versions is None else versions
-        return self.says(peer, Heartbeat(self.session(peer), seen, tuple(weights), tuple(held), 0, {}, 0))
+        return self.says(
+            peer, example(Heartbeat, session=self.session(peer), replies=seen, versions=tuple(weights), tickets=tuple(held))
+        )
 
     def holds(self, peer: bytes) -> set[int]:
         """The versions that this worker holds or is about to get."""
@@ -262,21 +267,21 @@ def test_a_process_that_was_replaced_joins_again_but_two_do_not_take_a_name_from
 
 def test_a_name_that_is_not_the_routing_id_is_refused() -> None:
     learner = Learner()
-    (refuse,) = of(learner.says(A, Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
+    (refuse,) = of(learner.says(A, example(Hello, worker="b", process_nonce=1001)), Refuse)
     assert "routing id" in refuse.reason
     assert learner.coordinator.members == {}
 
 
 def test_a_hello_over_a_connection_without_a_routing_id_is_refused_with_what_a_client_must_set() -> None:
     learner = Learner()
-    (refuse,) = of(learner.says(b"\0\0\0\0\1", Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
+    (refuse,) = of(learner.says(b"\0\0\0\0\1", example(Hello, worker="b", process_nonce=1001)), Refuse)
     assert refuse.reason.startswith("its connection has no routing id: expected the worker's name, set as the socket's")
     assert [type(event) for event in learner.coordinator.events] == [NamelessHello]
 
 
 def test_another_protocol_is_refused_and_says_what_to_do() -> None:
     learner = Learner()
-    outs = learner.says(A, Hello(PROTOCOL_VERSION + 1, "a", "host", 1, 1001, "fake", 1))
+    outs = learner.says(A, example(Hello, protocol=PROTOCOL_VERSION + 1, worker="a", process_nonce=1001))
     (refuse,) = of(outs, Refuse)
     assert f"expected {PROTOCOL_VERSION}, got {PROTOCOL_VERSION + 1}" in refuse.reason
     assert learner.coordinator.members == {}
@@ -288,14 +293,14 @@ def test_a_message_of_no_session_of_ours_is_answered_by_rejoin(known: bool) -> N
     learner = Learner()
     if known:
         learner.joins(A)
-    for message in (Heartbeat(5, 0, (0,), (), 0, {}, 0), fake_rollout(5, 0, 0, 0, 0)):
+    for message in (example(Heartbeat, session=5, versions=(0,)), fake_rollout(5, 0, 0, 0, 0)):
         assert learner.says(A, message) == [(A, Rejoin(5))]
 
 
 def test_a_last_word_of_no_session_of_ours_is_not_answered() -> None:
     learner = Learner()
     learner.joins(A)
-    assert learner.says(A, Goodbye(5, "bye", ())) == learner.says(A, Failure(5, "broke", "", None)) == []
+    assert learner.says(A, Goodbye(5, "bye", ())) == learner.says(A, example(Failure, session=5, error="broke")) == []
     assert A in learner.coordinator.members
 
 
@@ -461,7 +466,7 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(chan
     outs = learner.says(A, msgspec.structs.replace(learner.rollout_of(number), **change))
     ledger = learner.coordinator.rollouts.ledger
     assert (learner.coordinator.rollouts.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
-    assert permits(outs) == [Permit(other + 1, 0, 0, 2)]
+    assert permits(outs) == [example(Permit, ticket=other + 1, sequence=2)]
     assert learner.coordinator.members[A].strikes == 1
 
 
@@ -755,7 +760,7 @@ def test_a_lost_rollout_is_asked_for_again() -> None:
     learner.joins(A)
     learner.beats(A)
     outs = learner.beats(A, tickets=[1])
-    assert permits(outs) == [Permit(0, 0, 0, 0)]
+    assert permits(outs) == [example(Permit)]
     assert learner.coordinator.rollouts.ledger.lost == 0
 
 
@@ -793,7 +798,7 @@ def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     outs = learner.says(A, spoiled(learner.rollout_of(0)))
-    assert permits(outs) == [Permit(1, 0, 0, 1)]
+    assert permits(outs) == [example(Permit, ticket=1, sequence=1)]
     ledger = learner.coordinator.rollouts.ledger
     assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
 
@@ -933,7 +938,9 @@ def test_of_a_heartbeat_no_tickets_are_kept() -> None:
 def test_a_traceback_is_safe_to_show() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: \x1b[2J", 0))
+    learner.says(
+        A, example(Failure, session=learner.session(A), error="ValueError: x", traceback="Traceback: \x1b[2J", lane=0)
+    )
     raised = [event.traceback for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
     assert raised == ["Traceback: \\x1b[2J"]
 
@@ -942,7 +949,9 @@ def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> N
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.joins(B)
-    outs = learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: …", 0))
+    outs = learner.says(
+        A, example(Failure, session=learner.session(A), error="ValueError: x", traceback="Traceback: …", lane=0)
+    )
     assert A not in learner.coordinator.members
     assert [permit.incarnation for permit in permits(outs, B)] == [1]
     assert EnvironmentRaised("a", "host", "ValueError: x", "Traceback: …", lanes=(0,)) in learner.coordinator.events
@@ -954,7 +963,7 @@ def test_a_failure_belongs_to_its_lane_or_to_all_of_the_workers_lanes(lane: int 
     learner = Learner(lanes=2)
     learner.joins(A)
     learner.delivers(learner.tickets(A)[0])
-    learner.says(A, Failure(learner.session(A), "ValueError: x", "", lane))
+    learner.says(A, example(Failure, session=learner.session(A), error="ValueError: x", lane=lane))
     (failed,) = [event for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
     assert failed.lanes == lanes
     assert failed.worked_s is not None, "a rollout has env steps"
@@ -964,7 +973,7 @@ def test_a_failure_belongs_to_its_lane_or_to_all_of_the_workers_lanes(lane: int 
 def test_a_failure_of_the_users_policy_is_told_as_one(kind: type) -> None:
     learner = Learner(lanes=1, policy=msgspec.structs.replace(run_spec().policy, own=OwnPolicySpec("mine:make", ())))
     learner.joins(A)
-    learner.says(A, Failure(learner.session(A), "KeyError", "", None, of_policy=kind is PolicyRaised))
+    learner.says(A, example(Failure, session=learner.session(A), error="KeyError", of_policy=kind is PolicyRaised))
     (failed,) = [event for event in learner.coordinator.events if isinstance(event, Failed)]
     assert type(failed) is kind
 
@@ -1244,7 +1253,15 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
 def test_the_most_tickets_that_a_run_may_have_outstanding_fit_one_message() -> None:
     numbers = range(2**31, 2**31 + MOST_TICKETS)
     received = tuple(Received(n, 200, 10**5) for n in range(MOST_TICKETS))
-    order = Collect(2**48, 10**6, tuple(Permit(number, n, 200, 10**5) for n, number in enumerate(numbers)), received, ())
+    order = example(
+        Collect,
+        session=2**48,
+        version=10**6,
+        permits=tuple(
+            example(Permit, ticket=number, lane=n, incarnation=200, sequence=10**5) for n, number in enumerate(numbers)
+        ),
+        received=received,
+    )
     assert decode_to_worker([bytes(frame) for frame in encode(order)]) == order
 
 
@@ -1254,7 +1271,12 @@ def test_what_workers_note_of_the_environment_is_told_once() -> None:
     for peer in (A, B):
         learner.joins(peer)
         for note in notes:
-            learner.says(peer, Heartbeat(learner.session(peer), 0, (0,), tuple(learner.tickets(peer)), 0, {}, 0, note=note))
+            learner.says(
+                peer,
+                example(
+                    Heartbeat, session=learner.session(peer), versions=(0,), tickets=tuple(learner.tickets(peer)), note=note
+                ),
+            )
     told = [event for event in learner.coordinator.events if isinstance(event, EnvironmentNoted)]
     assert len(told) == MOST_NOTES
     assert [describe(event) for event in told[:2]] == ["worker a: it has a mask", "worker a: note 0"]

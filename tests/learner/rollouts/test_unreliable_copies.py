@@ -10,8 +10,9 @@ from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.alive import Alive, WorkerExit
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
+from millrace.protocol.messages import Heartbeat, Hello, ToLearner
 from millrace.protocol.wire.learner_link import LearnerLink
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
 
@@ -43,14 +44,17 @@ class Unreliable:
 
     def starts(self, worker: int) -> None:
         self.processes += 1
-        hello = Hello(PROTOCOL_VERSION, f"w{worker}", "host", 1, self.processes, "fake", self.processes)
+        hello = example(Hello, worker=f"w{worker}", process_nonce=self.processes, attempt=self.processes)
         self.hears(f"w{worker}".encode(), hello)
 
     def crashes(self, worker: int, *, after_steps: bool) -> None:
         """The process of this worker dies. It is started again."""
         member = self.coordinator.members[f"w{worker}".encode()]
         if after_steps:
-            self.hears(member.peer, Heartbeat(member.session, 0, (0,), tuple(member.tickets), 9, {}, 0))
+            self.hears(
+                member.peer,
+                example(Heartbeat, session=member.session, versions=(0,), tickets=tuple(member.tickets), steps=9),
+            )
         why = "was killed by SIGSEGV in a reset of its environment"
         exits = (WorkerExit(member.hello.worker, member.hello.process_nonce, why, failed=True),)
         self.hears(b"supervisor", Alive((), exits))

@@ -14,6 +14,7 @@ from millrace.protocol.messages import Evaluated, Goodbye, Heartbeat
 from millrace.protocol.random_streams import Purpose
 from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
 from tests.support.in_process.fake_processes import FakeProcesses
 
@@ -50,7 +51,9 @@ class Run:
         for more in (0, per_s):
             self.learner.now += 1.0
             held = tuple(self.learner.tickets(peer))
-            self.learner.says(peer, Heartbeat(session, 0, (0,), held, steps + int(more), {}, 0))
+            self.learner.says(
+                peer, example(Heartbeat, session=session, versions=(0,), tickets=held, steps=steps + int(more))
+            )
 
     @property
     def line(self) -> str:
@@ -119,7 +122,7 @@ def test_env_steps_of_a_rollout_that_has_come_and_of_an_evaluation_are_not_count
     run.learner.take()
     (ticket,) = coordinator.evaluation.held
     episode = Episode(1.0, 5, 0.0)
-    run.learner.says(A, Evaluated(run.learner.session(A), ticket, (episode,), (False,)))
+    run.learner.says(A, example(Evaluated, session=run.learner.session(A), ticket=ticket, episodes=(episode,), cut=(False,)))
     coordinator.evaluation.end()
     run.learner.publish(1)
     run.steps(A, 5)  # in all 6: the rollout and the evaluation
@@ -138,7 +141,7 @@ def test_env_steps_from_before_a_session_are_not_counted_in_it() -> None:
     assert run.learner.coordinator.collected() == 0
     session, held = run.learner.session(A), tuple(run.learner.tickets(A))
     for steps, collected in ((20, 0), (23, 3)):
-        run.learner.says(A, Heartbeat(session, 0, (0,), held, steps, {}, 0))
+        run.learner.says(A, example(Heartbeat, session=session, versions=(0,), tickets=held, steps=steps))
         assert run.learner.coordinator.collected() == collected
 
 
@@ -252,7 +255,7 @@ def test_if_the_members_only_act_the_worker_that_steps_is_named() -> None:
     acting.learner.now += 5.0
     stepping.learner.now = acting.learner.now
     for peer in (A, B):
-        stepping.learner.says(peer, Heartbeat(stepping.learner.session(peer), 0, (), (), 0, {}, 0))
+        stepping.learner.says(peer, example(Heartbeat, session=stepping.learner.session(peer)))
     stepping.does(B, "resetting", 4.0)
     acting.stepping = list(stepping.learner.coordinator.members.values())
     assert acting.line == "waiting 5 s for lanes 0, 1 (worker b on host-of-b: in reset for 4 s)"

@@ -20,6 +20,7 @@ from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import Described, Goodbye, Returned, ToLearner
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
+from tests.support.conversation.example_messages import example
 
 
 def test_lanes_have_consecutive_rows() -> None:
@@ -44,7 +45,7 @@ def test_what_is_not_infos_is_refused(value: object) -> None:
 
 
 def returned(results: bytes, error: str = "") -> Returned:
-    return Returned(1, 2, 0, 0, np.frombuffer(results, np.uint8), error, "")
+    return example(Returned, session=1, ticket=2, results=np.frombuffer(results, np.uint8), error=error)
 
 
 def frames(message: ToLearner) -> list[bytes]:

@@ -16,7 +16,6 @@ from millrace.protocol.bounds import LARGEST
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Answer,
     Call,
     Failure,
@@ -37,6 +36,7 @@ from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import Leaf, StepSpec
 from millrace.protocol.wire.codec import decode_to_observer, encode
 from millrace.protocol.wire.plain_values import pack
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import fake_rollout, process_ends
 
 A, B = b"a", b"b"
@@ -56,7 +56,7 @@ def order_coordinator(*peers: bytes) -> OrderCoordinator:
     """With these workers, one lane each, all of them stepped once."""
     made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
     for peer in peers:
-        made.receive(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", 1, 1, "fake", 1), 0.0)
+        made.receive(peer, example(Hello, worker=peer.decode()), 0.0)
     for lane in range(len(peers)):
         assert made.place(lane, patient=False)
         ((peer, order),) = made.order(lane, step)
@@ -67,14 +67,27 @@ def order_coordinator(*peers: bytes) -> OrderCoordinator:
 
 
 def step(session: int, ticket: int, life: LaneIncarnation) -> Order:
-    return Step(session, ticket, life.lane, life.incarnation, (np.zeros(1, np.int64),))
+    return example(
+        Step, session=session, ticket=ticket, lane=life.lane, incarnation=life.incarnation, actions=(np.zeros(1, np.int64),)
+    )
 
 
 def stepped(order: object, **changes: object) -> Stepped:
     assert isinstance(order, Step | Call)
     flag = np.zeros(1, bool)
     obs = (np.zeros((1, 2), np.float32),)
-    answer = Stepped(order.session, order.ticket, order.lane, order.incarnation, obs, np.zeros(1), flag, flag, NOTHING)
+    answer = example(
+        Stepped,
+        session=order.session,
+        ticket=order.ticket,
+        lane=order.lane,
+        incarnation=order.incarnation,
+        obs=obs,
+        reward=np.zeros(1),
+        terminated=flag,
+        truncated=flag,
+        infos=NOTHING,
+    )
     return msgspec.structs.replace(answer, **changes)
 
 
@@ -82,7 +95,10 @@ def in_memory(made: OrderCoordinator, lane: int, number: int) -> Stepped:
     """What its worker says when the infos of that order do not fit into shared memory."""
     member = made.owner(lane)
     assert member is not None
-    return stepped(Step(member.session, -number, lane, made.lanes[lane].incarnation, ()), infos=WORDS)
+    return stepped(
+        example(Step, session=member.session, ticket=-number, lane=lane, incarnation=made.lanes[lane].incarnation),
+        infos=WORDS,
+    )
 
 
 def test_an_order_is_answered_once() -> None:
@@ -122,7 +138,7 @@ def test_a_loss_is_told_once_and_its_lane_starts_again_in_its_next_incarnation()
 
 def test_an_error_of_an_environment_is_raised_once_with_its_traceback() -> None:
     made = order_coordinator(A)
-    made.receive(A, Failure(made.members[A].session, "boom", "its traceback", 0), 0.0)
+    made.receive(A, example(Failure, session=made.members[A].session, error="boom", traceback="its traceback", lane=0), 0.0)
     with pytest.raises(EnvironmentFailed, match=r"^worker a \(host\): boom$") as raised:
         made.raise_failures()
     assert raised.value.detail == "its traceback"
@@ -134,7 +150,7 @@ def test_a_lane_stays_where_it_is_until_all_begin_anew() -> None:
     made = order_coordinator(A)
     assert not made.place(1, patient=True)
     assert made.place(1, patient=False)
-    made.receive(B, Hello(PROTOCOL_VERSION, "b", "host", 1, 1, "fake", 1), 0.0)
+    made.receive(B, example(Hello, worker="b"), 0.0)
     assert made.place(1, patient=False)
     assert [lane.owner for lane in made.lanes] == [A, A]
     assert [peer for peer, message in made.rebalance() if isinstance(message, Release)] == [A]
@@ -144,7 +160,7 @@ def test_a_lane_stays_where_it_is_until_all_begin_anew() -> None:
 def test_in_a_tie_the_first_name_gets_the_next_lane_and_numbers_in_names_count() -> None:
     made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
     for name in ("w10", "w2"):
-        made.receive(name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, 1, "fake", 1), 0.0)
+        made.receive(name.encode(), example(Hello, worker=name), 0.0)
     for lane in range(2):
         assert made.place(lane, patient=False)
     assert [lane.owner for lane in made.lanes] == [b"w2", b"w10"]
@@ -221,7 +237,7 @@ def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
     made = order_coordinator(A)
     made.shared_orders[0] = 7
     session = in_memory(made, 0, 7).session
-    ((_, said),) = made.receive(A, Returned(session, -7, 0, 0, NOTHING, "", ""), 0.0)
+    ((_, said),) = made.receive(A, example(Returned, session=session, ticket=-7, results=NOTHING), 0.0)
     assert isinstance(said, Refuse)
     assert (made.members, made.answers, made.infos) == ({}, {}, {})
 
@@ -230,7 +246,7 @@ def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
 
 
 def beat(made: OrderCoordinator, peer: bytes, now: float, steps: int = 0) -> None:
-    made.receive(peer, Heartbeat(made.members[peer].session, 0, (), (), steps, {}, 0), now)
+    made.receive(peer, example(Heartbeat, session=made.members[peer].session, steps=steps), now)
 
 
 def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
@@ -263,7 +279,7 @@ def test_what_was_lost_on_the_way_is_said_again() -> None:
     session = made.members[A].session
     said: list[list[object]] = []
     for replies, held in ((0, ()), (1, (order_ticket(order),)), (2, ()), (2, ())):
-        outs = made.receive(A, Heartbeat(session, replies, (), held, 0, {}, 0), 1.0)
+        outs = made.receive(A, example(Heartbeat, session=session, replies=replies, tickets=held), 1.0)
         said.append([message for _, message in outs if isinstance(message, Step)])
         (reply,) = (message for _, message in outs if isinstance(message, HeartbeatReply))
         assert reply.received == (Received(0, 0, 0),), "its lanes; it closes any other"
@@ -299,11 +315,30 @@ def test_it_can_be_sent_whatever_workers_report() -> None:
 
 
 def call(session: int, ticket: int, life: LaneIncarnation) -> Order:
-    return Call(session, ticket, life.lane, life.incarnation, (0,), "name", False, NOTHING)
+    return example(
+        Call,
+        session=session,
+        ticket=ticket,
+        lane=life.lane,
+        incarnation=life.incarnation,
+        copies=(0,),
+        name="name",
+        given=NOTHING,
+    )
 
 
 def assign(session: int, ticket: int, life: LaneIncarnation) -> Order:
-    return Call(session, ticket, life.lane, life.incarnation, (0,), "name", True, NOTHING)
+    return example(
+        Call,
+        session=session,
+        ticket=ticket,
+        lane=life.lane,
+        incarnation=life.incarnation,
+        copies=(0,),
+        name="name",
+        assign=True,
+        given=NOTHING,
+    )
 
 
 def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_are_refused() -> None:
@@ -325,7 +360,15 @@ def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_
         return refusal.reason
 
     def returned(packed: np.ndarray[Any, Any], error: str = "") -> Callable[[Order], Answer]:
-        return lambda order: Returned(order.session, order.ticket, order.lane, order.incarnation, packed, error, "")
+        return lambda order: example(
+            Returned,
+            session=order.session,
+            ticket=order.ticket,
+            lane=order.lane,
+            incarnation=order.incarnation,
+            results=packed,
+            error=error,
+        )
 
     assert told(step, returned(results)) == "answer to Step: expected Stepped, got Returned"
     assert told(call, stepped) == "answer to Call: expected Returned, got Stepped"
@@ -339,10 +382,10 @@ def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_
 
 def test_failures_of_spare_workers_are_not_raised() -> None:
     coordinator = order_coordinator(A, B)
-    coordinator.receive(b"spare", Hello(PROTOCOL_VERSION, "spare", "host", 1, 1, "fake", 1), 0.0)
-    coordinator.receive(b"spare", Failure(coordinator.members[b"spare"].session, "boom", "", 0), 0.0)
+    coordinator.receive(b"spare", example(Hello, worker="spare"), 0.0)
+    coordinator.receive(b"spare", example(Failure, session=coordinator.members[b"spare"].session, error="boom", lane=0), 0.0)
     assert coordinator.failures == []
-    coordinator.receive(B, Failure(coordinator.members[B].session, "boom", "", 0), 0.0)
+    coordinator.receive(B, example(Failure, session=coordinator.members[B].session, error="boom", lane=0), 0.0)
     assert [failure.worker for failure in coordinator.failures] == ["b"]
 
 
@@ -351,7 +394,7 @@ def test_whoever_is_waited_for_no_longer_takes_no_other_worker_of_its_name_along
     made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
     peers = [b"a\0tag\0" + key * 64 for key in (b"1", b"2")]
     for lane, peer in enumerate(peers):
-        made.receive(peer, Hello(PROTOCOL_VERSION, "a", "host", 1, lane + 1, "fake", 1), 0.0)
+        made.receive(peer, example(Hello, worker="a", process_nonce=lane + 1), 0.0)
         assert made.place(lane, patient=False)
     slow = made.owner(1)
     assert slow is not None

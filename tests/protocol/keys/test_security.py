@@ -30,7 +30,6 @@ from millrace.protocol.keys.handshake_failures import (
 from millrace.protocol.keys.key_folder import KeyFolder, Keyring
 from millrace.protocol.keys.keys import ClientList, Key, Token
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Collect,
     Heartbeat,
     Hello,
@@ -44,6 +43,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.worker_link import WorkerLink
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 
 DEADLINE_S = 5.0  # within so long both sides must have said what is wrong
@@ -52,7 +52,7 @@ SERVER, LAB, HOME, STRANGER = (Key.new() for _ in range(4))
 
 
 def hello(worker: str = "w0", process_nonce: int = 1) -> Hello:
-    return Hello(PROTOCOL_VERSION, worker, "host", 1, process_nonce, "fake", 1)
+    return example(Hello, worker=worker, process_nonce=process_nonce)
 
 
 def token(client: Key = LAB, server: Key = SERVER) -> Token:
@@ -524,7 +524,7 @@ def test_another_key_cannot_speak_in_a_workers_session_nor_take_it_over(net: Net
     routing_id = peer.rpartition(b"\0")[0]
     lanes = set(member.lanes)
     thief = net.raw(learner, token(HOME), routing_id)
-    for message in (Heartbeat(member.session, 0, (), (), 0, {}, 0), hello(process_nonce=2)):
+    for message in (example(Heartbeat, session=member.session), hello(process_nonce=2)):
         thief.send_multipart(encode(message))
     serve(hub, lambda: len(hub.coordinator.members) == 2)
     assert hub.coordinator.members[peer] is member, "the session was replaced"
@@ -576,7 +576,7 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
         got = list(worker.receive())
         assert {type(message) for message in got} <= {Welcome, Weights, Collect}
         session = next(message.session for message in got if isinstance(message, Welcome))
-        worker.send(encode(Heartbeat(session, 0, (), (), 0, {}, 0)))
+        worker.send(encode(example(Heartbeat, session=session)))
     serve(hub, lambda: all(member.heartbeat is not None for member in hub.coordinator.members.values()))
 
 
@@ -614,7 +614,7 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     assert any(isinstance(message, Refuse) and "was revoked" in message.reason for message in got)
 
     workers[0].send(encode(hello("w0", 9)))  # its connection is still there
-    workers[0].send(encode(Heartbeat(session, 0, (), (), 0, {}, 0)))
+    workers[0].send(encode(example(Heartbeat, session=session)))
     serve(hub, lambda: learner.refused_messages == 2)
     assert len(hub.coordinator.members) == 1
     assert workers[0].poll(DEADLINE_S)

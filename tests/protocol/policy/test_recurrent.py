@@ -33,6 +33,7 @@ from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.envs.toy import Scripted
 from tests.support.in_process.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
@@ -339,6 +340,6 @@ class Watching:
 def test_an_evaluation_begins_each_episode_without_memory() -> None:
     run = run_of(f"{TOY}Scripted-v0", core="gru")
     evaluator = Evaluator(msgspec.structs.replace(run, env=EnvSpec.of(Ragged)), Watching())
-    orders = [Evaluate(1, seed, 0, (seed,), True, 100, False, False) for seed in range(50)]
+    orders = [example(Evaluate, session=1, ticket=seed, seeds=(seed,), greedy=True) for seed in range(50)]
     lengths = [evaluator.play(order, lambda rows: None, no_pulse).episodes[0].length for order in orders]
     assert len(set(lengths)) > 2

@@ -40,6 +40,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
 from millrace.protocol.wire.codec import DTYPES, decode_to_learner, decode_to_worker, encode
 from millrace.protocol.wire.message_sizes import MAX_FRAMES, MAX_HEAD_BYTES
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.examples import examples
 
@@ -253,8 +254,10 @@ def test_hello_and_refuse_are_for_ever_what_they_were() -> None:
         "88a474797065a548656c6c6fa870726f746f636f6c02a6776f726b6572a27730a4686f7374a168a370696407ad70726f6365"
         "73735f6e6f6e63654da8736f667477617265a173a7617474656d707401"
     )
-    assert decode_to_learner([hello]) == Hello(2, "w0", "h", 7, 77, "s", 1)
-    assert msgpack.unpackb(*sent(Hello(2, "w0", "h", 7, 77, "s", 1))) == msgpack.unpackb(hello) | {"evaluates": False}
+    assert decode_to_learner([hello]) == example(Hello, protocol=2, host="h", pid=7, process_nonce=77, software="s")
+    assert msgpack.unpackb(
+        *sent(example(Hello, protocol=2, host="h", pid=7, process_nonce=77, software="s"))
+    ) == msgpack.unpackb(hello) | {"evaluates": False}
     refuse = bytes.fromhex("82a474797065a6526566757365a6726561736f6ea26e6f")
     assert decode_to_worker([refuse]) == Refuse("no")
     assert sent(Refuse("no")) == [refuse]
@@ -452,4 +455,4 @@ def test_what_cannot_be_sent_is_not_sent(array: Any) -> None:
 
 def test_a_head_that_the_other_side_would_refuse_is_not_sent() -> None:
     with pytest.raises(ValueError, match="head expected at most"):
-        encode(Hello(1, "w", "h", 1, 1, "x" * MAX_HEAD_BYTES, 1))
+        encode(example(Hello, protocol=1, worker="w", host="h", software="x" * MAX_HEAD_BYTES))

@@ -26,6 +26,7 @@ from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, Ru
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from millrace.protocol.wire.compression import Packing, has_zstd, pack_stack, unpack_array, unpack_stack
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
+from tests.support.conversation.example_messages import example
 from tests.support.examples import examples
 from tests.support.in_process.collectors import collect, loop_over, random_collector, run_around, run_of
 
@@ -164,12 +165,10 @@ OBS = 1 + Rollout.__struct_fields__.index("obs")
 
 def a_rollout(obs: tuple[npt.NDArray[Any], ...] = (frame_stacks(17, 2, 4, (8, 8)),)) -> Rollout:
     floats, flags = np.zeros((16, 2), np.float32), np.zeros((16, 2), bool)
-    return Rollout(
+    return example(
+        Rollout,
         session=7,
-        lane=0,
         ticket=1,
-        version=0,
-        sequence=0,
         obs=obs,
         action=np.zeros((16, 2), np.int64),
         log_prob=floats,

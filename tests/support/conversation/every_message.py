@@ -1,15 +1,16 @@
 """A good message of each kind that a worker or a learner can send: what tests of every message go through.
 
-Rule: the lists are complete (`tests/protocol/wire/test_link.py`). Who adds a message to the protocol adds its example here.
+Rule: the lists are complete, in the order of the document. A message that is not made here is as small as it may be.
 """
 
 from __future__ import annotations
+
+from typing import Any, get_args
 
 import numpy as np
 
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Alive,
     Call,
     Collect,
@@ -28,10 +29,10 @@ from millrace.protocol.messages import (
     Permit,
     Received,
     Refuse,
-    Rejoin,
     Release,
     Reset,
     Returned,
+    Rollout,
     Step,
     Stepped,
     ToLearner,
@@ -44,6 +45,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.rollout import Episode
 from millrace.protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiBinarySpace, TupleSpace
 from millrace.protocol.wire.plain_values import pack
+from tests.support.conversation.example_messages import example, example_of_session
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 PACKED = np.frombuffer(pack([(0, {"ünï": [1.5, "text"]})]), np.uint8)
@@ -53,35 +55,60 @@ BOXES = DictSpace(("a", "b"), (BOX, TupleSpace((MultiBinarySpace((3,)),))))
 
 def to_learner(session: int, worker: str = "w0", nonce: int = 1) -> list[ToLearner]:
     """What this worker may say in this session."""
-    return [
-        Hello(PROTOCOL_VERSION, worker, "host", 1, nonce, "fake", nonce),
-        fake_rollout(session, 0, 0, 0, 0),
-        Heartbeat(session, 0, (0,), (1, 2), 5, {"act": 0.1}, 0),
-        Goodbye(session, "told to stop", (1,)),
-        Failure(session, "ValueError: ünïcode", "Traceback: …", 0),
-        Stepped(session, 1, 0, 0, (np.ones((2, 4)),), np.ones(2), np.zeros(2, bool), np.ones(2, bool), PACKED),
-        Returned(session, 1, 0, 0, PACKED, "ValueError: ünïcode", "Traceback: …"),
-        Described(session, 1, EnvDescription(BOXES, DiscreteSpace(2, 0, "int64"), PACKED, "{}", 500, "human")),
-        EpisodeRows(session, 1, 0, 0, (np.ones((3, 4)),), np.ones(2), np.ones(2), np.zeros(2, bool), np.ones(2, bool)),
-        Evaluated(session, 1, (Episode(1.5, 2, 0.1),), (False,)),
-        Alive((WorkerActivity(worker, nonce, "stepping", 0.5, 7),), (WorkerExit("w1", 2, "was killed by SIGKILL", True),)),
-    ]
+    of_copies = {
+        "obs": (np.ones((2, 4)),),
+        "reward": np.ones(2),
+        "terminated": np.zeros(2, bool),
+        "truncated": np.ones(2, bool),
+    }
+    description = EnvDescription(BOXES, DiscreteSpace(2, 0, "int64"), PACKED, "{}", 500, "human")
+    said: dict[type, Any] = {
+        Hello: example(Hello, worker=worker, process_nonce=nonce, attempt=nonce),
+        Alive: Alive(
+            (WorkerActivity(worker, nonce, "stepping", 0.5, 7),), (WorkerExit("w1", 2, "was killed by SIGKILL", True),)
+        ),
+        Rollout: fake_rollout(session, 0, 0, 0, 0),
+        Heartbeat: example(Heartbeat, session=session, versions=(0,), tickets=(1, 2), steps=5, stages={"act": 0.1}),
+        Goodbye: Goodbye(session, "told to stop", (1,)),
+        Failure: example(Failure, session=session, error="ValueError: ünïcode", traceback="Traceback: …", lane=0),
+        Described: Described(session, 1, description),
+        EpisodeRows: example(
+            EpisodeRows,
+            session=session,
+            ticket=1,
+            obs=(np.ones((3, 4)),),
+            action=np.ones(2),
+            reward=np.ones(2),
+            terminated=np.zeros(2, bool),
+            truncated=np.ones(2, bool),
+        ),
+        Evaluated: example(Evaluated, session=session, ticket=1, episodes=(Episode(1.5, 2, 0.1),), cut=(False,)),
+        Stepped: example(Stepped, session=session, ticket=1, **of_copies, infos=PACKED),
+        Returned: example(Returned, session=session, ticket=1, results=PACKED, error="ValueError: ünïcode", traceback="…"),
+    }
+    return [said.get(kind) or example_of_session(kind, session) for kind in get_args(ToLearner)]
 
 
 def to_worker(session: int, attempt: int = 1) -> list[ToWorker]:
     """What a learner may say in this session, to the worker that asked for it in this attempt."""
-    return [
-        Welcome(session, attempt, run_spec()),
-        Refuse("no"),
-        Rejoin(session),
-        Describe(session, 1, EnvSpec("Fake-v0")),
-        Weights(5, np.arange(5, dtype=np.float32), np.zeros(0, np.float32)),
-        Collect(session, 0, (Permit(50, 0, 0, 0),), (Received(0, 0, 0, (1,)),), (0,)),
-        Release(session, (LaneIncarnation(0, 0),)),
-        HeartbeatReply(session, 1, (Received(0, 0, 0, ()),)),
-        Drain("finished"),
-        Evaluate(session, 63, 5, (1, 2), True, 100, False, False),
-        Reset(session, 60, 0, 0, (0, 2), (7, None), PACKED),
-        Step(session, 61, 0, 0, (np.ones((3, 2), np.int64),)),
-        Call(session, 62, 0, 0, (1,), "gravity", True, PACKED),
-    ]
+    said: dict[type, Any] = {
+        Welcome: Welcome(session, attempt, run_spec()),
+        Refuse: Refuse("no"),
+        Describe: Describe(session, 1, EnvSpec("Fake-v0")),
+        Weights: Weights(5, np.arange(5, dtype=np.float32), np.zeros(0, np.float32)),
+        Collect: example(
+            Collect,
+            session=session,
+            permits=(example(Permit, ticket=50),),
+            received=(Received(0, 0, 0, (1,)),),
+            keep=(0,),
+        ),
+        Release: Release(session, (LaneIncarnation(0, 0),)),
+        HeartbeatReply: HeartbeatReply(session, 1, (Received(0, 0, 0, ()),)),
+        Drain: Drain("finished"),
+        Evaluate: example(Evaluate, session=session, ticket=63, version=5, seeds=(1, 2), greedy=True),
+        Reset: example(Reset, session=session, ticket=60, copies=(0, 2), seeds=(7, None), options=PACKED),
+        Step: example(Step, session=session, ticket=61, actions=(np.ones((3, 2), np.int64),)),
+        Call: example(Call, session=session, ticket=62, copies=(1,), name="gravity", assign=True, given=PACKED),
+    }
+    return [said.get(kind) or example_of_session(kind, session) for kind in get_args(ToWorker)]

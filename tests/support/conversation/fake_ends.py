@@ -47,6 +47,7 @@ from millrace.workers.conversation.session import (
     WorkerIdentity,
 )
 from millrace.workers.shared_weights import is_of_learner
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.rules import check_tickets
 
 PARAMETERS = np.zeros(1, np.float32)
@@ -63,7 +64,8 @@ def run_spec(lanes: int = 4, **changes: object) -> RunSpec:
 
 def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: int) -> Rollout:
     """One valid transition."""
-    return Rollout(
+    return example(
+        Rollout,
         session=session,
         lane=lane,
         ticket=ticket,
@@ -128,12 +130,13 @@ def fake_evaluated(task: EvaluationTask) -> Evaluated:
     """Result of an evaluator: episodes of two steps whose return names the seed and the version."""
     order = task.order
     episodes = tuple(Episode(seed + task.weights.version / 1000, 2, 0.0) for seed in order.seeds)
-    return Evaluated(order.session, order.ticket, episodes, (False,) * len(episodes))
+    return example(Evaluated, session=order.session, ticket=order.ticket, episodes=episodes, cut=(False,) * len(episodes))
 
 
 def fake_rows(session: int, ticket: int, episode: int, step: int) -> EpisodeRows:
     """One row of an episode of two steps."""
-    return EpisodeRows(
+    return example(
+        EpisodeRows,
         session=session,
         ticket=ticket,
         episode=episode,

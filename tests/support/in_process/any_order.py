@@ -20,13 +20,14 @@ from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.protocol.messages import PROTOCOL_VERSION, Call, Failure, Goodbye, Hello, Order, Refuse, Reset, Step, Welcome
+from millrace.protocol.messages import Call, Failure, Goodbye, Hello, Order, Refuse, Reset, Step, Welcome
 from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.codec import Buffer, decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.shared_memory import InheritedDescriptors, SharedMemory, new_memory
 from millrace.protocol.wire.wake_up import WakePipe
 from millrace.workers.vector_env.stepper import Stepper
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.described import described
 
@@ -61,7 +62,7 @@ class AnyOrder(FakeLink):
     def join(self, name: str) -> None:
         """A worker with this name says Hello."""
         self._nonce += 1
-        self.inbox.append((name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, self._nonce, "fake", 1)))
+        self.inbox.append((name.encode(), example(Hello, worker=name, process_nonce=self._nonce)))
 
     def leave(self, name: str) -> None:
         """The worker of this name is gone, with its env copies."""
@@ -162,7 +163,12 @@ class AnyOrder(FakeLink):
             self._fail(name, error)
 
     def _fail(self, name: str, error: EnvironmentFailed) -> None:
-        self.inbox.append((name.encode(), Failure(self._sessions[name], str(error), "traceback", error.lane)))
+        self.inbox.append(
+            (
+                name.encode(),
+                example(Failure, session=self._sessions[name], error=str(error), traceback="traceback", lane=error.lane),
+            )
+        )
         self._end(name)
 
 

@@ -28,6 +28,7 @@ from millrace.workers.collect.collector import Collector, OpenEnvCopies, open_en
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import LoopedCopies
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 
 TOY = "tests.support.envs.toy:"
 VERSION, SESSION = 7, 3
@@ -89,7 +90,10 @@ def sync_vector_env_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]])
 def evaluated(run: RunSpec, policy: Policy, episodes: int, seed: int) -> list[Episode]:
     """Greedy episodes that an evaluator plays, 20 side by side."""
     evaluator, seeds = Evaluator(run, policy), episode_seeds(seed, episodes)
-    orders = [Evaluate(1, 1, 0, seeds[i : i + 20], True, 10_000, False, False) for i in range(0, episodes, 20)]
+    orders = [
+        example(Evaluate, session=1, ticket=1, seeds=seeds[i : i + 20], greedy=True, most_steps=10_000)
+        for i in range(0, episodes, 20)
+    ]
     played = [episode for order in orders for episode in evaluator.play(order, lambda rows: None, no_pulse).episodes]
     evaluator.close()
     return played

@@ -18,12 +18,13 @@ import pytest
 
 import millrace
 from millrace.protocol.errors import EnvironmentFailed
-from millrace.protocol.messages import PROTOCOL_VERSION, Describe, Described, Hello, Refuse
+from millrace.protocol.messages import Describe, Described, Hello, Refuse
 from millrace.protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescription
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.worker_link import WorkerLink
 from tests.learner.config.test_resume_rules import content
+from tests.support.conversation.example_messages import example
 from tests.support.envs.toy import Countdown
 from tests.system.stage import preloaded
 from tests.system.stage.processes import ROOT, START_S, Stage, crowding, free_port, wait_for
@@ -244,7 +245,7 @@ def test_a_description_that_exceeds_the_bounds_is_refused_and_the_next_is_used(s
     before_mb = learner.memory_mb()
     link = WorkerLink(address, "huge")
     try:
-        link.send(encode(Hello(PROTOCOL_VERSION, "huge", "here", 1, 1, "test", 1)))
+        link.send(encode(example(Hello, worker="huge", host="here", software="test")))
         order = wait_for(lambda: [m for m in link.receive() if isinstance(m, Describe)], START_S, "an order")[0]
         bounds = np.zeros(()), np.ones(())
         huge = BoxSpace((MAX_ELEMENTS, 4096), "float64", *bounds)

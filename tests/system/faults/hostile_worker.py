@@ -18,7 +18,6 @@ import zmq
 
 from millrace.protocol.keys.worker_token import read_token
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Alive,
     Failure,
     Goodbye,
@@ -30,6 +29,7 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.worker_link import WorkerLink
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.extreme_messages import MARK, SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import fake_rollout
 from tests.support.conversation.hostile_messages import real
@@ -61,7 +61,9 @@ class Hostile:
         link, nonce = link or self._link, next(self._nonces)
         deadline_s = time.monotonic() + START_S
         while True:
-            link.send(encode(Hello(PROTOCOL_VERSION, name, "[bold]host", 1, nonce, "fuzz", nonce)))
+            link.send(
+                encode(example(Hello, worker=name, host="[bold]host", process_nonce=nonce, software="fuzz", attempt=nonce))
+            )
             if link.poll(2.0):
                 for message in link.receive():
                     if isinstance(message, Welcome) and message.attempt == nonce:
@@ -95,8 +97,30 @@ class Hostile:
 
 FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
     lambda session: [Goodbye(session, "x" * 1_000, ())],
-    lambda session: [Failure(session, "[/red]boom", f"2026-11-22 05:00:00,000 learner: forged\n{MARK}" * 1_500, 0)],
-    lambda session: [Heartbeat(session, 2**53, (2**53,), tuple(range(60_000)), 2**53, {"step": 1e9}, 2**53)] * 5,
+    lambda session: [
+        example(
+            Failure,
+            session=session,
+            error="[/red]boom",
+            traceback=f"2026-11-22 05:00:00,000 learner: forged\n{MARK}" * 1_500,
+            lane=0,
+        )
+    ],
+    lambda session: (
+        [
+            example(
+                Heartbeat,
+                session=session,
+                replies=2**53,
+                versions=(2**53,),
+                tickets=tuple(range(60_000)),
+                steps=2**53,
+                stages={"step": 1e9},
+                resident_bytes=2**53,
+            )
+        ]
+        * 5
+    ),
     lambda session: [Inquire()] * 20,
     lambda session: [Alive((), ())] * 20,
     lambda session: [fake_rollout(session, n % 2, n, n, n) for n in range(20)],

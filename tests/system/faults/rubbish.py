@@ -11,8 +11,9 @@ import sys
 
 import zmq
 
-from millrace.protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello
+from millrace.protocol.messages import Heartbeat, Hello
 from millrace.protocol.wire.codec import encode
+from tests.support.conversation.example_messages import example
 
 NAME = b"stranger"
 
@@ -30,9 +31,9 @@ def talk_rubbish(host: str, port: int, seed: int, *, connections: int = 100, mes
         stranger.connect(f"tcp://{host}:{port}")
         for number in range(messages):
             stranger.send_multipart([noise.randbytes(noise.randrange(2000)) for _ in range(1 + number % 80)])
-        hello = Hello(PROTOCOL_VERSION, NAME.decode(), "host", 1, 1, "", 1)
+        hello = example(Hello, worker=NAME.decode(), software="")
         stranger.send_multipart([*encode(hello), b"one frame too many"])
-        stranger.send_multipart(encode(Heartbeat(7, 0, (), (), 0, {}, 0)))
+        stranger.send_multipart(encode(example(Heartbeat, session=7)))
         return bool(stranger.poll(10_000))
     except zmq.Again:  # the learner does not let it in, and its queue is full
         return False

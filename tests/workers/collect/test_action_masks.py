@@ -26,6 +26,7 @@ from millrace.workers.collect.collector import Collector, OpenEnvCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
 from tests.support.users_code.mask_envs import SIZES, InInfo, InObservation, Parts
 
@@ -102,7 +103,7 @@ def test_a_vector_environment_gives_the_rows_of_the_loop(name: str, form: str) -
 def test_evaluation_takes_no_illegal_action(name: str, greedy: bool) -> None:
     run = masked_run(name)
     rows: list[Any] = []
-    order = Evaluate(1, 1, 0, (1, 2, 3), greedy, 1000, True, False)
+    order = example(Evaluate, session=1, ticket=1, seeds=(1, 2, 3), greedy=greedy, most_steps=1000, send_rows=True)
     played = Evaluator(run, random_policy(run.policy)).play(order, rows.append, no_pulse)
     assert len(played.episodes) == 3
     assert len(rows[0].obs) == len(run.policy.observation)  # without the mask
@@ -133,14 +134,16 @@ def test_a_wrong_mask_is_one_line_that_names_lane_copy_and_step(fault: str, open
 def test_a_wrong_mask_in_an_evaluation_is_one_line() -> None:
     run = masked_run("InInfo", fault="empty")
     with pytest.raises(EnvironmentFailed, match=r"copy 0, step \d+: action_mask: expected 7 zeros and ones"):
-        Evaluator(run, random_policy(run.policy)).play(Evaluate(1, 1, 0, (1,), True, 99, False, False), print, no_pulse)
+        Evaluator(run, random_policy(run.policy)).play(
+            example(Evaluate, session=1, ticket=1, greedy=True, most_steps=99), print, no_pulse
+        )
 
 
 def test_a_copy_that_was_cut_needs_no_mask_until_it_is_reset() -> None:
     run = masked_run("InInfo")
 
     def figures(evaluator: Evaluator, seeds: tuple[int, ...], most_steps: int) -> list[tuple[float, int]]:
-        order = Evaluate(1, 1, 0, seeds, True, most_steps, False, False)
+        order = example(Evaluate, session=1, ticket=1, seeds=seeds, greedy=True, most_steps=most_steps)
         return [(episode.reward, episode.length) for episode in evaluator.play(order, print, no_pulse).episodes]
 
     used, fresh = (Evaluator(run, random_policy(run.policy)) for _ in range(2))

@@ -22,6 +22,7 @@ from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.episode_facts import facts_of_copies, facts_of_info
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import (
     collect,
     no_pulse,
@@ -37,7 +38,7 @@ RUN = msgspec.structs.replace(run_of(FACTS, T=50, N=3), facts=NAMES)
 
 
 def evaluate_order(run: RunSpec, episodes: int) -> Evaluate:
-    return Evaluate(1, 1, 0, tuple(range(episodes)), True, 1000, False, False)
+    return example(Evaluate, session=1, ticket=1, seeds=tuple(range(episodes)), greedy=True, most_steps=1000)
 
 
 def facts(rollout: Rollout) -> list[tuple[float, ...]]:

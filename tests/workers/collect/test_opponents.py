@@ -28,6 +28,7 @@ from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.opponents import KnownOpponents, Match, Opponent, OtherTeams
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import no_pulse, random_policy
 from tests.support.users_code.seat_envs import AGENTS
 from tests.workers.collect.test_seat_rows import FORMS, seated_run
@@ -251,7 +252,9 @@ def test_an_evaluation_is_played_as_it_is_ordered() -> None:
     policy, weights = random_policy(run.policy), always(0, 0, run.policy)
     policy.load(weights.parameters, weights.buffers)
     evaluator = Evaluator(run, policy)
-    order = Evaluate(1, 1, 0, (5, 6, 7, 8), True, 100, False, False, (1, -1, 1, -1), (0, 1, 2, 0))
+    order = example(
+        Evaluate, session=1, ticket=1, seeds=(5, 6, 7, 8), greedy=True, opponents=(1, -1, 1, -1), teams=(0, 1, 2, 0)
+    )
     answer = evaluator.play(order, lambda rows: None, no_pulse, {1: always(1, 1, run.policy)})
     assert [episode.opponent for episode in answer.episodes] == [1, -1, 1, -1]
     (copies,) = evaluator._copies.values()

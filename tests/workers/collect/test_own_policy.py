@@ -21,6 +21,7 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.copies.env_copies import LoopedCopies
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import bits, collect, no_pulse, run_around, run_of
 from tests.support.users_code.own_policies import ARRAYS, EXTRAS, Broken, Linear
 
@@ -144,7 +145,7 @@ def test_its_state_begins_anew_with_each_episode() -> None:
 
 
 def test_an_evaluation_is_greedy_where_it_can_be() -> None:
-    order = Evaluate(1, 1, 0, (5, 6, 7), True, 500, False, False)
+    order = example(Evaluate, session=1, ticket=1, seeds=(5, 6, 7), greedy=True, most_steps=500)
     greedy, sampled = run_with(), run_with(Sampling)
     played = [Evaluator(run, loaded(run)).play(order, lambda rows: None, no_pulse).episodes for run in (greedy, sampled)]
     assert [each.length for each in played[0]] != [each.length for each in played[1]]

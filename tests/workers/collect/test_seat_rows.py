@@ -27,6 +27,7 @@ from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
 from millrace.workers.collect.collector import Collector
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, evaluated, no_pulse, random_collector, random_policy
 from tests.support.users_code.seat_envs import AGENTS, Lived, RandomCrowd, RandomGame
 
@@ -408,7 +409,11 @@ def test_an_evaluation_that_is_cut_counts_what_waiting_seats_have_got(made: Any)
     for most_steps in (1, 2, 3, 5, 9):
         evaluator, seeds = Evaluator(run, random_policy(run.policy)), episode_seeds(most_steps, 12)
         rows: list[EpisodeRows] = []
-        answer = evaluator.play(Evaluate(1, 1, 0, seeds, True, most_steps, True, False), rows.append, no_pulse)
+        answer = evaluator.play(
+            example(Evaluate, session=1, ticket=1, seeds=seeds, greedy=True, most_steps=most_steps, send_rows=True),
+            rows.append,
+            no_pulse,
+        )
         copies = [env.env.unwrapped for env in evaluator._copies[None].envs]  # type: ignore[attr-defined]
         for n, (episode, env) in enumerate(zip(answer.episodes, copies, strict=True)):
             lived = env.told[-1]

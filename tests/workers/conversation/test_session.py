@@ -14,7 +14,6 @@ import pytest
 
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
     Collect,
     Describe,
     Described,
@@ -64,6 +63,7 @@ from millrace.workers.conversation.session import (
 from millrace.workers.conversation.worker_states import TABLE, WorkerState
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from tests.support.conversation.every_message import to_worker
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_evaluated, fake_rollouts, held_count, run_spec
 
 M = TypeVar("M")
@@ -72,7 +72,7 @@ WHO = WorkerIdentity("w0", "host", 7, 77, "fake 1")
 RUN = run_spec(lanes=4)  # heartbeat_s 1, learner_timeout_s 6
 SESSION = 11
 JOIN_S, REJOIN_S = 60.0, 600.0
-EVALUATE = Evaluate(SESSION, 8, 0, (1, 2), True, 100, False, False)
+EVALUATE = example(Evaluate, session=SESSION, ticket=8, seeds=(1, 2), greedy=True)
 FIRST = WHO.process_nonce + 1  # number of the first attempt to join
 
 
@@ -103,9 +103,12 @@ def collect(
     The lanes named are all that the worker has, unless `received` says more.
     """
     sequences: defaultdict[int, Iterator[int]] = defaultdict(lambda: itertools.count(first))
-    permits = tuple(Permit(ticket, lane, incarnation, next(sequences[lane])) for ticket, lane in tickets)
+    permits = tuple(
+        example(Permit, ticket=ticket, lane=lane, incarnation=incarnation, sequence=next(sequences[lane]))
+        for ticket, lane in tickets
+    )
     theirs = lanes(*sorted(sequences), incarnation=incarnation) if received is None else received
-    return Collect(SESSION, version, permits, theirs, keep)
+    return example(Collect, session=SESSION, version=version, permits=permits, received=theirs, keep=keep)
 
 
 def joining() -> Session:
@@ -148,7 +151,17 @@ def drained(session: Session) -> list[WorkerEffect]:
 
 def stepped(order: Reset) -> Stepped:
     flag, nothing = np.zeros(1, bool), np.zeros(0, np.uint8)
-    return Stepped(SESSION, order.ticket, order.lane, order.incarnation, (), np.zeros(1), flag, flag, nothing)
+    return example(
+        Stepped,
+        session=SESSION,
+        ticket=order.ticket,
+        lane=order.lane,
+        incarnation=order.incarnation,
+        reward=np.zeros(1),
+        terminated=flag,
+        truncated=flag,
+        infos=nothing,
+    )
 
 
 def hello_attempt(effects: Sequence[WorkerEffect]) -> int:
@@ -161,7 +174,7 @@ def hello_attempt(effects: Sequence[WorkerEffect]) -> int:
 
 def test_hello_has_the_identity_and_the_protocol_version() -> None:
     (hello,) = sent(joining().tick(0.0), Hello)
-    assert hello == Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "fake 1", FIRST)
+    assert hello == example(Hello, pid=7, process_nonce=77, software="fake 1", attempt=FIRST)
 
 
 def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
@@ -422,7 +435,8 @@ def test_the_oldest_order_of_all_lanes_is_executed_first() -> None:
     session = joining()
     session.handle(Welcome(SESSION, FIRST, StepSpec((EnvSpec("Any-v0"),), (0, 1), (1, 1), (), ())), 0.0)
     later, earlier = (
-        Reset(SESSION, ticket, lane, 0, (0,), (None,), np.zeros(0, np.uint8)) for lane, ticket in ((0, 7), (1, 6))
+        example(Reset, session=SESSION, ticket=ticket, lane=lane, copies=(0,), seeds=(None,), options=np.zeros(0, np.uint8))
+        for lane, ticket in ((0, 7), (1, 6))
     )
     session.handle(later, 0.1)
     session.handle(earlier, 0.1)
@@ -433,7 +447,10 @@ def test_the_oldest_order_of_all_lanes_is_executed_first() -> None:
 def test_only_the_newest_order_of_a_lane_counts() -> None:
     session = joining()
     session.handle(Welcome(SESSION, FIRST, StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ())), 0.0)
-    earlier, later = (Reset(SESSION, ticket, 0, 0, (0,), (None,), np.zeros(0, np.uint8)) for ticket in (6, 7))
+    earlier, later = (
+        example(Reset, session=SESSION, ticket=ticket, copies=(0,), seeds=(None,), options=np.zeros(0, np.uint8))
+        for ticket in (6, 7)
+    )
     for order in (earlier, later, earlier):
         assert session.handle(order, 0.1) == []
     assert session.next_work() == later
@@ -450,7 +467,7 @@ def test_only_the_newest_order_of_a_lane_counts() -> None:
 @pytest.mark.parametrize(
     ("run", "order"),
     [
-        (RUN, Step(SESSION, 3, 0, 0, ())),
+        (RUN, example(Step, session=SESSION, ticket=3)),
         (StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ()), collect((0, 0))),
         (StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ()), EVALUATE),
     ],
@@ -581,7 +598,9 @@ def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     session.update_statistics(Statistics(120, {"step": 0.5}, 0))
     assert session.tick(0.9) == []
     (heartbeat,) = sent(session.tick(1.0), Heartbeat)
-    assert heartbeat == Heartbeat(SESSION, 4, (0,), (7, 8), 120, {"step": 0.5}, 0)
+    assert heartbeat == example(
+        Heartbeat, session=SESSION, replies=4, versions=(0,), tickets=(7, 8), steps=120, stages={"step": 0.5}
+    )
     assert session.due_s == 2.0
 
 
@@ -745,7 +764,10 @@ def test_a_late_copy_of_a_message_closes_no_lane_that_came_after_it(copy: ToWork
 
 
 def test_a_late_copy_of_an_order_opens_its_released_lane_until_the_next_reply() -> None:
-    lane, order = LaneIncarnation(0, 0), Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8))
+    lane, order = (
+        LaneIncarnation(0, 0),
+        example(Reset, session=SESSION, ticket=60, copies=(0,), seeds=(None,), options=np.zeros(0, np.uint8)),
+    )
     session = joining()
     session.handle(Welcome(SESSION, FIRST, StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ())), 0.0)
     session.handle(order, 0.1)
@@ -958,7 +980,7 @@ def test_a_failure_is_reported_with_its_traceback_and_leaves_with_exit_code_1() 
     task_of(session)
     effects = session.fail("ValueError: bad action", "Traceback: …", 3)
     assert effects == [
-        SendMessage(Failure(SESSION, "ValueError: bad action", "Traceback: …", 3)),
+        SendMessage(example(Failure, session=SESSION, error="ValueError: bad action", traceback="Traceback: …", lane=3)),
         Leave(1, "ValueError: bad action"),
     ]
 
@@ -967,7 +989,9 @@ def test_a_failure_of_the_users_policy_says_so() -> None:
     session = ready(collect((0, 3)))
     task_of(session)
     sent, _ = session.fail("policy Mine: act raised KeyError", "Traceback: …", None, of_policy=True)
-    assert sent == SendMessage(Failure(SESSION, "policy Mine: act raised KeyError", "Traceback: …", None, True))
+    assert sent == SendMessage(
+        example(Failure, session=SESSION, error="policy Mine: act raised KeyError", traceback="Traceback: …", of_policy=True)
+    )
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from millrace.workers.copy_slots import close_described
 from millrace.workers.described_copy import describe
 from millrace.workers.evaluate.evaluator import open_looped_copies
 from millrace.workers.vector_env.stepper import Stepper
+from tests.support.conversation.example_messages import example
 from tests.support.envs.toy import Countdown
 from tests.support.in_process.collectors import no_pulse, run_of
 from tests.support.in_process.described import step_spec
@@ -146,7 +147,12 @@ def test_copies_of_a_vector_environment(settings: dict[str, Any], made: list[Any
     stepper = Stepper(spec)
     for lane, copies in enumerate(spec.lanes):
         options = np.frombuffer(pack(None), np.uint8)
-        stepper.execute(Reset(1, 1, lane, 0, tuple(range(copies)), (1,) * copies, options), no_pulse)
+        stepper.execute(
+            example(
+                Reset, session=1, ticket=1, lane=lane, copies=tuple(range(copies)), seeds=(1,) * copies, options=options
+            ),
+            no_pulse,
+        )
     assert [(copy.number, copy.lane, copy.copy, copy.evaluation) for copy in Asks.made] == made
     assert [copy.slot for copy in Asks.made] == list(range(len(made)))
     stepper.lanes.close_all()

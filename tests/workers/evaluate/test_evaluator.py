@@ -22,6 +22,7 @@ from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate import episode_rows
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import no_pulse, random_policy, run_of
 
 Array = np.ndarray[Any, Any]
@@ -96,7 +97,16 @@ def echo_run(**kwargs: Any) -> RunSpec:
 
 
 def order(*seeds: int, most_steps: int = 1_000, greedy: bool = True, **settings: bool) -> Evaluate:
-    return Evaluate(3, 70, 0, seeds, greedy, most_steps, settings.get("rows", False), settings.get("frames", False))
+    return example(
+        Evaluate,
+        session=3,
+        ticket=70,
+        seeds=seeds,
+        greedy=greedy,
+        most_steps=most_steps,
+        send_rows=settings.get("rows", False),
+        send_frames=settings.get("frames", False),
+    )
 
 
 def play(evaluator: Evaluator, asked: Evaluate) -> Evaluated:

@@ -15,6 +15,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import EpisodeRows, Evaluate
 from millrace.protocol.rollout import Episode
 from millrace.workers.evaluate.evaluator import Evaluator
+from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy, run_of
 
 
@@ -76,7 +77,7 @@ def test_an_evaluation_plays_it_alike(most_steps: int) -> None:
     played = []
     for run in (ALONE, SEATED):
         rows: list[EpisodeRows] = []
-        order = Evaluate(1, 1, 0, (3, 4, 5), False, most_steps, True, False)
+        order = example(Evaluate, session=1, ticket=1, seeds=(3, 4, 5), most_steps=most_steps, send_rows=True)
         answer = Evaluator(run, random_policy(run.policy)).play(order, rows.append, no_pulse)
         told = [(each.episode, each.reward.tolist(), each.obs[0].ravel().tolist(), each.truncated.tolist()) for each in rows]
         played.append((figures(answer.episodes), answer.cut, told))

@@ -21,6 +21,7 @@ from millrace.protocol.messages import Call, Reset, Returned, Step, Stepped
 from millrace.protocol.wire.plain_values import pack, unpack
 from millrace.workers.copies.env_loop import EnvLoop
 from millrace.workers.vector_env.stepper import Stepper
+from tests.support.conversation.example_messages import example
 from tests.support.envs.toy import Countdown
 from tests.support.in_process.described import step_spec
 from tests.support.numbers.bit_equality import bit_equal
@@ -28,7 +29,9 @@ from tests.support.numbers.bit_equality import bit_equal
 
 def call(stepper: Stepper, name: str, arguments: Any, *, assign: bool = False) -> Returned:
     packed = np.frombuffer(pack(arguments), np.uint8)
-    answer = stepper.execute(Call(1, 1, 0, 0, (0, 1), name, assign, packed), lambda: None)
+    answer = stepper.execute(
+        example(Call, session=1, ticket=1, copies=(0, 1), name=name, assign=assign, given=packed), lambda: None
+    )
     assert isinstance(answer, Returned)
     return answer
 
@@ -90,9 +93,16 @@ class Changes(Countdown):
 def stepped(env: Callable[[], Any], steps: int) -> list[Stepped]:
     """The answers of two copies in a vector environment to `steps` steps."""
     stepper = Stepper(step_spec(VectorEnvSettings(env, 2, lanes=1)))
-    answers = [stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)]
+    answers = [
+        stepper.execute(
+            example(Reset, session=1, ticket=1, copies=(0, 1), seeds=(0, 1), options=np.frombuffer(pack(None), np.uint8)),
+            lambda: None,
+        )
+    ]
     actions = (np.zeros(2, np.int64),)
-    answers += [stepper.execute(Step(1, t, 0, 0, actions), lambda: None) for t in range(2, 2 + steps)]
+    answers += [
+        stepper.execute(example(Step, session=1, ticket=t, actions=actions), lambda: None) for t in range(2, 2 + steps)
+    ]
     return [answer for answer in answers if isinstance(answer, Stepped)]
 
 
@@ -152,11 +162,14 @@ class Halves(Countdown):
 
 def test_an_environment_may_change_its_action() -> None:
     stepper = Stepper(step_spec(VectorEnvSettings(Halves, 2, lanes=1)))
-    stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)
+    stepper.execute(
+        example(Reset, session=1, ticket=1, copies=(0, 1), seeds=(0, 1), options=np.frombuffer(pack(None), np.uint8)),
+        lambda: None,
+    )
     actions = np.ones((2, 2), np.float32)
     actions.flags.writeable = False  # as that of a message
     for t in (2, 3):
-        answer = stepper.execute(Step(1, t, 0, 0, (actions,)), lambda: None)
+        answer = stepper.execute(example(Step, session=1, ticket=t, actions=(actions,)), lambda: None)
         assert isinstance(answer, Stepped)
         assert answer.reward.tolist() == [0.5, 0.5]
     stepper.lanes.close_all()
@@ -231,9 +244,14 @@ class OnlyWhileOpen(Countdown):
 def test_a_lane_that_is_released_during_a_step_is_closed_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("millrace.workers.copies.env_loop.PULSE_S", -1.0)  # a pulse after each copy
     stepper, envs = Stepper(step_spec(VectorEnvSettings(OnlyWhileOpen, 2, lanes=1))), list[OnlyWhileOpen]()
-    stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)
+    stepper.execute(
+        example(Reset, session=1, ticket=1, copies=(0, 1), seeds=(0, 1), options=np.frombuffer(pack(None), np.uint8)),
+        lambda: None,
+    )
     envs += [cast(OnlyWhileOpen, env.unwrapped) for env in stepper.lanes[0]._loop.envs]
-    answer = stepper.execute(Step(1, 2, 0, 0, (np.zeros(2, np.int64),)), lambda: stepper.lanes.close([0]))
+    answer = stepper.execute(
+        example(Step, session=1, ticket=2, actions=(np.zeros(2, np.int64),)), lambda: stepper.lanes.close([0])
+    )
     assert isinstance(answer, Stepped)
     assert answer.reward.tolist() == [1.0, 1.0]
     assert [env.open for env in envs] == [False, False]
@@ -245,7 +263,7 @@ def test_a_lane_that_is_released_while_its_copies_are_made_is_closed_after_the_o
     closed: list[EnvLoop] = []
     monkeypatch.setattr(EnvLoop, "close", lambda loop: closed.append(loop))
     stepper = Stepper(step_spec(VectorEnvSettings(Countdown, 2, lanes=1)))
-    reset = Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8))
+    reset = example(Reset, session=1, ticket=1, copies=(0, 1), seeds=(0, 1), options=np.frombuffer(pack(None), np.uint8))
     answer = stepper.execute(reset, lambda: stepper.lanes.close([0]) if not closed else None)
     assert isinstance(answer, Stepped)
     assert len(closed) == 1
