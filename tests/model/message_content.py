@@ -1,38 +1,33 @@
 """Messages as plain tuples, which a state of the model can hold, and back.
 
-Rule: only what the two halves read is kept. A rollout is one valid transition.
+Rule: only what the two halves read is kept: numbers, flags, and records of these. What is kept follows from the types of the
+fields, and which numbers are names from the names of the fields (`NAMED`); so a new field of a message is in the model.
+Texts, arrays, seconds by stage and descriptions of an environment are always the same. A rollout is one valid transition.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar, get_args
 
+import msgspec
+import msgspec.inspect as mi
 import numpy as np
 
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.messages import (
-    PROTOCOL_VERSION,
-    Collect,
     Describe,
     Described,
     EpisodeRows,
     Evaluate,
     Evaluated,
-    Heartbeat,
-    HeartbeatReply,
     Hello,
-    LaneIncarnation,
-    Permit,
-    Received,
-    Refuse,
-    Rejoin,
-    Release,
     Rollout,
     ToLearner,
     ToWorker,
     Weights,
-    Welcome,
 )
 from millrace.protocol.rollout import Episode
 from millrace.protocol.space_spec import DiscreteSpace, EnvDescription
@@ -41,7 +36,10 @@ from millrace.protocol.wire.plain_values import pack
 from tests.model.conversation import Content
 from tests.model.names import FIRST_OF, Kind, Name, name
 from tests.model.settings import TICK_S, TIMEOUT_S
+from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
+
+T = TypeVar("T")
 
 ENV = EnvSpec("Fake-v0")
 WAIT = WaitSpec(heartbeat_s=TICK_S, learner_timeout_s=TIMEOUT_S)
@@ -73,107 +71,138 @@ def incarnation(lane: int, number: int) -> Name:
     return name(Kind.INCARNATION, number, lane)
 
 
-@cache
-def rollout(session: int, lane: int, ticket: int, version: int, sequence: int) -> Rollout:
-    return fake_rollout(session, lane, ticket, version, sequence)
+# -------------------------------------------------------------------- fields
+
+Read = Callable[[Any, Any, int], Any]
+"""Takes a field's value, its record, and the number of the worker that sends or receives it. Returns its content."""
+
+NAMED: Mapping[str, Read] = {
+    "session": lambda value, record, worker: session(value),
+    "ticket": lambda value, record, worker: ticket(value),
+    "tickets": lambda value, record, worker: tuple(ticket(each) for each in sorted(value)),
+    "incarnation": lambda value, record, worker: incarnation(record.lane, value),
+    "replies": lambda value, record, worker: name(Kind.REPLIES, value, record.session),
+    "number": lambda value, record, worker: name(Kind.REPLIES, value, record.session),
+    "process_nonce": lambda value, record, worker: name(Kind.NONCE, value, worker),
+    "attempt": lambda value, record, worker: name(Kind.ATTEMPT, value, worker),
+    "received": lambda value, record, worker: tuple(sorted(fields_of(each, worker) for each in value)),
+    "out_of_order": lambda value, record, worker: tuple(sorted(value)),
+    "run": lambda value, record, worker: isinstance(value, WaitSpec),
+}
+"""Fields whose numbers are names, whose order does not matter, or which say only whether the run is known."""
+KINDS: Mapping[str, type] = {kind.__name__: kind for kind in (*get_args(ToLearner), *get_args(ToWorker))}
+ROLLOUT = fake_rollout(0, 0, 0, 0, 0)
+WEIGHTS = Weights(0, PARAMETERS, BUFFERS)
+OTHERS: Mapping[type, Callable[[int, Mapping[str, Any]], Any]] = {
+    Hello: lambda worker, kept: example(Hello, worker=f"w{worker}", software="model"),
+    Rollout: lambda worker, kept: ROLLOUT,
+    EpisodeRows: lambda worker, kept: fake_rows(0, 0, 0, kept["first_step"]),
+    Weights: lambda worker, kept: WEIGHTS,
+    Describe: lambda worker, kept: Describe(0, 0, ENV),
+    Described: lambda worker, kept: Described(0, 0, DESCRIPTION),
+}
+"""Messages with the fields that are not kept; those of other kinds are as small as they may be."""
+
+
+def _plain(value: Any, record: Any, worker: int) -> Any:
+    return value
+
+
+def _records(value: Any, record: Any, worker: int) -> Any:
+    return tuple(fields_of(each, worker) for each in value)
+
+
+def _is_kept(kind: mi.Type) -> bool:
+    """Whether values of this type are numbers, flags, or records of these."""
+    match kind:
+        case mi.IntType() | mi.BoolType() | mi.FloatType() | mi.NoneType():
+            return True
+        case mi.UnionType(types=types):
+            return all(map(_is_kept, types))
+        case mi.VarTupleType(item_type=inner):
+            return _is_kept(inner)
+        case mi.StructType(fields=fields):
+            return all(_is_kept(field.type) for field in fields)
+    return False
 
 
 @cache
-def weights(version: int) -> Weights:
-    return Weights(version, PARAMETERS, BUFFERS)
+def _kept(kind: Any) -> dict[str, Read]:
+    """The fields of a record that are kept, in their order."""
+    if dataclasses.is_dataclass(kind):
+        return {field.name: NAMED.get(field.name, _plain) for field in dataclasses.fields(kind)}
+    record = mi.type_info(kind)
+    assert isinstance(record, mi.StructType)
+    found: dict[str, Read] = {}
+    for field in record.fields:
+        if field.name in NAMED:
+            found[field.name] = NAMED[field.name]
+        elif _is_kept(field.type):
+            holds_records = isinstance(field.type, mi.VarTupleType) and isinstance(field.type.item_type, mi.StructType)
+            found[field.name] = _records if holds_records else _plain
+    return found
 
 
-def hello(worker: int, nonce: int, attempt: int, *, evaluates: bool = False) -> Hello:
-    return Hello(
-        protocol=PROTOCOL_VERSION,
-        worker=f"w{worker}",
-        host="host",
-        pid=1,
-        process_nonce=nonce,
-        software="model",
-        attempt=attempt,
-        evaluates=evaluates,
-    )
+@cache
+def _inner(kind: type) -> dict[str, type]:
+    """The records in the fields of a message, by field."""
+    record = mi.type_info(kind)
+    assert isinstance(record, mi.StructType)
+    inner = {field.name: field.type.item_type for field in record.fields if isinstance(field.type, mi.VarTupleType)}
+    return {field: of.cls for field, of in inner.items() if isinstance(of, mi.StructType) and _is_kept(of)}
+
+
+def fields_of(record: Any, worker: int = 0) -> Content:
+    """What is kept of a record: the contents of its fields, in their order."""
+    kind: Any = type(record)
+    return tuple([read(getattr(record, field), record, worker) for field, read in _kept(kind).items()])
+
+
+def record_of(kind: type[T], content: Content) -> T:
+    """The record with these fields, of which all are kept."""
+    fields: Any = kind
+    return kind(**dict(zip(_kept(fields), map(_value, content), strict=True)))
+
+
+def _value(content: Any) -> Any:
+    """Numbers in place of their names."""
+    if isinstance(content, Name):
+        return content.value
+    return tuple(map(_value, content)) if isinstance(content, tuple) else content
+
+
+# -------------------------------------------------------------------- messages
 
 
 def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
     """`worker`: the number of the worker that sends or receives it."""
-    match message:
-        case Hello():
-            attempt = name(Kind.ATTEMPT, message.attempt, worker)
-            return "Hello", name(Kind.NONCE, message.process_nonce, worker), attempt, message.evaluates
-        case Heartbeat(number, replies, versions, tickets):
-            held = tuple(ticket(each) for each in sorted(tickets))
-            return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), versions, held, message.waits
-        case Rollout():
-            return "Rollout", *rollout_content(message)
-        case Welcome(number, attempt, run):
-            return "Welcome", session(number), name(Kind.ATTEMPT, attempt, worker), isinstance(run, WaitSpec)
-        case Describe(number, each):
-            return "Describe", session(number), ticket(each)
-        case Described(number, each):
-            return "Described", session(number), ticket(each)
-        case Refuse():
-            return ("Refuse",)
-        case Rejoin(number):
-            return "Rejoin", session(number)
-        case Weights(version):
-            return "Weights", version
-        case Collect(number, version, permits, received, keep):
-            permitted = tuple(
-                (ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation), p.sequence, p.opponent) for p in permits
-            )
-            return "Collect", session(number), version, permitted, _received(received), keep
-        case Release(number, lanes):
-            return "Release", session(number), tuple((each.lane, incarnation(each.lane, each.incarnation)) for each in lanes)
-        case HeartbeatReply(number, replies, received):
-            return "HeartbeatReply", session(number), name(Kind.REPLIES, replies, number), _received(received)
-        case Evaluate(number, each, version, seeds, _, _, with_rows):
-            return "Evaluate", session(number), ticket(each), version, seeds, with_rows, message.keep
-        case EpisodeRows(number, each, episode, step):
-            return "EpisodeRows", session(number), ticket(each), episode, step
-        case Evaluated(number, each, episodes):
-            return "Evaluated", session(number), ticket(each), tuple(episode.reward for episode in episodes)
-        case _:
-            raise AssertionError(f"the model has no {type(message).__name__}")
+    return type(message).__name__, *fields_of(message, worker)
 
 
 def message_of(content: Content, worker: int, run: WaitSpec | RunSpec | StepSpec) -> Any:
-    """The message of this content, from or to this worker."""
-    match content:
-        case "Hello", nonce, attempt, evaluates:
-            return hello(worker, nonce.value, attempt.value, evaluates=evaluates)
-        case "Heartbeat", number, replies, versions, tickets, waits:
-            held = tuple(each.value for each in tickets)
-            return Heartbeat(number.value, replies.value, versions, held, 0, {}, 0, waits=waits)
-        case "Rollout", *fields:
-            return rollout_of(tuple(fields))
-        case "Welcome", number, attempt, waits:
-            return Welcome(number.value, attempt.value, WAIT if waits else run)
-        case "Describe", number, each:
-            return Describe(number.value, each.value, ENV)
-        case "Described", number, each:
-            return described(number.value, each.value)
-        case ("Refuse",):
-            return Refuse("refused")
-        case "Rejoin", number:
-            return Rejoin(number.value)
-        case "Weights", version:
-            return weights(version)
-        case "Collect", number, version, permits, received, keep:
-            allowed = tuple(Permit(each.value, lane, inc.value, *more) for each, lane, inc, *more in permits)
-            return Collect(number.value, version, allowed, _received_of(received), keep)
-        case "Release", number, lanes:
-            return Release(number.value, tuple(LaneIncarnation(lane, inc.value) for lane, inc in lanes))
-        case "HeartbeatReply", number, replies, received:
-            return HeartbeatReply(number.value, replies.value, _received_of(received))
-        case "Evaluate", number, each, version, seeds, with_rows, keep:
-            return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False, keep=keep)
-        case "EpisodeRows", number, each, episode, step:
-            return fake_rows(number.value, each.value, episode, step)
-        case "Evaluated", number, each, returns:
-            return evaluated(number.value, each.value, returns)
-    raise AssertionError(content)
+    """The message of this content, from or to this worker. `run`: what a Welcome brings that does not let a worker wait."""
+    kind, inner = KINDS[content[0]], _inner(KINDS[content[0]])
+    kept: dict[str, Any] = {}
+    for field, value in zip(_kept(kind), content[1:], strict=True):
+        if field == "run":
+            kept[field] = WAIT if value else run
+        elif field in inner:
+            kept[field] = tuple(record_of(inner[field], each) for each in value)
+        else:
+            kept[field] = _value(value)
+    if kind in OTHERS:
+        return msgspec.structs.replace(OTHERS[kind](worker, kept), **kept)
+    return example(kind, **kept)
+
+
+@cache
+def weights(version: int) -> Weights:
+    return msgspec.structs.replace(WEIGHTS, version=version)
+
+
+def hello(worker: int, nonce: int, attempt: int, *, evaluates: bool = False) -> Hello:
+    """The Hello of this attempt of a process."""
+    return example(Hello, worker=f"w{worker}", process_nonce=nonce, software="model", attempt=attempt, evaluates=evaluates)
 
 
 def described(number: int, of_ticket: int) -> Described:
@@ -184,22 +213,19 @@ def described(number: int, of_ticket: int) -> Described:
 def evaluated(number: int, of_ticket: int, returns: tuple[float, ...]) -> Evaluated:
     """An answer with episodes of these returns."""
     episodes = tuple(Episode(each, EPISODE_STEPS, 0.0) for each in returns)
-    return Evaluated(number, of_ticket, episodes, (False,) * len(episodes))
+    return example(Evaluated, session=number, ticket=of_ticket, episodes=episodes, cut=(False,) * len(episodes))
 
 
 def rollout_content(message: Rollout) -> Content:
-    return session(message.session), message.lane, ticket(message.ticket), message.version, message.sequence
+    return fields_of(message)
 
 
+@cache
 def rollout_of(content: Content) -> Rollout:
-    number, lane, of_ticket, version, sequence = content
-    return rollout(number.value, lane, of_ticket.value, version, sequence)
+    rollout: Rollout = message_of(("Rollout", *content), 0, WAIT)
+    return rollout
 
 
-def _received(received: tuple[Received, ...]) -> Content:
-    lanes = sorted(received, key=lambda each: each.lane)
-    return tuple((r.lane, incarnation(r.lane, r.incarnation), r.next_sequence, tuple(sorted(r.out_of_order))) for r in lanes)
-
-
-def _received_of(content: Content) -> tuple[Received, ...]:
-    return tuple(Received(lane, number.value, following, out) for lane, number, following, out in content)
+def order_content(order: Evaluate) -> Content:
+    """An order to evaluate, without the weights that it lists, which matter when it comes."""
+    return content_of(msgspec.structs.replace(order, keep=()), 0)

@@ -25,7 +25,17 @@ from millrace.workers.conversation.session import (
 )
 from tests.model import process_part
 from tests.model.conversation import Content
-from tests.model.message_content import described, incarnation, rollout_content, rollout_of, session, ticket, weights
+from tests.model.message_content import (
+    described,
+    fields_of,
+    incarnation,
+    record_of,
+    rollout_content,
+    rollout_of,
+    session,
+    ticket,
+    weights,
+)
 from tests.model.process_part import Process
 from tests.model.settings import Settings
 from tests.support.conversation.fake_ends import fake_evaluated, fake_rollouts, held_count
@@ -168,7 +178,7 @@ def saved(worker: Worker, now: float) -> Content:
         more = lanes, tuple(sorted(held.weights))
     work = None
     if isinstance(task, RolloutTask):
-        work = session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments)
+        work = session(task.session), task.weights.version, tuple(map(fields_of, task.assignments))
     return process_part.saved(worker, now, more, work)
 
 
@@ -196,11 +206,6 @@ def _lane(number: int, lane: RolloutLane) -> Content:
     return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept
 
 
-def _work(assignment: Assignment) -> Content:
-    number = incarnation(assignment.lane, assignment.incarnation)
-    return ticket(assignment.ticket), assignment.lane, number, assignment.sequence, assignment.opponent
-
-
 W = TypeVar("W", bound=Worker)
 
 
@@ -217,6 +222,6 @@ def loaded(content: Content, number: int, settings: Settings, kind: type[W]) -> 
         here.asked = {each.value: Permitted(*permitted) for each, *permitted in tickets}
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
     if work is not None:
-        assignments = tuple(Assignment(each.value, lane, inc.value, *more) for each, lane, inc, *more in work[2])
+        assignments = tuple(record_of(Assignment, each) for each in work[2])
         worker.task = RolloutTask(work[0].value, weights(work[1]), assignments, {})
     return worker

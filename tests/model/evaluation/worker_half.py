@@ -15,7 +15,7 @@ from millrace.protocol.rules import Rule
 from millrace.workers.conversation.session import EvaluationTask, RolloutTask
 from tests.model import worker_part
 from tests.model.conversation import Content
-from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
+from tests.model.message_content import EPISODE_STEPS, content_of, message_of, order_content, session, ticket, weights
 from tests.model.worker_part import Worker
 from tests.support.conversation.fake_ends import fake_rows
 
@@ -90,7 +90,7 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
     if worker.session is None:
         return content, None, None
     held = worker.session._current.evaluations
-    orders = tuple(_order_content(order) for _, order in sorted(held.asked.items()))
+    orders = tuple(order_content(order) for _, order in sorted(held.asked.items()))
     answers = tuple(content_of(answer, worker.number) for answer in held.answered.values())
     played = tuple(
         (session(number), ticket(each)) for number, each in sorted(worker.played) if number == worker.session.session
@@ -98,7 +98,7 @@ def saved(worker: EvaluatingWorker, now: float) -> Content:
     task = worker.task
     if not isinstance(task, EvaluationTask):
         return content, (orders, answers, played), None
-    return content, (orders, answers, played), (task.weights.version, _order_content(task.order))
+    return content, (orders, answers, played), (task.weights.version, order_content(task.order))
 
 
 def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWorker:
@@ -109,21 +109,11 @@ def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWor
         return worker
     orders, answers, played = held
     evaluations = worker.session._current.evaluations
-    evaluations.asked = {order.ticket: order for order in map(_order, orders)}
-    evaluations.answered = {
-        each.value: evaluated(of_session.value, each.value, returns) for _, of_session, each, returns in answers
-    }
-    worker.played = {(number.value, each.value) for number, each in played}
+    for order in (message_of(each, number, settings.run) for each in orders):
+        evaluations.asked[order.ticket] = order
+    for answer in (message_of(each, number, settings.run) for each in answers):
+        evaluations.answered[answer.ticket] = answer
+    worker.played = {(of_session.value, each.value) for of_session, each in played}
     if running is not None:
-        worker.task = EvaluationTask(weights(running[0]), _order(running[1]), {})
+        worker.task = EvaluationTask(weights(running[0]), message_of(running[1], number, settings.run), {})
     return worker
-
-
-def _order_content(order: Evaluate) -> Content:
-    """Without the weights that it lists, which matter when it comes."""
-    return session(order.session), ticket(order.ticket), order.version, order.seeds, order.send_rows
-
-
-def _order(content: Content) -> Evaluate:
-    number, each, version, seeds, with_rows = content
-    return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False)
