@@ -42,10 +42,7 @@ TOLD_TO_STOP = "told to stop"
 
 
 class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
-    """May I join? Repeated with backoff until it is answered.
-
-    (rule HELLO_AGAIN)
-    """
+    """May I join? Repeated with backoff until it is answered."""
 
     protocol: Natural
     worker: Name

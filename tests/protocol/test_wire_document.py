@@ -10,8 +10,9 @@ import inspect
 import re
 import textwrap
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -36,12 +37,14 @@ from millrace.protocol.messages import (
     ToWorker,
     Weights,
 )
+from millrace.protocol.rules import in_document
 from millrace.protocol.wire import codec, message_sizes, socket_options
 from millrace.protocol.wire import compression as packing
 from millrace.workers.conversation import held, session, worker_states
 from tests.support.conversation.example_messages import example
 
-DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
+ROOT = Path(__file__).parents[2]
+DOCUMENT = ROOT / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
 
 # Records that travel inside messages, in the order in which a reader meets them.
@@ -128,35 +131,12 @@ WORDS: Mapping[str, str] = {
     "reward": "raw rewards",
     "render_mode": "gymnasium's render mode; empty if none",
 }
-# Where the document says when a message is sent, and what follows.
-STEPS, COLLECTS, REPAIRS = "Environment profile", "Collector profile", "The heartbeat repairs"
-OF_WORKER, OF_LEARNER, SHARED = "The worker's half", "The learner's half", "Weights once for each machine"
-PROSE: Mapping[type, tuple[str, ...]] = {
-    Hello: ("Transport", OF_WORKER),
-    messages.Alive: ("What a worker does in a session", SHARED),
-    messages.Described: ("Describe",),
-    messages.Describe: ("Describe", REPAIRS),
-    Rollout: (COLLECTS, "Packed arrays"),
-    messages.Heartbeat: (OF_WORKER, REPAIRS),
-    messages.Goodbye: (OF_WORKER,),
-    messages.Failure: (OF_WORKER,),
-    messages.EpisodeRows: (COLLECTS,),
-    messages.Evaluated: (COLLECTS,),
-    messages.Stepped: (STEPS,),
-    messages.Returned: (STEPS,),
-    messages.Welcome: ("What a worker does in a session", "Describe", OF_LEARNER),
-    messages.Refuse: (OF_WORKER,),
-    messages.Rejoin: (OF_WORKER, OF_LEARNER),
-    Weights: (COLLECTS, "The ticket law", SHARED),
-    Collect: (OF_WORKER, "The ticket law"),
-    messages.Release: (STEPS, OF_WORKER),
-    messages.Evaluate: (COLLECTS,),
-    messages.HeartbeatReply: (OF_WORKER, REPAIRS, SHARED),
-    messages.Drain: (OF_WORKER,),
-    messages.Reset: (STEPS,),
-    messages.Step: (STEPS,),
-    messages.Call: (STEPS,),
+VERSION_IN = {
+    "clients/cpp/include/millrace/messages.hpp": r"(?<=PROTOCOL_VERSION = )\d+",
+    "clients/js/millrace.js": r"(?<=PROTOCOL_VERSION = )\d+",
+    "docs/how-to/write_a_client.md": r"(?<=\"protocol\": )\d+",
 }
+"""Where else the number of the protocol stands. A client that has it must pass its tests."""
 # What each limit bounds. A new MAX_* constant without a line here fails a test.
 LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (message_sizes, "MAX_FRAMES"): "frames of a message, the head included",
@@ -269,16 +249,35 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
     return msgspec.json.encode(made).decode()
 
 
-def links(sections: tuple[str, ...]) -> str:
+@cache
+def written_sections() -> dict[str, str]:
+    """What is written by hand below each heading of the document that has no generated part."""
+    text = DOCUMENT.read_text(encoding="utf-8")
+    by_hand = re.sub(r"<!-- generated (.+?):.*?<!-- end of \1 -->", "", text, flags=re.DOTALL)
+    _, *parts = re.split(r"^#+ (.+)$", by_hand, flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def told_in(kind: type) -> list[str]:
+    """The sections with rules that name this message; if there are none, those that name it."""
+    message, written = re.compile(rf"`{kind.__name__}(?:\.\w+)?`"), written_sections()
+    ruled = {words.section for words in in_document().values() if message.search(words.text)} - {"Words"}
+    return [section for section in written if section in ruled] or [
+        section for section, text in written.items() if message.search(text)
+    ]
+
+
+def links(sections: Iterable[str]) -> str:
     """Links to these headings of the document."""
     anchor = {section: re.sub(r"[^a-z0-9 -]", "", section.lower()).replace(" ", "-") for section in sections}
-    return " and ".join(f"[{section}](#{anchor[section]})" for section in sections)
+    *others, last = [f"[{section}](#{anchor[section]})" for section in sections]
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def record(kind: type[msgspec.Struct]) -> str:
     """A heading, what the class says of itself, and its fields: with their places, if they go by position."""
     config = kind.__struct_config__
-    told = f" See {links(PROSE[kind])}." if kind in PROSE else ""
+    told = f" See {links(told_in(kind))}." if is_message(kind) else ""
     says = marked(inspect.getdoc(kind) or "")
     if "<!--" in says and told:
         says += "<!-- rule -->"
@@ -452,9 +451,17 @@ def test_every_message_and_field_says_what_it_means(kind: type) -> None:
 
 
 @pytest.mark.parametrize("kind", [*ToLearner.__args__, *ToWorker.__args__], ids=lambda kind: kind.__name__)
-def test_every_message_points_to_the_text_about_it(kind: type) -> None:
-    text = DOCUMENT.read_text(encoding="utf-8")
-    assert all(re.search(rf"^##+ {re.escape(section)}$", text, re.MULTILINE) for section in PROSE[kind])
+def test_every_message_is_explained_in_a_section_that_is_written_by_hand(kind: type) -> None:
+    assert told_in(kind), f"say in protocol/README.md when a {kind.__name__} is sent, and what follows"
+
+
+def test_a_message_points_to_the_rules_that_name_it() -> None:
+    assert told_in(Collect) == ["The worker's half", "The ticket law", "The heartbeat repairs"]
+
+
+@pytest.mark.parametrize("path", VERSION_IN)
+def test_clients_and_pages_have_the_number_of_the_protocol(path: str) -> None:
+    assert re.findall(VERSION_IN[path], (ROOT / path).read_text(encoding="utf-8")) == [str(PROTOCOL_VERSION)]
 
 
 def test_no_type_is_written_in_python() -> None:
@@ -538,3 +545,6 @@ def test_from_the_document_alone_a_head_can_be_read(kind: type[msgspec.Struct]) 
 
 if __name__ == "__main__":
     DOCUMENT.write_text(rewritten(DOCUMENT.read_text(encoding="utf-8")), encoding="utf-8")
+    for path, number in VERSION_IN.items():
+        page = ROOT / path
+        page.write_text(re.sub(number, str(PROTOCOL_VERSION), page.read_text(encoding="utf-8")), encoding="utf-8")
