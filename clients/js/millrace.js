@@ -13,9 +13,8 @@ import { readToken, routingId } from "./token.js";
 export { box, discrete, UsageError };
 
 const PROTOCOL_VERSION = 11;
-const FIELDS = { // how many fields each message of the learner has
-  Welcome: 3, Rejoin: 1, Describe: 5, Weights: 4, Collect: 4, Release: 2, Evaluate: 10, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5,
-  Call: 8,
+const FIELDS = { // how many fields each message of the learner has, of those that the environment profile knows
+  Welcome: 3, Rejoin: 1, Describe: 5, Weights: 4, Release: 2, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
 };
 const OF_ANY_SESSION = ["Welcome", "Refuse", "Drain", "Weights"];
 const OBEYED = { // the table of the wire document: what is not ignored in each state
