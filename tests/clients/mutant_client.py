@@ -37,6 +37,7 @@ from millrace.protocol.messages import (
     Rejoin,
     Release,
     Reset,
+    Returned,
     Rollout,
     Step,
     Stepped,
@@ -111,6 +112,18 @@ class Mutant(WorkerLink):
                 return [replace(message, tickets=tuple(sorted(self.tickets)))]
             case "leaves without Goodbye", Goodbye():
                 return []
+            case "speaks another protocol", Hello():
+                return [replace(message, protocol=message.protocol + 1)]
+            case "two results for one copy", Returned():
+                return [replace(message, results=np.frombuffer(pack([1, 2]), np.uint8), error="")]
+            case "goes on after Goodbye", Goodbye():
+                return [message, message]
+            case "observes what is no number", Stepped():
+                return [replace(message, obs=tuple(np.full_like(leaf, np.nan) for leaf in message.obs))]
+            case "rewards a reset", Stepped():
+                return [replace(message, reward=np.ones_like(message.reward))]
+            case "wrong ticket", Rollout():
+                return [replace(message, ticket=message.ticket + 1000)]
             case "wrong ticket", Stepped():
                 return [replace(message, ticket=message.ticket - 1)]
             case "wrong incarnation", Stepped():
@@ -311,6 +324,8 @@ class Mutant(WorkerLink):
                 self.drains = True
             case "no autoreset", Welcome(_, _, StepSpec() as run):
                 return [replace(message, run=replace(run, autoreset="SameStep"))]
+            case "ignores Drain while it joins", Drain() if not self.session:
+                return []
             case "no drain", Drain():
                 return []
             case "drains after the next Collect", Drain():

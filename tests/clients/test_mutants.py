@@ -145,6 +145,13 @@ MUTANTS = [
     Mutant("forgets who is reset first", "collector", "keeps the row format", Rule.FIRST_RESETS, "False", GAME),
     Mutant("wrong episode return", "collector", "keeps the row format", Rule.EPISODES, "", CROWD),
     Mutant("wrong log-probabilities", "collector", "collects rollouts", Rule.LOG_PROB, "-", GAME),
+    Mutant("speaks another protocol", "environment", "says Hello first", Rule.PROTOCOL, "protocol"),
+    Mutant("two results for one copy", "environment", "answers a Call", Rule.RETURNED, "[1, 2]"),
+    Mutant("goes on after Goodbye", "environment", "says Goodbye after Drain", Rule.AFTER_GOODBYE, "Goodbye("),
+    Mutant("observes what is no number", "environment", "answers Reset and Step", Rule.IN_SPACE, "nan"),
+    Mutant("rewards a reset", "environment", "answers Reset and Step", Rule.AFTER_RESET, "Stepped("),
+    Mutant("wrong ticket", "collector", "collects rollouts of a lane", Rule.TICKETS, "Rollout("),
+    Mutant("ignores Drain while it joins", "environment", "when Drain answers its Hello", Rule.DRAIN_JOINING, ""),
 ]
 
 

@@ -48,19 +48,13 @@ WITHOUT_INVARIANT_OR_CHECK = {
 """Rules that neither an invariant of the model nor a check of clients names."""
 WITHOUT_MISTAKE = {
     Rule.ROUTING_ID,
-    Rule.TICKETS,
     Rule.DECLINED,
-    Rule.IN_SPACE,
-    Rule.RETURNED,
-    Rule.AFTER_RESET,
     Rule.EVALUATIONS_FIRST,
-    Rule.DRAIN_JOINING,
     Rule.JOINING_IGNORES,
     Rule.HELD_ALREADY,
     Rule.LATE_REPLY,
     Rule.IGNORE_UNREADABLE,
     Rule.CONNECTION,
-    Rule.AFTER_GOODBYE,
     Rule.UNKNOWN_SESSION,
     Rule.HELLO_WHILE_DRAINING,
     Rule.OTHER_PROTOCOL,
@@ -70,7 +64,6 @@ WITHOUT_MISTAKE = {
     Rule.SHARED_WEIGHTS,
     Rule.SHARED_OF_LEARNER,
     Rule.DRAIN_AGAIN,
-    Rule.PROTOCOL,
 }
 """Rules that no mutation of the model and no mutant of a client breaks."""
 
