@@ -1,6 +1,7 @@
 """The conversation before a run: workers wait for it, and describe environments. Pure: messages and `now` in, messages out.
 
-Rule: one worker describes, the first that joined; the others wait. Each time that a worker is lost that was asked, or that
+Rule: one worker describes, the first that joined; the others wait. A worker that has not answered an order comes last when
+the next environment is described: it may hang. Each time that a worker is lost that was asked, or that
 no answer has come for long, twice as many are asked at once: one bad machine delays the start by one try, and an
 environment that fails everywhere is found out as fast as all workers together can.
 
@@ -75,8 +76,6 @@ class DescribeCoordinator(Coordinator[Member]):
         self._unknown = unknown
         self._at_once = 1
         self._tickets += 1
-        for member in self.members.values():
-            member.tickets.clear()
         return self._deal()
 
     def ask_more(self) -> list[Outgoing]:
@@ -92,7 +91,7 @@ class DescribeCoordinator(Coordinator[Member]):
     # ---------------------------------------------------------------- inside
 
     def _removed(self, member: Member, why: str) -> None:
-        if member.tickets:
+        if self._tickets in member.tickets:
             self._double()
 
     def _double(self) -> None:
@@ -101,10 +100,10 @@ class DescribeCoordinator(Coordinator[Member]):
     def _deal(self) -> list[Outgoing]:
         if self._unknown is None or self.described is not None:
             return []
-        active = sorted(self.membership.active(), key=_may_have_lanes_first)
-        asked = sum(bool(member.tickets) for member in active)
-        free = [member for member in active if not member.tickets]
-        return [self._order(member) for member in free[: max(0, self._at_once - asked)]]
+        asked = [member for member in self.membership.active() if self._tickets in member.tickets]
+        others = [member for member in self.membership.active() if self._tickets not in member.tickets]
+        others.sort(key=_free_first)
+        return [self._order(member) for member in others[: max(0, self._at_once - len(asked))]]
 
     def _order(self, member: Member) -> Outgoing:
         unknown = self._unknown
@@ -113,7 +112,9 @@ class DescribeCoordinator(Coordinator[Member]):
         return member.peer, Describe(member.session, self._tickets, unknown.env, unknown.vector, unknown.render_mode)
 
     def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        return [self._order(member)] if lost else []
+        for ticket in lost:
+            del member.tickets[ticket]  # it is free again, if this was the order of an earlier environment
+        return [self._order(member)] if self._tickets in lost and self.described is None else []
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
         """The answer to what a member sent in its session."""
@@ -130,7 +131,9 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def _take_description(self, member: Member, message: Described) -> list[Outgoing]:
         if member.tickets.pop(message.ticket, None) is None:
-            return []  # of an earlier environment, or it has come before
+            return []  # it has come before
+        if message.ticket != self._tickets:
+            return []  # of an earlier environment
         if self.described is not None or self._unknown is None:
             return []
         try:
@@ -160,6 +163,8 @@ class DescribeCoordinator(Coordinator[Member]):
         return refusal
 
 
-def _may_have_lanes_first(member: Member) -> tuple[bool, int]:
-    """Sort key: the copy that is described is of use to a worker that gets the first lane."""
-    return member.hello.evaluates, member.join_number
+def _free_first(member: Member) -> tuple[bool, bool, int]:
+    """Sort key: who is not busy with an earlier order, and of these the one that gets the first lane, for it can use the
+    copy that it describes.
+    """
+    return bool(member.tickets), member.hello.evaluates, member.join_number

@@ -1,8 +1,9 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
 Rule: every lane has an owner as long as there are workers, and no worker has two lanes more than another. Workers that only
-evaluate have none. A lane moves only between its rollouts. Placement is computed again only after an event that can change
-it: with a thousand workers, to look at all of them at each rollout would cost more than the rollout.
+evaluate have none, and those that still describe an environment have none yet. A lane moves only between its rollouts.
+Placement is computed again only after an event that can change it: with a thousand workers, to look at all of them at each
+rollout would cost more than the rollout.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ class LanePlacement(Generic[L]):
         if not self._unplaced and len({lane.owner for lane in self._lanes}) == len(self._lanes):
             self._stop_waiting()
             return []  # every lane has a worker of its own: nothing moves, however many spares there are
-        members = sorted((each for each in active if not each.hello.evaluates), key=lambda member: member.join_number)
+        may_have_lanes = (each for each in active if not (each.hello.evaluates or each.describes))
+        members = sorted(may_have_lanes, key=lambda member: member.join_number)
         if members:
             self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
         return self.even_out(members)

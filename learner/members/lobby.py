@@ -82,7 +82,7 @@ class Lobby:
         """
         coordinator = self._coordinator
         server = self._server
-        settings = self._settings
+        stall_timeout_s = self._settings.stall_timeout_s
         members = coordinator.members
         began_s = self._clock()
         wait = LongWait(began_s)
@@ -90,16 +90,13 @@ class Lobby:
         while coordinator.described is None:
             server.listen(POLL_S)
             check_interrupt()
-            self._failures.check()
-            if coordinator.unsuitable is not None:
-                raise coordinator.unsuitable
+            self._check()
             now = self._clock()
-            server.check_members(settings.no_workers_timeout_s)
             # In environment code, a worker is ended by the timeouts of the calls, which name themselves.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
-            if now - max(began_s, busy_s) > settings.stall_timeout_s and members:
+            if now - max(began_s, busy_s) > stall_timeout_s and members:
                 told = server.what_workers_do()
-                raise Stalled(f"no description of the environment within {settings.stall_timeout_s:.0f} s; {told}")
+                raise Stalled(f"no description of the environment within {stall_timeout_s:.0f} s; {told}")
             if wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), server.what_workers_do())
                 server.send(coordinator.ask_more())
@@ -117,11 +114,19 @@ class Lobby:
         """Nothing is to be done when a message was sent."""
 
     def listen(self) -> None:
-        """Answer the workers, while the learner prepares the run."""
+        """Answer the workers, while the learner prepares the run. Raises as `describe` does if none can take part in it."""
         self._server.listen(0.0)
+        self._check()
 
     def hand_over(self) -> Membership[Member]:
         """The run begins. Returns the workers that wait for it: its hub takes them over."""
-        self.listen()  # so that it takes over nobody whose process has ended, or whose key was revoked meanwhile
+        self._server.listen(0.0)  # so that it takes over nobody whose process has ended, or whose key was revoked meanwhile
         self._server.close()
         return self._coordinator.membership
+
+    def _check(self) -> None:
+        """Raise what ends the start: too many failures, an environment that does not suit, or no worker."""
+        self._failures.check()
+        if self._coordinator.unsuitable is not None:
+            raise self._coordinator.unsuitable
+        self._server.check_members(self._settings.no_workers_timeout_s)

@@ -84,6 +84,9 @@ class Member:
     """Number of heartbeat replies that were sent."""
     welcomed: int = 0
     """`replies` when the run was sent to it."""
+    describes: bool = False
+    """Whether it may still be busy with a description that it was asked for before the run: it has not begun the run, as
+    far as is known."""
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
@@ -160,6 +163,11 @@ class Member:
             self.speed = self.speed.after(heartbeat.steps, self.heard_s)
         held = set(heartbeat.tickets)
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
+
+    def begins(self, heartbeat: Heartbeat) -> None:
+        """Note if this heartbeat shows that a worker which had to describe an environment has begun the run."""
+        if not heartbeat.waits:
+            self.describes = False
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
         """The late actions since the last heartbeat. Those before this session belong to an earlier one.

@@ -3,7 +3,8 @@
 Rule: what is kept of a worker ends with its session, beside totals and a limited number of refusals. The number of
 members is limited.
 
-Rule: the workers that have joined before there is a run keep their sessions when it begins (`take_over`).
+Rule: the workers that have joined before there is a run keep their sessions when it begins (`take_over`). One that was
+asked for a description and has not answered gets no work before it has begun the run: it may hang.
 
 Rule: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
 or of another process under the same name, ends the session before it. A process that lost its name in this way may join
@@ -115,7 +116,7 @@ class Membership(Generic[M]):
 
     def active(self) -> list[M]:
         """The members that are given work, in the order in which they joined."""
-        return [member for member in self.members.values() if member.state is MemberState.ACTIVE]
+        return [each for each in self.members.values() if each.state is MemberState.ACTIVE and not each.describes]
 
     def collectors(self) -> list[M]:
         """The members that may have lanes."""
@@ -218,6 +219,7 @@ class Membership(Generic[M]):
         for peer, waited in waiting.members.items():
             member = self._member_class(**vars(waited))
             member.heard_s = member.joined_s = now
+            member.describes = bool(waited.tickets)
             member.tickets = {}
             self.members[peer] = member
             self._of_process[member.hello.worker, member.hello.process_nonce] = member
@@ -327,7 +329,9 @@ class Membership(Generic[M]):
         """Ask every member to leave; nobody can join any more."""
         self.draining = reason
         out: list[Outgoing] = []
-        for member in self.active():
+        for member in self.members.values():
+            if member.state is not MemberState.ACTIVE:
+                continue
             member.state = TABLE[member.state][Drain]
             out.append((member.peer, Drain(one_line(reason))))
         return out

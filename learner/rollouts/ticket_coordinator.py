@@ -238,7 +238,11 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         if note and note not in self._notes and len(self._notes) < MOST_NOTES:
             self._notes.add(note)
             self.events.append(EnvironmentNoted(member.hello.worker, note))
-        return super()._heartbeat(member, heartbeat)
+        described = member.describes
+        out = super()._heartbeat(member, heartbeat)
+        if described and not member.describes:
+            self._placement.joined()  # it may have lanes from now on
+        return out
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         out = self.weights.again(member, heartbeat)

@@ -44,7 +44,7 @@ SAVED: dict[type, set[str]] = {
     WeightsHeld: {"by_worker"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
-    | {"strikes", "takeovers", "welcomed"},
+    | {"strikes", "takeovers", "welcomed", "describes"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order"},
     Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent"},

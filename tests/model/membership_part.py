@@ -45,6 +45,7 @@ def _member(member: Member, now: float) -> Content:
         replies(member.replies),
         replies(member.welcomed),
         member.takeovers,
+        member.describes,
         member.strikes if isinstance(member, CollectingMember) else None,
     )
 
@@ -54,10 +55,11 @@ def load(membership: Membership[M], content: Content, kind: type[M]) -> None:
     members, _, none_silent, refused = content
     for join_number, fields in enumerate(members):
         worker, nonce, attempt, evaluates, number, heard, lanes, tickets, *more = fields
-        replies, welcomed, takeovers, strikes = more
+        replies, welcomed, takeovers, describes, strikes = more
         said = hello(worker.value, nonce.value, attempt.value, evaluates=evaluates)
         member = kind(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
+        member.describes = describes
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
         member.replies, member.welcomed, member.takeovers = replies.value, welcomed.value, takeovers
         if isinstance(member, CollectingMember):

@@ -31,6 +31,7 @@ from millrace.protocol.messages import (
     Collect,
     Describe,
     Described,
+    Drain,
     Failure,
     Goodbye,
     Heartbeat,
@@ -89,9 +90,8 @@ def join(made: DescribeCoordinator, name: bytes, nonce: int = 1) -> int:
 
 
 def order(made: DescribeCoordinator, name: bytes) -> int:
-    """The ticket of the order that this worker was sent."""
-    (ticket,) = made.members[name].tickets
-    return ticket
+    """The ticket of the newest order that this worker was sent."""
+    return max(made.members[name].tickets)
 
 
 def describes(
@@ -191,6 +191,54 @@ def test_of_two_environments_each_is_described_once_and_a_late_answer_is_not_of_
     assert made.described is not None
 
 
+def test_the_next_environment_is_not_asked_of_a_worker_that_hangs_in_the_one_before() -> None:
+    made = coordinator()
+    one, two = join(made, A), join(made, B)
+    made.ask_more()
+    late = order(made, A)
+    made.receive(B, Described(two, late, DESCRIPTION), 1.0)
+    ((peer, asked),) = made.ask(Unknown(ENV))
+    assert (peer, asked) == (B, Describe(two, order(made, B), ENV))
+    made.receive(A, Described(one, late, DESCRIPTION), 2.0)
+    ((peer, _),) = made.ask(Unknown(ENV))
+    assert peer == A, "it has answered, and joined first"
+
+
+def test_a_worker_whose_order_of_an_earlier_environment_was_lost_is_free() -> None:
+    made = coordinator()
+    one, two = join(made, A), join(made, B)
+    made.ask_more()
+    ticket = order(made, A)
+    made.receive(B, Described(two, ticket, DESCRIPTION), 1.0)
+    assert [type(message) for _, message in made.receive(A, beat(one, 1), 2.0)] == [HeartbeatReply]
+    ((peer, _),) = made.ask(Unknown(ENV))
+    assert peer == A
+
+
+def test_a_worker_that_describes_when_the_run_begins_gets_lanes_once_it_has_begun_the_run() -> None:
+    made = coordinator()
+    one, two = join(made, A), join(made, B)
+    made.ask_more()
+    made.receive(B, Described(two, order(made, B), DESCRIPTION), 1.0)
+    run = TicketCoordinator(run_spec(lanes=2), max_lag=0, worker_timeout_s=5, first_session=10)
+    run.take_over(made.membership, 2.0)
+    run.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    assert {peer for peer, _ in run.begin_update()} == {B}
+    run.receive(A, beat(one, 0), 3.0)
+    assert run.members[B].lanes == {0, 1}
+    run.receive(A, msgspec.structs.replace(beat(one, 0), waits=False), 4.0)
+    assert not run.members[A].describes
+    assert any(lane.moving for lane in run.rollouts.lanes), "one of the two moves after its rollout"
+
+
+def test_a_worker_that_still_describes_is_asked_to_leave_as_others_are() -> None:
+    made = coordinator()
+    join(made, A)
+    run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
+    run.take_over(made.membership, 2.0)
+    assert run.drain("the run is over") == [(A, Drain("the run is over"))]
+
+
 def test_the_run_begins_in_the_sessions_of_those_that_wait_for_it() -> None:
     made = coordinator(decliners_to_end=0)
     refused = made.receive(A, Goodbye(join(made, A), "no such environment", ()), 1.0)
@@ -213,6 +261,7 @@ def test_the_welcome_that_brings_the_run_is_sent_again_if_a_heartbeat_shows_that
     made = coordinator()
     session = join(made, A)
     made.receive(A, beat(session, 0), 1.0)
+    made.receive(A, Described(session, order(made, A), DESCRIPTION), 1.0)
     run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
     run.take_over(made.membership, 2.0)
     run.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
@@ -390,6 +439,12 @@ def saying(link: FakeLink, *messages: Callable[[int], ToLearner], name: bytes = 
     link.inbox.append((name, hello(name, nonce)))
 
 
+def failure_of(lobby: Lobby) -> Failure:
+    """A failure of its only member."""
+    (session,) = (member.session for member in lobby._coordinator.members.values())
+    return Failure(session, "OSError: no display", "", None)
+
+
 def test_the_lobby_returns_the_description_and_answers_the_workers_until_the_run_begins() -> None:
     link = FakeLink()
     saying(link, lambda session: Described(session, FIRST_TICKET + 1, DESCRIPTION))
@@ -400,6 +455,33 @@ def test_the_lobby_returns_the_description_and_answers_the_workers_until_the_run
     lobby.listen()
     assert decode_to_worker([bytes(frame) for frame in link.sent[-1]]) == HeartbeatReply(session, 1, ())
     assert lobby.hand_over().members.keys() == {A}
+
+
+def test_a_start_whose_workers_all_die_after_the_description_ends_at_once() -> None:
+    """The learner imports PyTorch meanwhile, and answers them."""
+    link = FakeLink()
+    left = [1.0]
+    saying(link, lambda session: Described(session, FIRST_TICKET + 1, DESCRIPTION))
+    ended = WorkerExit("w0", 1, "was killed by signal 9", failed=True)
+    processes = FakeProcesses(of_ended=lambda: [] if left[0] else [ended], of_left=lambda collecting: left[0], expected=1)
+    _, lobby = shell(link, processes=processes)
+    lobby.listen()
+    left[0] = 0.0
+    line = "no worker is left, and none will be started again: the last one was killed by signal 9"
+    with pytest.raises(NoWorkers, match=f"^{line}$"):
+        lobby.listen()
+
+
+def test_one_failure_too_many_after_the_description_ends_the_start() -> None:
+    link = FakeLink()
+    saying(link, lambda session: Described(session, FIRST_TICKET + 1, DESCRIPTION))
+    _, lobby = shell(link)
+    link.send = lambda peer, frames: True  # type: ignore[method-assign, assignment]
+    link.inbox += [(A, failure_of(lobby)), (A, hello(A, 2))]
+    lobby.listen()
+    link.inbox.append((A, failure_of(lobby)))
+    with pytest.raises(EnvironmentFailed, match="OSError: no display; failure 2 in a row"):
+        lobby.listen()
 
 
 def test_one_failure_too_many_ends_the_start() -> None:

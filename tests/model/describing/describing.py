@@ -16,7 +16,10 @@ from tests.model.training import Training, now_at
 
 @dataclass(frozen=True)
 class Describing(Training):
-    """A training run that begins with a description."""
+    """A training run that begins with a description, or with several, one after another."""
+
+    environments: int = 1
+    """how many environments are described: that of the run is the last"""
 
     def start(self) -> tuple[Content, list[Content]]:
         workers = [worker_half.DescribingWorker(self, number, 0) for number in range(self.workers)]
@@ -40,10 +43,11 @@ class Describing(Training):
         if isinstance(content[0], str):
             return Facts()
         if len(content) == 2:  # the learner
-            return learner_half.facts(content) if content[1] is None else super().facts(content[1])
+            return learner_half.facts(content, self) if content[1] is None else super().facts(content[1])
         training, _, describes = content
         facts = super().facts(training)
-        return facts._replace(working=facts.working or describes)
+        return facts._replace(working=facts.working or describes is not None)
 
     def __str__(self) -> str:
-        return f"{super().__str__()}, after a description"
+        after = "a description" if self.environments == 1 else f"{self.environments} descriptions"
+        return f"{super().__str__()}, after {after}"

@@ -10,20 +10,38 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from millrace.protocol.rules import Rule
-from tests.model.mutations import HELD, MEMBERSHIP, SESSION, Mutation, play
+from tests.model.mutations import HELD, MEMBERSHIP, PLACEMENT, SESSION, Mutation, play
 
 if TYPE_CHECKING:
     from tests.model.conversation import Conversation
 
 COORDINATOR = "millrace.learner.members.describe_coordinator"
+MEMBER = "millrace.learner.members.member"
 
 MUTATIONS = {
-    "all workers describe": Mutation(Rule.ONE_DESCRIBES, COORDINATOR, "in free[: max(0, self._at_once - asked)]", "in free"),
+    "all workers describe": Mutation(
+        Rule.ONE_DESCRIBES, COORDINATOR, "in others[: max(0, self._at_once - len(asked))]", "in others"
+    ),
+    "the next environment is described by who hangs": Mutation(
+        Rule.ONE_DESCRIBES, COORDINATOR, "return bool(member.tickets), member.hello", "return False, member.hello"
+    ),
+    "lanes go to workers that still describe": Mutation(
+        Rule.BEGINS, PLACEMENT, "each.hello.evaluates or each.describes", "each.hello.evaluates"
+    ),
+    "who describes is forgotten when the run begins": Mutation(
+        Rule.BEGINS, MEMBERSHIP, "member.describes = bool(waited.tickets)", "member.describes = False"
+    ),
+    "a worker that has described never gets lanes": Mutation(
+        Rule.BEGINS, MEMBER, "            self.describes = False\n", "            pass\n"
+    ),
     "a worker that is asked counts as free": Mutation(
         Rule.ONE_DESCRIBES, COORDINATOR, "member.tickets[self._tickets] = member.replies\n", "pass\n"
     ),
     "a lost order to describe is not sent again": Mutation(
-        Rule.ORDER_AGAIN, COORDINATOR, "return [self._order(member)] if lost else []", "return []"
+        Rule.ORDER_AGAIN,
+        COORDINATOR,
+        "return [self._order(member)] if self._tickets in lost and self.described is None else []",
+        "return []",
     ),
     "a description is not taken": Mutation(Rule.FIRST_DESCRIPTION, COORDINATOR, "self.described = described\n", "pass\n"),
     "nobody is asked in place of a lost worker": Mutation(
@@ -69,6 +87,7 @@ def runs() -> list[Conversation]:
         Describing(workers=2, lanes=1, updates=1, faults=0),
         Describing(workers=1, lanes=1, updates=1, faults=1),
         Describing(workers=2, lanes=1, updates=1, faults=1),
+        Describing(workers=2, lanes=1, updates=1, faults=1, environments=2),
         Describing(workers=1, lanes=1, updates=1, faults=2),
     ]
 

@@ -84,7 +84,7 @@ MUTATIONS = {
         Rule.FORGETS, SESSION, "return self.state not in goes_on or work.session != self.session", "return False"
     ),
     "a worker that only evaluates gets a lane": Mutation(
-        Rule.EVALUATES, PLACEMENT, "(each for each in active if not each.hello.evaluates)", "active"
+        Rule.EVALUATES, PLACEMENT, "if not (each.hello.evaluates or each.describes)", "if not each.describes"
     ),
     "all play an evaluation beside training": Mutation(
         None, TICKETS, "if member.hello.evaluates or not self.beside]", "if True]"
