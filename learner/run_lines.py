@@ -68,10 +68,17 @@ class RunLine(NamedTuple):
         return self.state == "training" and not (self.progress.updates or self.progress.env_steps_made)
 
     @property
+    def has_numbers(self) -> bool:
+        """Whether anything says how far it is. A power failure may cost the file that does."""
+        return not self.begins and (self.summary is not None or self.progress.at_s > 0.0)
+
+    @property
     def done(self) -> str:
         """How much of it is done, or why it ended before."""
         if self.begins:
             return "before its first update"
+        if not self.has_numbers:
+            return "–"
         if self.summary is not None and (reason := self.summary.stop_reason) != self.state:
             return "100%" if reason == ALL_STEPS_DONE else one_line(reason, MOST_REASON)
         sign = last_sign(self.progress) if self.state == "dead" else ""
@@ -151,8 +158,8 @@ def in_sentences(line: RunLine) -> str:
     """The last state of a run that nobody trains, as lines for a terminal."""
     progress = line.progress
     done = f"{steps_in_words(progress)} env steps in {duration(progress.wall_s)}"
-    score = f"return {return_in_words(progress.return_mean)}"
-    lines = [headline(line), f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}: {done}, {score}"]
+    figures = f": {done}, return {return_in_words(progress.return_mean)}" if line.has_numbers else ""
+    lines = [headline(line), f"{line.env}, {algorithm_label(line.algo)}, seed {line.seed}{figures}"]
     if line.summary is not None and line.summary.evaluation is not None:
         lines.append(one_line(f"greedy {line.summary.evaluation}"))
     return "\n".join(lines)

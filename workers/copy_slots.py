@@ -4,7 +4,8 @@ Rule: a copy holds its slot from before it is made until after it was closed, so
 its constructor raises, it may have started something: then the slot is free when the process and its children have ended.
 
 Rule: a copy that was described, and has done nothing else, is the next one that its thread makes, if that would be the same.
-If not, it is closed first. So a worker never has a copy more than it needs.
+If not, it is closed first. A worker closes it, too, if it has made none for `UNUSED_S` of a run: it may be spare. So no
+worker has a copy for long that it does not need.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, m
 from millrace.protocol.errors import UsageError
 from millrace.workers.activity import CLOSING, activity
 from millrace.workers.machine_slots import slots
+
+UNUSED_S = 60.0  # since the run began: more workers may have to join before the first order comes
 
 _slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
 Made = TypeVar("Made")

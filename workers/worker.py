@@ -9,6 +9,7 @@ In a vector environment, where one step may take as long as the caller allows, a
 from __future__ import annotations
 
 import logging
+import math
 import os
 import platform
 import socket
@@ -49,7 +50,7 @@ from millrace.workers.conversation.session import (
     WorkerIdentity,
 )
 from millrace.workers.conversation.worker_states import WorkerState
-from millrace.workers.copy_slots import close_described
+from millrace.workers.copy_slots import UNUSED_S, close_described
 from millrace.workers.described_copy import describe
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import NoSlot, slots
@@ -121,6 +122,7 @@ class Worker:
         if self._options.shared_weights is not None:
             link.watch(self._options.shared_weights.wake_fd)
         self._pulse_due_s = 0.0
+        self._unused_from_s = math.inf  # from then on the copy that was described is not kept
         self._resident_bytes = 0
         self._left: Leave | None = None
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
@@ -134,6 +136,7 @@ class Worker:
             while self._left is None:
                 self._do(self._session.tick(self._clock()))
                 self._connect_again_if_unheard()
+                self._close_unused()
                 if self._left is None:
                     idle_s = min(IDLE_S, max(0.0, self._session.due_s - self._clock()))
                     self._listen(self._serve_shared_memory(idle_s))
@@ -317,9 +320,11 @@ class Worker:
                 case SendMessage(message):
                     self._send(message)
                 case StartSession(run):
+                    self._unused_from_s = math.inf
                     self._close_all()
                     self._begin(run)
                 case BeginRun(run):
+                    self._unused_from_s = self._clock() + UNUSED_S
                     self._begin(run)
                 case CloseLanes(lanes):
                     if (owner := self._actors or self._stepper) is not None:
@@ -379,6 +384,12 @@ class Worker:
                 return Described(order.session, order.ticket, describe(order))
         finally:
             heartbeats.stop()
+
+    def _close_unused(self) -> None:
+        """A worker that has no lane does not keep the copy that it has described."""
+        if self._clock() > self._unused_from_s:
+            self._unused_from_s = math.inf
+            close_described()
 
     def _close_all(self) -> None:
         close_described()

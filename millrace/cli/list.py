@@ -38,8 +38,8 @@ def _cells(line: RunLine) -> dict[str, str]:
         "environment": line.env,
         "algorithm": algorithm_label(line.algo),
         "return": "-" if progress.return_mean is None else return_in_words(progress.return_mean),
-        "env steps": "-" if line.begins else f"{progress.env_steps_made:,}",
+        "env steps": f"{progress.env_steps_made:,}" if line.has_numbers else "-",
         "done": line.done,
-        "steps/s": "-" if line.begins else per_second(progress.steps_per_s),
+        "steps/s": per_second(progress.steps_per_s) if line.has_numbers else "-",
         "started": line.started,
     }

@@ -12,6 +12,7 @@ from typing import Any, NoReturn, cast
 import msgspec
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.arrays import Array
@@ -46,6 +47,7 @@ from millrace.workers import machine_slots as slot_file
 from millrace.workers.activity import ActivityReader, activity
 from millrace.workers.actors import Actors, make_local_actors
 from millrace.workers.conversation.session import Leave, Session
+from millrace.workers.copy_slots import UNUSED_S
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 from millrace.workers.machine_slots import Slots
 from millrace.workers.shared_weights import SharedWeights, SharedWeightsReader
@@ -344,6 +346,18 @@ def test_a_worker_that_lacks_the_environment_declines_and_is_not_started_again(s
     assert left.exit_code == EXIT_UNSUITABLE
     assert left.reason.startswith(SAYS)
     assert [type(message) for message in link.heard()] == [Hello, Goodbye]
+
+
+def test_a_worker_that_gets_no_lane_does_not_keep_the_copy_that_it_has_described(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = Unanswered()
+    link.messages = [Welcome(1, 1, WaitSpec(learner_timeout_s=1e9)), Describe(1, 7, RUN.env), Welcome(1, 1, RUN)]
+    closed_at: list[float] = []
+    monkeypatch.setattr(CartPoleEnv, "close", lambda self: closed_at.append(link.now))
+    session = Session(replace(identity("w0"), process_nonce=0), 0.0)
+    stop = WorkerOptions(stop_requests=lambda: int(link.now > 3 * UNUSED_S))
+    Worker(cast(WorkerLink, link), session, stop, clock=lambda: link.now).run()
+    (at,) = closed_at
+    assert UNUSED_S < at < UNUSED_S + 2.0
 
 
 def test_the_copy_that_a_worker_has_described_is_the_first_of_its_lane(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -200,7 +200,7 @@ def _run_row(line: RunLine, home: str) -> str:
         f'<td><b class="state {line.state}">{line.state}</b></td>',
         f'<td class="number">{score}</td>',
         f'<td class="number">{escape(line.done)}{left}</td>',
-        f'<td class="number late">{"–" if line.begins else per_second(progress.steps_per_s)}</td>',
+        f'<td class="number late">{per_second(progress.steps_per_s) if line.has_numbers else "–"}</td>',
         f'<td class="late">{line.started}</td>',
     ]
     return f'<tr id="run-{key}">{choose}{name}{"".join(cells)}</tr>'
