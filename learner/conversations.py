@@ -19,10 +19,13 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.kinds_of_copies import has_masks
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import acting_size
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, WaitSpec, facts_of_all_seats, seat_returns
 from millrace.protocol.wire.codec import check_can_be_sent
 from millrace.protocol.wire.compression import has_zstd
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
+
+NO_PROGRESS = RunProgress()
 
 
 def rollout_spec(
@@ -126,14 +129,14 @@ def open_hub(
     return hub
 
 
-def lobby_settings(config: RolloutConfig, steps: int = 0) -> LobbySettings:
-    """The settings that matter before the run. `steps`: its env steps."""
+def lobby_settings(config: RolloutConfig, progress: RunProgress = NO_PROGRESS) -> LobbySettings:
+    """The settings that matter before the run. `progress`: how far it is."""
     return LobbySettings(
         wait=WaitSpec(config.call_timeouts(), config.heartbeat_s()),
         worker_timeout_s=config.worker_timeout_s,
         no_workers_timeout_s=config.no_workers_timeout_s,
         stall_timeout_s=config.stall_timeout_s(),
         max_env_failures=config.max_env_failures,
-        steps=steps,
+        progress=progress,
         launched_workers=config.launched_workers,
     )

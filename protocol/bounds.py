@@ -45,6 +45,8 @@ Moment = Annotated[float, Meta(ge=0, le=1e11)]
 """Seconds since 1970."""
 Real = Annotated[float, Meta(ge=-1.7976931348623157e308, le=1.7976931348623157e308)]
 """A finite number."""
+Figure = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+"""A time, or a mean, rate or sum of counts: short enough for a table."""
 Versions = Annotated[tuple[Natural, ...], Meta(max_length=MAX_TICKETS)]
 Tickets = Annotated[tuple[Natural, ...], Meta(max_length=MAX_TICKETS)]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 
-from millrace.protocol.bounds import Moment, Natural
+from millrace.protocol.bounds import Figure, Line, Moment, Name, Natural, Real
 
 
 class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
@@ -24,15 +24,15 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     """env steps to train for; 0 for what has no end: a learner of one's own, or a vector environment"""
     updates: Natural = 0
     """updates made so far, those before a resume included"""
-    wall_s: float = 0.0
+    wall_s: Figure = 0.0
     """seconds of training, those before a resume included; evaluations do not count"""
-    steps_per_s: float = 0.0
+    steps_per_s: Figure = 0.0
     """env steps per second of training since this process started, `collected` included"""
-    return_mean: float | None = None
+    return_mean: Real | None = None
     """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
-    length_mean: float | None = None
+    length_mean: Figure | None = None
     """mean length of the same episodes, in env steps"""
-    lag_mean: float = 0.0
+    lag_mean: Figure = 0.0
     """mean lag of the rollouts of the last update, in versions of the weights"""
     lag_max: Natural = 0
     """the largest of these lags"""
@@ -40,16 +40,16 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     """workers that have joined and are not lost"""
     workers_expected: Natural = 0
     """workers that this run starts; 0: any number may join"""
-    ledger: dict[str, Natural] = {}
+    ledger: dict[Name, Natural] = {}
     """number of tickets and transitions in each state"""
-    stages: dict[str, float] = {}
+    stages: dict[Name, Figure] = {}
     """seconds that the learner, and all workers together, have spent in each stage so far"""
-    phase: str = ""
+    phase: Name = ""
     """what the learner does: starting, gathering rollouts, learning, or evaluating; empty if that is not known"""
-    waiting: str = ""
+    waiting: Line = ""
     """who waits for whom, and for what share of the time, or how far an evaluation is: "evaluating for 41 s: 37 of 100
     episodes (…"; empty if nobody waits long"""
-    stop_reason: str = ""
+    stop_reason: Line = ""
     """why the run ended; empty while it goes on"""
     cut_short: bool = False
     """whether an error or an interrupt ended it"""

@@ -83,10 +83,10 @@ class DescribeCoordinator(Coordinator[Member]):
         self._double()
         return self._deal()
 
-    def status(self, total_steps: int, now: float) -> Status:
+    def status(self, progress: RunProgress, now: float) -> Status:
         """The answer to `millrace status`. There are no weights yet, and no ledger."""
         env = "" if self._unknown is None else self._unknown.env.id
-        return Status(env, RunProgress(total_steps=total_steps), self.membership.status(now))
+        return Status(env, progress, self.membership.status(now))
 
     # ---------------------------------------------------------------- inside
 

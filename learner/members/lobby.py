@@ -10,7 +10,9 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event
@@ -19,10 +21,12 @@ from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import Stalled
 from millrace.protocol.logs.long_wait import LongWait
 from millrace.protocol.messages import Status
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 from millrace.protocol.wire.learner_link import LearnerLink
 
@@ -41,7 +45,8 @@ class LobbySettings:
     no_workers_timeout_s: float
     stall_timeout_s: float
     max_env_failures: int
-    steps: int = 0
+    progress: RunProgress = field(default_factory=RunProgress)
+    """How far the run is: one that is resumed does not begin with 0."""
     launched_workers: int = 0
 
 
@@ -104,7 +109,21 @@ class Lobby:
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
-        return self._coordinator.status(self._settings.steps, now)
+        doing = self._server.what_workers_do()
+        if self._coordinator.described is not None:
+            waiting = "preparing the run"
+        elif self._coordinator.members:
+            waiting = f"waiting for a description of the environment: {doing}"
+        else:
+            waiting = doing
+        progress = replace(
+            self._settings.progress,
+            workers_alive=len(self._coordinator.members),
+            workers_expected=self.processes.expected,
+            phase="starting",
+            waiting=one_line(waiting),
+        )
+        return self._coordinator.status(progress, now)
 
     def happened(self, event: Event) -> None:
         """Count failures. None comes after env steps, so there is no line to log."""

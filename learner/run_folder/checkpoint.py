@@ -106,6 +106,11 @@ def has_any(folder: Path) -> bool:
     return bool(_files(folder))
 
 
+def newest_env_steps(folder: Path) -> int:
+    """Env steps of the newest checkpoint, by its name; 0 if there is none."""
+    return max((int(path.stem) for path in _files(folder) if path.stem.isascii() and path.stem.isdecimal()), default=0)
+
+
 def _files(folder: Path) -> list[Path]:
     """The checkpoint files of a run folder, the oldest first."""
     return regular_files(folder, f"{FOLDER}/*{SUFFIX}")

@@ -14,9 +14,10 @@ import msgspec
 from msgspec.structs import replace
 
 from millrace.learner.run_folder.atomic_write import write_atomically
+from millrace.learner.run_folder.checkpoint import newest_env_steps
 from millrace.learner.run_folder.regular_files import read
 from millrace.learner.run_folder.results import Summary
-from millrace.protocol.bounds import INVALID
+from millrace.protocol.bounds import INVALID, LARGEST
 from millrace.protocol.progress import RunProgress
 
 PROGRESS_FILE = "progress.json"
@@ -61,6 +62,12 @@ def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> R
         return msgspec.json.decode(read(run / PROGRESS_FILE), type=RunProgress)
     except (OSError, *INVALID):
         return RunProgress(total_steps=total_steps)
+
+
+def progress_before(resumed: Path | None, total_steps: int) -> RunProgress:
+    """How far a run of this many env steps is before it begins. One that is resumed goes on from its newest checkpoint."""
+    env_steps = 0 if resumed is None else min(newest_env_steps(resumed), LARGEST)
+    return RunProgress(env_steps=env_steps, total_steps=total_steps)
 
 
 def of_summary(summary: Summary, total_steps: int) -> RunProgress:

@@ -20,6 +20,7 @@ from millrace.protocol.progress import RunProgress
 ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
 BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once
 LEAST_PER_S = 1e-4  # an env step in three hours; a smaller speed is 0
+LONG_RETURN = 1e12  # from here on the digits of a return make a table too wide
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -45,7 +46,9 @@ def percent(progress: RunProgress) -> str:
 
 def return_in_words(mean: float | None) -> str:
     """The mean return of the last training episodes."""
-    return "none yet" if mean is None else f"{mean:,.1f}"
+    if mean is None:
+        return "none yet"
+    return f"{mean:,.1f}" if abs(mean) < LONG_RETURN else f"{mean:.3g}"
 
 
 def workers_in_words(progress: RunProgress) -> str:

@@ -24,7 +24,7 @@ def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], 
     steps = sum(member.heartbeat.steps for member in members if member.heartbeat is not None)
     progress = RunProgress(
         env_steps=min(steps, LARGEST),  # workers may report anything
-        steps_per_s=sum(row.steps_per_s for row in workers),
+        steps_per_s=max(-LARGEST, min(sum(row.steps_per_s for row in workers), LARGEST)),
     )
     envs = ", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs))
     return Status(envs, progress, workers, workers_wanted=len(coordinator.lanes))

@@ -16,6 +16,7 @@ from millrace.learner.extras import check_packages
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.resume_checks import Resumption, unless_finished
+from millrace.learner.run_folder.progress_file import progress_before
 from millrace.learner.run_setup import (
     RunSetup,
     known_environment,
@@ -60,7 +61,8 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         if not elsewhere:
             folder = folder or stack.enter_context(run_folder(config, None))
             crew = crew_of_run(config, folder.path)
-        lobby = pool.start(crew, lobby_settings(config, config.steps))
+        progress = progress_before(None if resume is None else resume.run, config.steps)
+        lobby = pool.start(crew, lobby_settings(config, progress))
         known = known_environment(config, env, resume, lobby)
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)

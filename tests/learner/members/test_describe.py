@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import cast
 
 import msgspec
@@ -43,6 +44,7 @@ from millrace.protocol.messages import (
     Welcome,
     WorkerExit,
 )
+from millrace.protocol.progress import RunProgress
 from millrace.protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
 from millrace.protocol.specs import StepSpec, WaitSpec
 from millrace.protocol.wire.codec import decode_to_worker
@@ -406,7 +408,7 @@ def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
 def test_the_status_says_who_is_here() -> None:
     made = coordinator()
     join(made, A)
-    answer = made.status(500, 1.0)
+    answer = made.status(RunProgress(total_steps=500), 1.0)
     assert (answer.env, answer.version, answer.progress.total_steps) == ("Fake-v0", -1, 500)
     assert [worker.worker for worker in answer.workers] == ["w0"]
 
@@ -472,11 +474,24 @@ def test_a_start_whose_workers_all_die_after_the_description_ends_at_once() -> N
         lobby.listen()
 
 
+def test_the_status_says_how_far_the_run_is_who_is_here_and_what_is_awaited() -> None:
+    link = FakeLink()
+    settings = replace(SETTINGS, progress=RunProgress(env_steps=400, total_steps=500))
+    lobby = Lobby(cast(LearnerLink, link), FakeProcesses(expected=2), settings, lambda: link.now)
+    assert lobby.status(link.now).progress.waiting == "waiting for a worker to join at fake"
+    link.inbox.append((A, hello(A)))
+    lobby.listen()
+    progress = lobby.status(link.now).progress
+    assert (progress.env_steps, progress.total_steps, progress.phase) == (400, 500, "starting")
+    assert (progress.workers_alive, progress.workers_expected) == (1, 2)
+    assert progress.waiting.startswith("waiting for a description of the environment: worker w0 on host: ")
+
+
 def test_one_failure_too_many_after_the_description_ends_the_start() -> None:
     link = FakeLink()
     saying(link, lambda session: Described(session, FIRST_TICKET + 1, DESCRIPTION))
     _, lobby = shell(link)
-    link.send = lambda peer, frames: True  # type: ignore[method-assign, assignment]
+    link.send = lambda peer, frames: True  # type: ignore[method-assign]
     link.inbox += [(A, failure_of(lobby)), (A, hello(A, 2))]
     lobby.listen()
     link.inbox.append((A, failure_of(lobby)))

@@ -8,8 +8,16 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from millrace.learner.run_folder.checkpoint import FOLDER, SUFFIX
 from millrace.learner.run_folder.progress import Progress
-from millrace.learner.run_folder.progress_file import EVERY_S, LONGEST_SILENCE_S, PROGRESS_FILE, ProgressFile, last_progress
+from millrace.learner.run_folder.progress_file import (
+    EVERY_S,
+    LONGEST_SILENCE_S,
+    PROGRESS_FILE,
+    ProgressFile,
+    last_progress,
+    progress_before,
+)
 from millrace.learner.run_folder.results import Summary
 from millrace.protocol.progress import RunProgress
 from tests.support.run_folders import a_run
@@ -72,6 +80,14 @@ def test_what_the_disk_refuses_is_dropped_and_written_later(tmp_path: Path) -> N
     assert last_progress(run, None).env_steps == 20
 
 
+def test_a_run_that_is_resumed_is_as_far_as_its_newest_checkpoint_and_goes_to_the_new_end(tmp_path: Path) -> None:
+    assert progress_before(None, 500) == progress_before(tmp_path, 500) == RunProgress(total_steps=500)
+    (tmp_path / FOLDER).mkdir()
+    for env_steps in (200, 300):
+        (tmp_path / FOLDER / f"{env_steps:012d}{SUFFIX}").touch()
+    assert progress_before(tmp_path, 500) == RunProgress(env_steps=300, total_steps=500)
+
+
 def test_what_was_refused_is_written_although_nothing_has_changed_since(tmp_path: Path) -> None:
     now = BEGAN_S
     run = tmp_path / "run"
@@ -84,7 +100,8 @@ def test_what_was_refused_is_written_although_nothing_has_changed_since(tmp_path
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b'{"env_steps": -5}', b'{"at_s": 1e300}', b'{"stages": {"a": 1e999}}', b"\xff"]
+    "content",
+    [b"", b"{", b'{"env_steps": -5}', b'{"at_s": 1e300}', b'{"stages": {"a": 1e999}}', b'{"wall_s": 1e308}', b"\xff"],
 )
 def test_of_a_damaged_file_nothing_is_known_but_the_settings(tmp_path: Path, content: bytes) -> None:
     (tmp_path / PROGRESS_FILE).write_bytes(content)

@@ -86,6 +86,7 @@ def test_numbers_have_the_same_words_everywhere() -> None:
     without_end = RunProgress(env_steps=9_000, workers_alive=3)
     assert (steps_in_words(without_end), percent(without_end), workers_in_words(without_end)) == ("9,000", "0%", "3")
     assert (return_in_words(None), return_in_words(-1_234.56)) == ("none yet", "-1,234.6")
+    assert return_in_words(-1e308) == "-1e+308"
 
 
 def test_only_what_went_wrong_is_said() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from millrace.extras.monitoring.report.charts import MINUS
+from millrace.learner.run_folder.sentences import return_in_words
 
 
 def document(title: str, head: Sequence[str], main: str) -> str:
@@ -37,5 +38,5 @@ def section(name: str, about: str, content: str, key: str = "") -> str:
 
 
 def return_text(value: float) -> str:
-    """A return with one decimal and a typographic minus sign."""
-    return f"{value:,.1f}".replace("-", MINUS)
+    """A return in words, with a typographic minus sign."""
+    return return_in_words(value).replace("-", MINUS)
