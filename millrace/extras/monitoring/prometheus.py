@@ -31,7 +31,7 @@ from prometheus_client.metrics_core import (
 from prometheus_client.registry import Collector
 
 from millrace.learner.config.config import Config
-from millrace.learner.rollouts.hub import Hub, HubObserver, HubSnapshot
+from millrace.learner.rollouts.hub import Hub, HubSnapshot
 from millrace.learner.run_folder.results import FactMean
 from millrace.learner.run_folder.run_format import versions
 from millrace.protocol.address import WILDCARDS, is_local
@@ -199,7 +199,7 @@ def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetric
 
 
 @contextmanager
-def metrics_server(config: Config) -> Iterator[HubObserver]:
+def metrics_server(config: Config) -> Iterator[Callable[[Hub], None]]:
     """Serve `/metrics` at `metrics_bind` until the context ends. Yields the observer that the hub must call.
 
     Raises `UsageError`, with a one-line message, if the port is in use.
