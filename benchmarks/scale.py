@@ -30,6 +30,8 @@ from rich.table import Table
 from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
 from benchmarks.writing import write
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.rollout import stack_rollouts
@@ -72,7 +74,7 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     me = psutil.Process()
     run = run_spec(workers)
     link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
-    coordinator = TicketCoordinator(run, max_lag=0, worker_timeout_s=10, first_session=1)
+    coordinator = TicketCoordinator(run, RolloutDealer(run.lanes, Rounds(0)), worker_timeout_s=10, first_session=1)
     hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0))
     parameters = np.zeros(acting_size(POLICY), np.float32)
     buffers = np.zeros(buffer_size(POLICY), np.float32)

@@ -17,6 +17,8 @@ import numpy as np
 
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import COLORS, DPI, GREY
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Hello
 
@@ -50,7 +52,7 @@ def play(max_lag: int, seconds: float) -> Played:
     """What workers and learner do with tickets under this `max_lag`."""
     run = run_spec(LANES)
     rollout = canned(run)
-    coordinator = TicketCoordinator(run, max_lag=max_lag, worker_timeout_s=1e9, first_session=1)
+    coordinator = TicketCoordinator(run, RolloutDealer(run.lanes, Rounds(max_lag)), worker_timeout_s=1e9, first_session=1)
     spans: list[Span] = []
     lags: list[int] = []
     events: list[tuple[float, int]] = []  # when a row's rollout or update ends

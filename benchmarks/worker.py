@@ -25,6 +25,8 @@ from benchmarks.writing import write
 from millrace.learner.config.layers import resolve
 from millrace.learner.env_spaces import EnvSpaces
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.run_spec import run_spec
 from millrace.protocol.env_spec import EnvSpec
@@ -53,7 +55,7 @@ def start_one(env: EnvSpec, *, supervised: bool = False) -> tuple[float, float]:
     acting, _ = parameter_layout(run.policy)
     with tempfile.TemporaryDirectory() as folder:
         link = LearnerLink(f"ipc://{folder}/learner")
-        coordinator = TicketCoordinator(run, max_lag=0, worker_timeout_s=60, first_session=1)
+        coordinator = TicketCoordinator(run, RolloutDealer(run.lanes, Rounds(0)), worker_timeout_s=60, first_session=1)
         hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()

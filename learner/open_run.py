@@ -25,10 +25,10 @@ from millrace.learner.config.algorithm_names import FOR_PRIOR
 from millrace.learner.config.config import Config
 from millrace.learner.config.costs import large_observations, minibatch_rows
 from millrace.learner.config.validation import unused_setting
-from millrace.learner.conversations import open_hub
 from millrace.learner.extras import started_by
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.learner.open_hub import open_hub
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from millrace.learner.run import OpenRun
@@ -67,7 +67,8 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
     if torch_device(setup.config) == "cpu" and (line := large_observations(setup.config, spec.policy)):
         log_notice(log, line)
     setup = _use_threads(setup, spec.policy, lobby.processes)
-    config, folder = setup.config, setup.folder
+    config = setup.config
+    folder = setup.folder
     algorithm, prior = _new_algorithm(setup, spec)
     state = restore(folder, algorithm) if setup.resumed else RunState()
     # The last save gets half of what is left of the grace time, and the workers need time to leave.
@@ -151,7 +152,9 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses
 
 def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData | None]:
     """An algorithm that starts from another run, if it is to, and has its prior data. A resumed one has its own start."""
-    config, folder, policy = setup.config, setup.folder, spec.policy
+    config = setup.config
+    folder = setup.folder
+    policy = spec.policy
     algorithm = algorithm_class(config.algo)(
         config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
     )

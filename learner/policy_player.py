@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import open_hub
 from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.lobby import Lobby
+from millrace.learner.open_hub import open_hub
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of

@@ -6,8 +6,8 @@ import msgspec
 
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.config.config import Config
-from millrace.learner.conversations import rollout_spec
 from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.rollout_spec import rollout_spec
 from millrace.learner.rollouts.opponent_pool import teams_of
 from millrace.protocol.bounds import MAX_FACTS
 from millrace.protocol.env_spec import EnvSpec

@@ -33,8 +33,13 @@ class Audience:
 
     def __init__(self, run: RunParts, callbacks: Callbacks, files: RunFiles, requests: Requests) -> None:
         """`requests`: what callbacks ask for."""
-        self._config, self._hub, self._tally, self._state = run.config, run.hub, run.tally, run.tally.state
-        self._callbacks, self._files, self._requests = callbacks, files, requests
+        self._config = run.config
+        self._hub = run.hub
+        self._tally = run.tally
+        self._state = run.tally.state
+        self._callbacks = callbacks
+        self._files = files
+        self._requests = requests
         self._settings = msgspec.to_builtins(run.config)
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._workers_alive = 0
@@ -140,7 +145,10 @@ class Audience:
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
         """`collected`: env steps that wait for the next update, if that is awaited."""
-        state, tally, wall_s, lags = self._state, self._tally, self._tally.wall_s(snapshot), snapshot.lags or [0]
+        state = self._state
+        tally = self._tally
+        wall_s = self._tally.wall_s(snapshot)
+        lags = snapshot.lags or [0]
         return Progress(
             at_s=time.time(),
             run=self._files.path,

@@ -38,8 +38,11 @@ class Evaluations:
         """The evaluation of the final policy to report, once the run was concluded."""
         self.ended_by: Evaluation | None = None
         """The one that ended the run, if it was of the final policy. Then `final` is a second one, on other episodes."""
-        self._run, self._config, self._time_limit = run, run.config, time_limit
-        self._tally, self._state = run.tally, run.tally.state
+        self._run = run
+        self._config = run.config
+        self._time_limit = time_limit
+        self._tally = run.tally
+        self._state = run.tally.state
         self.write_best()  # the folder may have that of a later version, which was lost
 
     def begin_again(self, env_attributes: Array | None, watch: Callable[[], None]) -> Row | None:
@@ -77,7 +80,8 @@ class Evaluations:
     def end_pending(self, watch: Callable[[], None]) -> Row | None:
         """Wait for the evaluation beside training, if there is one. Returns its metrics, and which policy they are of."""
         state = self._state
-        pending, policy = state.pending, state.pending_policy
+        pending = state.pending
+        policy = state.pending_policy
         if pending is None:
             return None
         found = self._end(watch)
@@ -91,7 +95,9 @@ class Evaluations:
 
         Returns whether the final policy had no such evaluation before.
         """
-        state, before, ended = self._state, self.of_newest(), self._tally.stop_reason() != ALL_STEPS_DONE
+        state = self._state
+        before = self.of_newest()
+        ended = self._tally.stop_reason() != ALL_STEPS_DONE
         size = final_evaluation_size(self._config, state.env_steps, self._tally.window.length_mean, self._time_limit)
         if size != (usual := evaluation_size(self._config)):
             log_notice(log, _smaller(size, usual))
@@ -101,7 +107,8 @@ class Evaluations:
         if ended and before is not None:
             found_again = self._evaluate(Purpose.CONFIRMATION, size, watch)
             self._say(found_again, state.env_steps)
-            self.final, self.ended_by = found_again, before
+            self.final = found_again
+            self.ended_by = before
         else:
             self.final = found
         self.confirmed = self._confirm(size, watch)
@@ -111,7 +118,9 @@ class Evaluations:
         """Write the best policy into the run folder, if it is known."""
         if self._state.best_policy is None:
             return
-        policy, spec, folder = self._state.best_policy, self._run.spec, self._run.folder
+        policy = self._state.best_policy
+        spec = self._run.spec
+        folder = self._run.folder
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def to_report(self) -> Evaluation | None:
@@ -138,7 +147,8 @@ class Evaluations:
 
     def _evaluate_newest(self, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
         """Evaluate the newest policy; the same version is not evaluated twice."""
-        state, found = self._state, self.of_newest()
+        state = self._state
+        found = self.of_newest()
         if found is None or found.episodes != size.episodes:
             found = self._evaluate(Purpose.EVALUATION, size, watch)
             self._found(found, EvaluatedPolicy(state.version, state.env_steps))
@@ -146,7 +156,8 @@ class Evaluations:
 
     def _found(self, found: Evaluation, of: EvaluatedPolicy) -> None:
         """The newest evaluation found this, of this policy."""
-        self._state.newest_evaluation, self._state.evaluated = found, of
+        self._state.newest_evaluation = found
+        self._state.evaluated = of
         self._say(found, of.env_steps)
 
     def _say(self, found: Evaluation, env_steps: int) -> None:
@@ -179,7 +190,8 @@ class Evaluations:
         """
         state = self._state
         if state.best is None or found.return_mean >= state.best[0]:
-            state.best, state.best_policy = (found.return_mean, env_steps), policy()
+            state.best = (found.return_mean, env_steps)
+            state.best_policy = policy()
             self.write_best()
 
 

@@ -39,7 +39,9 @@ class RunFiles:
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
         """Removes the rows of updates that the checkpoint of a resumed run knows nothing of. Raises `RunError`."""
         self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
-        self._state, self._evaluations, self._attributes = run.tally.state, evaluations, attributes
+        self._state = run.tally.state
+        self._evaluations = evaluations
+        self._attributes = attributes
         self.path = one_line(str(run.folder.shown))
         self.checkpoint = ""
         """Path of the newest checkpoint that this process has written."""
@@ -72,7 +74,8 @@ class RunFiles:
         began_s = time.monotonic()
         self._folder.writes.write("state", self._write_state)
         self._schedule.saved(began_s)
-        took_s, grace_s = time.monotonic() - began_s, self._config.grace_s
+        took_s = time.monotonic() - began_s
+        grace_s = self._config.grace_s
         if grace_s and self.longest_save_s <= grace_s < took_s:  # said once
             log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", took_s, grace_s)
         self.longest_save_s = max(self.longest_save_s, took_s)
@@ -126,7 +129,8 @@ class RunFiles:
 
     def continues(self) -> str:
         """One line that says where a resumed run continues, and which updates are lost."""
-        state, lost = self._state, self._metrics.removed
+        state = self._state
+        lost = self._metrics.removed
         line = f"run {self._folder.shown} continues at {state.env_steps:,} env steps, after update {state.version:,}"
         if lost:
             line += f"; {lost:,} later update{'s were' if lost > 1 else ' was'} not saved, and must be made again"
@@ -167,7 +171,9 @@ class RunFiles:
     def _write_state(self) -> None:
         """Write the policy and a checkpoint. Raises `RunError` if the disk refuses one of them; the other one is written."""
         self._make_folder_again()
-        spec, env_steps, snapshot = self._spec, self._state.env_steps, self._hub.snapshot()
+        spec = self._spec
+        env_steps = self._state.env_steps
+        snapshot = self._hub.snapshot()
         state = msgspec.structs.replace(
             self._state,
             wall_s=self._tally.wall_s(snapshot),
@@ -184,7 +190,8 @@ class RunFiles:
         finally:
             path = checkpoint.save(self._folder.path, state, env_steps, self._config.keep_checkpoints)
             self.checkpoint = one_line(str(path))
-            self._saved, self._saved_env_steps = self._position(), env_steps
+            self._saved = self._position()
+            self._saved_env_steps = env_steps
 
     def _confirm_lock(self) -> None:
         if self._folder.lock is not None:
@@ -196,7 +203,10 @@ class RunFiles:
         return state.version, state.next_evaluation, state.evaluated, state.best, self._attributes.changes
 
     def _summary(self, reason: str, cut_short: bool) -> Summary:
-        config, state, tally, snapshot = self._config, self._state, self._tally, self._hub.snapshot()
+        config = self._config
+        state = self._state
+        tally = self._tally
+        snapshot = self._hub.snapshot()
         wall_s = tally.wall_s(snapshot)
         return Summary(
             env=config.env,

@@ -45,9 +45,11 @@ class Tally:
         self.gathered_s = 0.0
         """Seconds that callbacks and the dataset took for the rollouts of the next update."""
         self._ended_by = ended_by
-        self._config, self._steps_per_update = config, spec.rollout_steps * config.envs
+        self._config = config
+        self._steps_per_update = spec.rollout_steps * config.envs
         self._update_s = 0.0
-        self.wall_before_s, self.steps_before = state.wall_s, state.env_steps
+        self.wall_before_s = state.wall_s
+        self.steps_before = state.env_steps
         self._started_s = time.monotonic()
 
     def count(self, batch: Batch) -> None:
@@ -65,7 +67,8 @@ class Tally:
 
     def stop_reason(self) -> str | None:
         """Why the run should end now, or None."""
-        state, newest = self.state, self.state.newest_evaluation
+        state = self.state
+        newest = self.state.newest_evaluation
         return self._ended_by() or reason_to_stop(
             self._config,
             env_steps_after_next_update=state.env_steps + self._steps_per_update if state.version else 0,
@@ -87,7 +90,8 @@ class Tally:
 
     def evaluated(self) -> None:
         """The evaluation that was due is made. The next one is due at the next multiple that is not reached yet."""
-        every, state = self._config.eval_every, self.state
+        every = self._config.eval_every
+        state = self.state
         state.next_evaluation += every * (1 + (state.env_steps - state.next_evaluation) // every)
 
     # ---------------------------------------------------------------- seconds

@@ -142,7 +142,9 @@ class Member:
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
         """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
-        before, self.activity, self.activity_s = self.activity, activity, now
+        before = self.activity
+        self.activity = activity
+        self.activity_s = now
         if activity.doing not in OUR_CODE:
             self.in_env_code_s = now
         return activity.env_calls > (0 if before is None else before.env_calls)

@@ -105,7 +105,10 @@ class Membership(Generic[M]):
         """
         self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
         """whether a policy of the user's acts in the workers: no worker can blame one that is ours"""
-        self._run, self._member_class, self._on_removed, self.is_spare = run, member_class, on_removed, is_spare
+        self._run = run
+        self._member_class = member_class
+        self._on_removed = on_removed
+        self.is_spare = is_spare
         self._first_session = self._next_session = first_session
         self._joins = 0
         self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
@@ -135,7 +138,8 @@ class Membership(Generic[M]):
 
     def take_events(self) -> list[Event]:
         """Return and clear the events since the last call."""
-        events, self.events = self.events, []
+        events = self.events
+        self.events = []
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
@@ -185,7 +189,8 @@ class Membership(Generic[M]):
             return [(peer, Refuse(why))], None
         if self.draining is not None:
             return [(peer, Drain(one_line(self.draining)))], None  # rule HELLO_WHILE_DRAINING
-        member, takeovers = self.members.get(peer), 0
+        member = self.members.get(peer)
+        takeovers = 0
         if member is None and len(self.members) >= MAX_MEMBERS:
             why = f"workers: expected at most {MAX_MEMBERS} at one learner"
             self.events.append(WorkerRefused(hello.worker, why))
@@ -214,8 +219,11 @@ class Membership(Generic[M]):
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
         """The run begins for the workers that wait for it: their sessions go on, and another Welcome brings the run."""
-        self._first_session, self._next_session, self._joins = waiting._first_session, waiting._next_session, waiting._joins
-        self._refused, self._removed_for_silence = waiting._refused, waiting._removed_for_silence
+        self._first_session = waiting._first_session
+        self._next_session = waiting._next_session
+        self._joins = waiting._joins
+        self._refused = waiting._refused
+        self._removed_for_silence = waiting._removed_for_silence
         for peer, waited in waiting.members.items():
             member = self._member_class(**vars(waited))
             member.heard_s = member.joined_s = now
@@ -264,11 +272,13 @@ class Membership(Generic[M]):
         if self.draining is not None:
             return [(peer, Drain(one_line(self.draining)))], removed
         members = [member for member in found if member is not None]
-        answer, supervisor = list[Outgoing](), None
+        answer = list[Outgoing]()
+        supervisor = None
         if alive.replies is not None and members:
             known = (each.supervisor for each in members if each.supervisor and each.supervisor.peer == peer)
             supervisor = next(known, None) or SharingSupervisor(peer)
-            supervisor.heard_s, supervisor.received = now, alive.replies
+            supervisor.heard_s = now
+            supervisor.received = alive.replies
             supervisor.replies += 1
             answer.append((peer, HeartbeatReply(self._first_session, supervisor.replies, ())))
         for member in members:
@@ -289,7 +299,8 @@ class Membership(Generic[M]):
 
     def record_exit(self, worker_exit: WorkerExit, key: bytes | None = None) -> bool:
         """A member's process has ended: remove the member. True if it was one. `key`: as for `record_activity`."""
-        worker, reason = worker_exit.worker, worker_exit.reason
+        worker = worker_exit.worker
+        reason = worker_exit.reason
         member = self._of_process.get((worker, worker_exit.process_nonce))
         if member is not None and (key is None or key == key_of_peer(member.peer)):
             if worker_exit.failed:
@@ -320,7 +331,8 @@ class Membership(Generic[M]):
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
         self._of_process.pop((member.hello.worker, member.hello.process_nonce), None)
-        worker, tickets = member.hello.worker, len(member.tickets)
+        worker = member.hello.worker
+        tickets = len(member.tickets)
         left = WorkerLeft(worker, why, tickets, event is Goodbye)
         self.events.append(left if refusal is None else WorkerRefused(worker, refusal, tickets))
         self._on_removed(member, why)

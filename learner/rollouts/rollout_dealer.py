@@ -39,12 +39,14 @@ class RolloutDealer:
     def __init__(
         self,
         lanes: int,
-        max_lag: int,
+        rounds: Rounds,
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
         opponents: OpponentPool | None = None,
     ) -> None:
-        """`incarnations`: the first of each lane; there may be more or fewer of them than lanes. `opponents`: if any."""
+        """`ledger` and `incarnations` come from a checkpoint: the incarnations are the first of each lane, and there may be
+        more or fewer of them than lanes. `opponents`: those of a run with teams.
+        """
         self.opponents = opponents
         self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(lanes)]
         self.ledger = ledger or Ledger()
@@ -52,7 +54,7 @@ class RolloutDealer:
         """the tickets that workers hold, by number"""
         self.ready: dict[int, dict[int, AcceptedRollout]] = {}
         """the rollouts that have come and were not taken, by round and by lane"""
-        self.rounds = Rounds(max_lag)
+        self.rounds = rounds
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had, and may have again
         self._to_deal = set[int]()  # lanes with rounds that are to be dealt
 

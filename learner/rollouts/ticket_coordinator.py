@@ -23,8 +23,6 @@ from millrace.learner.members.member_states import SentUnusable
 from millrace.learner.members.membership import Answered, Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
-from millrace.learner.rollouts.ledger import Ledger
-from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.protocol.errors import BadRollout
@@ -57,20 +55,14 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def __init__(
         self,
         run: RunSpec,
+        rollouts: RolloutDealer,
         *,
-        max_lag: int,
         worker_timeout_s: float,
         first_session: int,
-        ledger: Ledger | None = None,
-        incarnations: Sequence[int] = (),
-        opponents: OpponentPool | None = None,
         check_rows: CheckRows = validate,
     ) -> None:
-        """`ledger` and `incarnations` come from a checkpoint. `opponents`: those of a run with teams.
-
-        `check_rows`: of each rollout, before it is accepted.
-        """
-        self.rollouts = RolloutDealer(run.lanes, max_lag, ledger, incarnations, opponents)
+        """`check_rows`: of each rollout, before it is accepted."""
+        self.rollouts = rollouts
         self.evaluation = EvaluationDealer(run)
         lanes = self.rollouts.lanes
         membership = Membership(run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, lanes))

@@ -13,10 +13,10 @@ from millrace.launch.crew import Crew
 from millrace.launch.learner_inference import NEVER_S, ActingSettings, open_stepping_pool
 from millrace.launch.worker_pool import WorkerPool, open_worker_pool
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import lobby_settings
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.who_may_connect import BindSettings
+from millrace.learner.open_hub import lobby_settings
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy
 from millrace.learner.torch_setup import one_thread
 from millrace.learner.vector_env.settings import VectorEnvSettings

@@ -9,10 +9,11 @@ from millrace.launch.crew import Crew, worker_cores
 from millrace.launch.worker_pool import open_worker_pool
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import workers_to_wait_for
-from millrace.learner.conversations import lobby_settings, open_hub, rollout_spec
 from millrace.learner.env_spaces import EnvSpaces
 from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.who_may_connect import BindSettings
+from millrace.learner.open_hub import lobby_settings, open_hub
+from millrace.learner.rollout_spec import rollout_spec
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.own_policy import OwnPolicy

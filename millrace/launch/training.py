@@ -11,10 +11,10 @@ from millrace.launch.worker_pool import WorkerPool, open_worker_pool
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
 from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
-from millrace.learner.conversations import lobby_settings
 from millrace.learner.extras import check_packages
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.who_may_connect import BindSettings
+from millrace.learner.open_hub import lobby_settings
 from millrace.learner.resume_checks import Resumption, unless_finished
 from millrace.learner.run_folder.progress_file import progress_before
 from millrace.learner.run_setup import (

@@ -43,7 +43,8 @@ from millrace.protocol.wire.wake_up import SPIN_S, WakePipe
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
 LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it hears nothing from the learner for this long
-STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
+STEP_TIMEOUT_LEAST_S = 60.0
+STEP_TIMEOUT_MOST_S = 1e6
 
 
 @checked

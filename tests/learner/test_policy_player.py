@@ -11,9 +11,9 @@ import pytest
 
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import lobby_settings
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.learner.open_hub import lobby_settings
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.run_folder.run_folder import RunFolder

@@ -129,12 +129,15 @@ class Learner:
         settings = self.settings
         coordinator = TicketCoordinator(
             settings.run,
-            max_lag=settings.max_lag,
+            RolloutDealer(
+                settings.run.lanes,
+                Rounds(settings.max_lag),
+                ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used),
+                incarnations=[number.value for number in incarnations],
+                opponents=settings.pool(version - 1),
+            ),
             worker_timeout_s=TIMEOUT_S,
             first_session=self.coordinator.membership._next_session,
-            ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used),
-            incarnations=[number.value for number in incarnations],
-            opponents=settings.pool(version - 1),
             check_rows=any_rows,
         )
         coordinator.weights.kept = {each: weights(each) for each in _snapshots(coordinator)}
@@ -381,11 +384,14 @@ def loaded(content: Content, settings: Settings) -> Learner:
     unplaced, settled, waiting_for, to_deal, (kept, held), *mine = rest
     coordinator = TicketCoordinator(
         settings.run,
-        max_lag=settings.max_lag,
+        RolloutDealer(
+            settings.run.lanes,
+            Rounds(settings.max_lag),
+            ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
+            opponents=settings.pool(version),
+        ),
         worker_timeout_s=TIMEOUT_S,
         first_session=members[1].value,
-        ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
-        opponents=settings.pool(version),
         check_rows=any_rows,
     )
     coordinator.version = version
@@ -444,7 +450,7 @@ def first_learner(settings: Settings, kind: type[L]) -> tuple[L, list[Outgoing]]
         settings,
         TicketCoordinator(
             settings.run,
-            max_lag=settings.max_lag,
+            RolloutDealer(settings.run.lanes, Rounds(settings.max_lag)),
             worker_timeout_s=TIMEOUT_S,
             first_session=0,
             check_rows=any_rows,

@@ -57,7 +57,8 @@ from millrace.workers.conversation.worker_states import (
 )
 from millrace.workers.exit_codes import EXIT_UNSUITABLE
 
-HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
+HELLO_FIRST_S = 0.25
+HELLO_MOST_S = 4.0
 NO_LEARNER = "no learner answered"
 
 
@@ -341,7 +342,8 @@ class Session:
             return []
         self.due_s = now + self.run.heartbeat_s
         self._unanswered_s = min(self._unanswered_s, now)
-        current, statistics = self._current, self._statistics
+        current = self._current
+        statistics = self._statistics
         heartbeat = Heartbeat(
             session=self.session,
             replies=current.replies,
@@ -422,7 +424,8 @@ class Session:
             return self._welcome_again(message.run, now)
         self.state = TABLE[self.state][type(message)]
         self._current = _SessionState()
-        self.run, self.session = message.run, message.session  # rule SESSION
+        self.run = message.run
+        self.session = message.session  # rule SESSION
         self._unanswered_s = math.inf
         self.due_s = now + message.run.heartbeat_s
         self._join_timeout_s = self._rejoin_timeout_s

@@ -142,5 +142,6 @@ class Examiner:
             self._record("failed", expected="the whole test within --limit-s", got="no time left")
 
     def _taken(self) -> list[LearnerEffect]:
-        effects, self.learner.effects = self.learner.effects, []
+        effects = self.learner.effects
+        self.learner.effects = []
         return effects

@@ -73,7 +73,8 @@ class LaneRows:
             self._length += ~resets
             for n in np.flatnonzero(over).tolist():
                 expected.append((float(self._return[n]), int(self._length[n])))
-                self._return[n], self._length[n] = 0.0, 0
+                self._return[n] = 0.0
+                self._length[n] = 0
         if run.seats:  # rewards outside of rows count too
             returns = (sum(episode.facts[-len(run.seats) :]) for episode in rollout.episodes)
             expected = [(total, length) for total, (_, length) in zip(returns, expected, strict=True)]

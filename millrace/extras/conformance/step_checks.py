@@ -73,7 +73,9 @@ class Stepping:
     """A session of the environment profile, with the orders that checks need."""
 
     def __init__(self, learner: Learner, env: DescribedEnv, mode: Mode = "NextStep") -> None:
-        self.learner, self.env, self.spec = learner, env, step_spec(learner, env, mode)
+        self.learner = learner
+        self.env = env
+        self.spec = step_spec(learner, env, mode)
         self.space: Any = env.action_space
         self.space.seed(1)
         self.flatten = make_flatten(env.action_space)
@@ -304,7 +306,8 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
 
 def controller(steps: Stepping) -> Callable[[Stepped], tuple[Array, ...]]:
     """What chooses actions for long episodes: for a cart with a pole (Box(4), Discrete(2)) it balances the pole."""
-    (observation, *more), (action, *others) = steps.spec.observation, steps.spec.action
+    observation, *more = steps.spec.observation
+    action, *others = steps.spec.action
     is_pole = not more and not others and observation.shape == (4,) and action.kind == "discrete" and action.sizes == (2,)
     if not is_pole:
         return lambda row: steps.random_actions(len(row.reward))

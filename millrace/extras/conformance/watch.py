@@ -97,7 +97,8 @@ class WatchedSession:
         self._described: dict[int, Described] = {}  # the first answer to each Describe
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
         self._lanes: dict[int, int] = {}  # the client's lanes, each in its highest incarnation
-        self._asked, self._answered = Counter[int](), Counter[int]()
+        self._asked = Counter[int]()
+        self._answered = Counter[int]()
         self._results: dict[int, Evaluated] = {}  # the first answer to each Evaluate
         self._due: dict[int, int] = {}  # tickets that arrive before a later HeartbeatReply than this one
         self._missing = set[int]()  # of these, those that the last Heartbeat should have listed, and did not
@@ -121,7 +122,9 @@ class WatchedSession:
         match message:
             case Welcome(session, _, RunSpec() | StepSpec() as run) if session == self.session:
                 if isinstance(self.run, WaitSpec):
-                    self.welcome, self.run, self._welcomed = message, run, self.replies
+                    self.welcome = message
+                    self.run = run
+                    self._welcomed = self.replies
                     self._due.clear()  # what is still to be described is not wanted any more
             case Describe() if message.session != self.session:
                 self._ignored[message.ticket] = OTHER_SESSION
@@ -326,7 +329,8 @@ class WatchedSession:
                 Rule.DESCRIBE, f"the ticket of a Describe: {sorted(self.descriptions) or 'none yet'}", brief(message)
             )
         self._answered[ticket] += 1
-        asked, answered = self._asked[ticket], self._answered[ticket]
+        asked = self._asked[ticket]
+        answered = self._answered[ticket]
         if answered > asked:
             raise Broken(
                 Rule.DESCRIBE, f"answers to ticket {ticket} as often as it was sent: {asked}", f"{answered} answers"

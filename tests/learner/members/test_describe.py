@@ -20,6 +20,8 @@ from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.members.member_states import TimedOut
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.protocol.alive import NO_SLOT, WorkerActivity
@@ -222,7 +224,7 @@ def test_a_worker_that_describes_when_the_run_begins_gets_lanes_once_it_has_begu
     one, two = join(made, A), join(made, B)
     made.ask_more()
     made.receive(B, Described(two, order(made, B), DESCRIPTION), 1.0)
-    run = TicketCoordinator(run_spec(lanes=2), max_lag=0, worker_timeout_s=5, first_session=10)
+    run = TicketCoordinator(run_spec(lanes=2), RolloutDealer(2, Rounds(0)), worker_timeout_s=5, first_session=10)
     run.take_over(made.membership, 2.0)
     run.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
     assert {peer for peer, _ in run.begin_update()} == {B}
@@ -236,7 +238,7 @@ def test_a_worker_that_describes_when_the_run_begins_gets_lanes_once_it_has_begu
 def test_a_worker_that_still_describes_is_asked_to_leave_as_others_are() -> None:
     made = coordinator()
     join(made, A)
-    run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
+    run = TicketCoordinator(run_spec(), RolloutDealer(4, Rounds(0)), worker_timeout_s=5, first_session=10)
     run.take_over(made.membership, 2.0)
     assert run.drain("the run is over") == [(A, Drain("the run is over"))]
 
@@ -246,7 +248,7 @@ def test_the_run_begins_in_the_sessions_of_those_that_wait_for_it() -> None:
     refused = made.receive(A, Goodbye(join(made, A), "no such environment", ()), 1.0)
     session = join(made, B)
     made.receive(B, beat(session, 0), 1.0)
-    run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
+    run = TicketCoordinator(run_spec(), RolloutDealer(4, Rounds(0)), worker_timeout_s=5, first_session=10)
     attempt = made.members[B].hello.attempt
     welcome = (B, Welcome(session, attempt, run_spec()))
     assert run.take_over(made.membership, 100.0) == [welcome]
@@ -264,7 +266,7 @@ def test_the_welcome_that_brings_the_run_is_sent_again_if_a_heartbeat_shows_that
     session = join(made, A)
     made.receive(A, beat(session, 0), 1.0)
     made.receive(A, Described(session, order(made, A), DESCRIPTION), 1.0)
-    run = TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10)
+    run = TicketCoordinator(run_spec(), RolloutDealer(4, Rounds(0)), worker_timeout_s=5, first_session=10)
     run.take_over(made.membership, 2.0)
     run.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
     assert [type(message) for _, message in run.begin_update()] == [Collect, Weights]
@@ -279,7 +281,7 @@ def test_a_description_that_comes_after_the_run_has_begun_is_no_mistake() -> Non
     session = join(made, A)
     late = Described(session, order(made, A), DESCRIPTION)
     for run in (
-        TicketCoordinator(run_spec(), max_lag=0, worker_timeout_s=5, first_session=10),
+        TicketCoordinator(run_spec(), RolloutDealer(4, Rounds(0)), worker_timeout_s=5, first_session=10),
         OrderCoordinator(StepSpec((ENV,), (0,), (1,), (), ()), 10),
     ):
         run.take_over(made.membership, 2.0)

@@ -22,6 +22,8 @@ from hypothesis import strategies as st
 from millrace.cli.status import as_table
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.errors import BadMessage
@@ -166,7 +168,7 @@ Say = Callable[[Conversation, int], None]
 def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
     """Lane, ticket, version, sequence and incarnation of each rollout that an update used, in order."""
     link = Conversation()
-    coordinator = TicketCoordinator(RUN, max_lag=1, worker_timeout_s=3.0, first_session=1)
+    coordinator = TicketCoordinator(RUN, RolloutDealer(RUN.lanes, Rounds(1)), worker_timeout_s=3.0, first_session=1)
     settings = HubSettings(60.0, 600.0, max_env_failures=0)
     hub = Hub(cast(LearnerLink, link), coordinator, settings, clock=lambda: link.now)
     honest = [Honest(f"w{number}") for number in range(LANES)]

@@ -17,7 +17,9 @@ from millrace.learner.members.member_server import TURN_S
 from millrace.learner.members.membership import MAX_MEMBERS, REMEMBERED
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lag_statistics import MOST_WORKERS, LagStatistics
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from millrace.protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from millrace.protocol.messages import (
@@ -50,7 +52,9 @@ class Noisy:
 
     def __init__(self, max_env_failures: int = 0, **run: object) -> None:
         self.link = FakeLink()
-        self.coordinator = TicketCoordinator(run_spec(1, **run), max_lag=0, worker_timeout_s=5.0, first_session=1)
+        self.coordinator = TicketCoordinator(
+            run_spec(1, **run), RolloutDealer(1, Rounds(0)), worker_timeout_s=5.0, first_session=1
+        )
         settings = HubSettings(60.0, 600.0, max_env_failures)
         self.hub = Hub(cast(LearnerLink, self.link), self.coordinator, settings, clock=lambda: self.link.now)
         self.joins("honest")

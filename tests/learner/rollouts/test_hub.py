@@ -14,6 +14,8 @@ from millrace.learner.members.member import Member
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import RunError
 from millrace.protocol.logs.long_wait import AGAIN_S, FIRST_S
@@ -34,7 +36,9 @@ def hub_with_a_worker(
     acting_dtype: ActingDtype = "float32", processes: WorkerProcesses | None = None, lanes: int = 1
 ) -> tuple[FakeLink, Hub, Heartbeat]:
     link = FakeLink()
-    coordinator = TicketCoordinator(run_spec(lanes), max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
+    coordinator = TicketCoordinator(
+        run_spec(lanes), RolloutDealer(lanes, Rounds(0)), worker_timeout_s=WORKER_TIMEOUT_S, first_session=1
+    )
     hub = Hub(
         cast(LearnerLink, link),
         coordinator,

@@ -9,9 +9,9 @@ from typing import cast, get_args
 import pytest
 
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import lobby_settings, open_hub
 from millrace.learner.members.events import Failed, PolicyRaised, WorkerLeft, WorkerProcessFailed
 from millrace.learner.members.lobby import Lobby
+from millrace.learner.open_hub import lobby_settings, open_hub
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch, Standstill
 from millrace.protocol.alive import Alive, WorkerActivity, WorkerExit

@@ -26,8 +26,10 @@ from millrace.learner.members.events import (
 from millrace.learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import MOST_NOTES, STRIKES, TicketCoordinator
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
@@ -81,11 +83,9 @@ class Learner:
         """`run`: what differs from the smallest run."""
         self.coordinator = TicketCoordinator(
             run_spec(lanes, **run),
-            max_lag=max_lag,
+            RolloutDealer(lanes, Rounds(max_lag), ledger=ledger, incarnations=incarnations),
             worker_timeout_s=TIMEOUT_S,
             first_session=100,
-            ledger=ledger,
-            incarnations=incarnations,
         )
         self.now = 0.0
         if publish:

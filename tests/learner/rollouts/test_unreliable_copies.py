@@ -7,6 +7,8 @@ from typing import cast
 import pytest
 
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.alive import Alive, WorkerExit
 from millrace.protocol.errors import EnvironmentFailed
@@ -25,7 +27,9 @@ class Unreliable:
 
     def __init__(self) -> None:
         self.link = FakeLink()
-        self.coordinator = TicketCoordinator(run_spec(COPIES), max_lag=0, worker_timeout_s=1e9, first_session=1)
+        self.coordinator = TicketCoordinator(
+            run_spec(COPIES), RolloutDealer(COPIES, Rounds(0)), worker_timeout_s=1e9, first_session=1
+        )
         link, settings = cast(LearnerLink, self.link), HubSettings(1e9, 1e9, max_env_failures=3)
         self.hub = Hub(link, self.coordinator, settings, clock=lambda: self.link.now)
         self.processes = 0

@@ -12,8 +12,8 @@ from millrace.flags.parse import parse_flags
 from millrace.launch.crew import Crew
 from millrace.launch.worker_pool import open_worker_pool
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.conversations import lobby_settings
 from millrace.learner.members.who_may_connect import BindSettings
+from millrace.learner.open_hub import lobby_settings
 from millrace.workers import worker_thread
 from millrace.workers.conversation.connection_rules import wait_limits_s
 from millrace.workers.conversation.session import Session, WorkerIdentity

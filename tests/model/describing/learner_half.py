@@ -15,6 +15,8 @@ from gymnasium import spaces
 from millrace.learner.members.describe_coordinator import FIRST_TICKET, DescribeCoordinator, Unknown
 from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.messages import Describe, Rejoin, WorkerExit
@@ -113,7 +115,11 @@ def _in_lobby(coordinator: DescribeCoordinator, event: Event, message: Content |
 def _taken_over(coordinator: DescribeCoordinator, settings: Describing, now: float) -> tuple[Learner, list[Outgoing]]:
     """The hub is made: it has the workers, and no weights yet."""
     made = TicketCoordinator(
-        settings.run, max_lag=settings.max_lag, worker_timeout_s=TIMEOUT_S, first_session=0, check_rows=any_rows
+        settings.run,
+        RolloutDealer(settings.run.lanes, Rounds(settings.max_lag)),
+        worker_timeout_s=TIMEOUT_S,
+        first_session=0,
+        check_rows=any_rows,
     )
     out = made.take_over(coordinator.membership, now)
     before = {peer: member.session for peer, member in coordinator.members.items()}

@@ -16,6 +16,8 @@ import zmq
 
 from millrace.learner.members.membership import REMEMBERED
 from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.address import worker_name
 from millrace.protocol.errors import BadMessage, RunError, UsageError
@@ -495,7 +497,7 @@ def test_an_eavesdropper_reads_everything_without_keys_and_nothing_with_them(net
 
 
 def coordinator(workers: int = 2) -> TicketCoordinator:
-    return TicketCoordinator(run_spec(workers), max_lag=0, worker_timeout_s=60.0, first_session=1000)
+    return TicketCoordinator(run_spec(workers), RolloutDealer(workers, Rounds(0)), worker_timeout_s=60.0, first_session=1000)
 
 
 def hub_of(link: LearnerLink) -> Hub:

@@ -19,7 +19,9 @@ import numpy as np
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
@@ -382,11 +384,9 @@ class World:
         self.plan = None
         coordinator = TicketCoordinator(
             self.run,
-            max_lag=self.max_lag,
+            RolloutDealer(self.run.lanes, Rounds(self.max_lag), ledger=ledger, incarnations=incarnations),
             worker_timeout_s=3.0,
             first_session=self.random.getrandbits(48),
-            ledger=ledger,
-            incarnations=incarnations,
         )
         self.coordinator = coordinator
         parameters = self.parameters[coordinator.membership._first_session] = PARAMETERS.copy()

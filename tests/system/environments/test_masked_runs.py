@@ -15,8 +15,8 @@ import pytest
 
 import millrace
 from millrace.learner.config.layers import resolve
-from millrace.learner.conversations import rollout_spec
 from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.rollout_spec import rollout_spec
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import MillraceError, UsageError

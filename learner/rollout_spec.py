@@ -1,31 +1,20 @@
-"""What a learner says to its workers, made from its settings: before the run, and in it.
+"""The specification that `Welcome` brings to the workers of a run, for our training and for a user's own loop.
 
-A run's specification is what `Welcome` brings, for our training and for a user's own loop.
-Who starts worker processes is not known here: the launchers in `millrace` pass in `WorkerProcesses`. Imports no torch.
+Imports no torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.env_spaces import EnvSpaces
-from millrace.learner.members.lobby import Lobby, LobbySettings
-from millrace.learner.rollouts.hub import Hub, HubObserver, HubSettings
-from millrace.learner.rollouts.ledger import Ledger
-from millrace.learner.rollouts.opponent_pool import OpponentPool
-from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.kinds_of_copies import has_masks
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.progress import RunProgress
-from millrace.protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, WaitSpec, facts_of_all_seats, seat_returns
+from millrace.protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats, seat_returns
 from millrace.protocol.wire.codec import check_can_be_sent
 from millrace.protocol.wire.compression import has_zstd
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
-
-NO_PROGRESS = RunProgress()
 
 
 def rollout_spec(
@@ -88,55 +77,3 @@ def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: RolloutConf
             f"environment {env}: expected a policy whose weights take at most {MAX_FRAME_BYTES:,} bytes, got {size:,}; wrap "
             "the environment so that its spaces are smaller, or choose a smaller net"
         )
-
-
-def open_hub(
-    config: RolloutConfig,
-    run: RunSpec,
-    lobby: Lobby,
-    check_interrupt: Callable[[], None],
-    observer: HubObserver = lambda hub: None,
-    past: tuple[Ledger, Sequence[int]] | None = None,
-    opponents: OpponentPool | None = None,
-) -> Hub:
-    """The hub of a run, for the workers in this lobby, and for those that join later. It takes the lobby's place.
-
-    An update takes one rollout for each lane. `check_interrupt` is called while the hub waits: what it
-    raises ends the wait. `observer` is called each time the hub has listened. `past`: the ledger, and the next
-    incarnation of each lane, of a run that goes on. `opponents`: those of a run with teams.
-    """
-    ledger, incarnations = (None, ()) if past is None else past
-    coordinator = TicketCoordinator(
-        run,
-        max_lag=config.max_lag,
-        worker_timeout_s=config.worker_timeout_s,
-        first_session=lobby.first_session,
-        ledger=ledger,
-        incarnations=incarnations,
-        opponents=opponents,
-    )
-    limits = [most for most in (config.max_env_copies, lobby.processes.most_copies) if most]
-    if limits:
-        coordinator.evaluation.most_copies = min(limits) - run.lanes * run.copies
-    settings = HubSettings(
-        config.no_workers_timeout_s,
-        config.stall_timeout_s(),
-        config.max_env_failures,
-        config.acting_dtype,
-    )
-    hub = Hub(lobby.link, coordinator, settings, lobby.processes, check_interrupt, observer)
-    hub.take_over(lobby.hand_over())
-    return hub
-
-
-def lobby_settings(config: RolloutConfig, progress: RunProgress = NO_PROGRESS) -> LobbySettings:
-    """The settings that matter before the run. `progress`: how far it is."""
-    return LobbySettings(
-        wait=WaitSpec(config.call_timeouts(), config.heartbeat_s()),
-        worker_timeout_s=config.worker_timeout_s,
-        no_workers_timeout_s=config.no_workers_timeout_s,
-        stall_timeout_s=config.stall_timeout_s(),
-        max_env_failures=config.max_env_failures,
-        progress=progress,
-        launched_workers=config.launched_workers,
-    )
