@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic
 
-from millrace.learner.members.events import Event, WorkerNotStarted
+from millrace.learner.members.events import Event, WorkerStartFailed
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import MemberState, SentUnusable
 from millrace.learner.members.membership import M, Membership, Outgoing
@@ -75,7 +75,7 @@ class Coordinator(ABC, Generic[M]):
         """A process of this program has ended."""
         match ended:
             case StartFailed(worker, reason, last_lines):
-                self.events.append(WorkerNotStarted(worker, reason, last_lines))
+                self.events.append(WorkerStartFailed(worker, reason, last_lines))
                 return []
             case WorkerExit():
                 return self._deal() if self.membership.record_exit(ended) else []

@@ -24,7 +24,7 @@ class WorkerJoined:
 
 @dataclass(frozen=True)
 class WorkerLeft:
-    """A worker is no longer a member. `tickets` of its tickets are dealt again."""
+    """A worker is no longer a member. `tickets`: how many of its tickets are dealt again."""
 
     json_name: ClassVar[str] = "left"
     worker: str
@@ -35,7 +35,7 @@ class WorkerLeft:
 
 @dataclass(frozen=True)
 class WorkerRefused:
-    """A worker was refused, and is no member. If it was one, `tickets` of its tickets are dealt again."""
+    """A worker was refused, and is no member. `tickets`: how many of its tickets are dealt again, if it was one."""
 
     json_name: ClassVar[str] = "refused"
     worker: str
@@ -47,9 +47,8 @@ class WorkerRefused:
 class NamelessHello:
     """A Hello came over a connection without a routing id, and was refused.
 
-    Mostly nothing is wrong: a worker that was not answered for a while, or its successor of the same name, has connected
-    again, and ZeroMQ takes the routing id from the older connection, with what it had sent still unread. The newer one says
-    Hello itself. If a client sets no routing id, it learns that by the refusal.
+    Usually it is harmless: a worker that connected again, or its successor of the same name, has taken over the routing id,
+    and this is a leftover message of the older connection. A client that sets no routing id learns that by the refusal.
     """
 
     json_name: ClassVar[str] = "nameless_hello"
@@ -59,7 +58,7 @@ class NamelessHello:
 
 @dataclass(frozen=True)
 class Failed:
-    """A worker failed in code of the user. It may come back."""
+    """A worker failed in the user's code. It may come back. Each event is one of the three classes below."""
 
     json_name: ClassVar[str]
     worker: str
@@ -70,9 +69,9 @@ class Failed:
     lanes: tuple[int, ...] = ()
     """The lane that failed, if it is known; else those that the worker held."""
     worked_s: float | None = None
-    """For how many seconds the worker had made env steps before; None if its process is not known to have made one."""
+    """Seconds from its first env step to the failure; None if its process is not known to have made one."""
     spare: bool = False
-    """Whether it held no lane while every lane had a worker. Such a failure does not count against the run."""
+    """Whether the run did not need it: every lane had another worker. Such a failure does not count against the run."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +98,8 @@ class WorkerProcessFailed(Failed):
 
 
 @dataclass(frozen=True)
-class WorkerNotStarted:
-    """A process that this program started ended by itself before it had joined."""
+class WorkerStartFailed:
+    """A worker's process ended by itself before it had joined. This program had started it."""
 
     json_name: ClassVar[str] = "not_started"
     worker: str
@@ -110,7 +109,7 @@ class WorkerNotStarted:
 
 
 @dataclass(frozen=True)
-class RejoinRequested:
+class WorkerToldToRejoin:
     """A worker was told to join again because its session had ended.
 
     The `late` transitions that its message carried are counted and not used.
@@ -124,7 +123,7 @@ class RejoinRequested:
 
 @dataclass(frozen=True)
 class EnvironmentNoted:
-    """A worker has seen something in its environment that whoever trains should know."""
+    """A worker has seen something in its environment that the user should know."""
 
     json_name: ClassVar[str] = "environment_noted"
     worker: str
@@ -160,10 +159,10 @@ LoggedEvent = (
     WorkerJoined
     | WorkerLeft
     | WorkerRefused
-    | WorkerNotStarted
+    | WorkerStartFailed
     | NamelessHello
     | Failed
-    | RejoinRequested
+    | WorkerToldToRejoin
     | EnvironmentNoted
 )
 Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
@@ -175,7 +174,7 @@ def describe(event: LoggedEvent) -> str:
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:
-        case Failed(traceback=below) | WorkerNotStarted(last_lines=below) if below:
+        case Failed(traceback=below) | WorkerStartFailed(last_lines=below) if below:
             return f"{line}\n{indented(below)}"
         case _:
             return line
@@ -197,9 +196,9 @@ def _line(event: LoggedEvent) -> str:
         case Failed(worker, host, error, spare=spare):
             died = isinstance(event, WorkerProcessFailed) and not spare
             return f"worker {worker} ({host}): {error}" + ("; this counts as a failure of the environment" if died else "")
-        case WorkerNotStarted(worker, why):
+        case WorkerStartFailed(worker, why):
             return f"worker {worker} {why}"
-        case RejoinRequested(worker, _, late):
+        case WorkerToldToRejoin(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"
         case EnvironmentNoted(worker, note):

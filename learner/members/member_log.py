@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from millrace.learner.members.events import LoggedEvent, RejoinRequested
+from millrace.learner.members.events import LoggedEvent, WorkerToldToRejoin
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
 from millrace.protocol.wire.learner_link import LearnerLink
@@ -46,7 +46,7 @@ class MemberLog:
         """
         source = self._source(cause)
         kept_back: int | None = 0
-        if isinstance(event, RejoinRequested):
+        if isinstance(event, WorkerToldToRejoin):
             kept_back = self._limit.due(f"told {event.worker} {source}", self._clock())
         if kept_back is None:
             return

@@ -28,13 +28,13 @@ from millrace.learner.members.events import (
     LoggedEvent,
     NamelessHello,
     PolicyRaised,
-    RejoinRequested,
     RolloutArrived,
     RolloutRejected,
     WorkerJoined,
     WorkerLeft,
-    WorkerNotStarted,
     WorkerRefused,
+    WorkerStartFailed,
+    WorkerToldToRejoin,
     describe,
 )
 from millrace.learner.members.held_up import what_they_do
@@ -331,11 +331,11 @@ class MemberServer:
     def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
         """Log an event. `told`: the worker of whose failure the log has just told. Returns who that is now."""
         line = describe(event)
-        expected = isinstance(event, WorkerJoined | RejoinRequested | NamelessHello)
+        expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello)
         match event:
             case WorkerRefused(_, why) | NamelessHello(_, why):
                 self._last_turned_away = f"was refused: {one_line(why)}"
-            case WorkerNotStarted(_, why):
+            case WorkerStartFailed(_, why):
                 self._last_turned_away = why
             case WorkerLeft(worker, why, _, on_purpose):
                 expected = on_purpose and self._membership.draining is not None

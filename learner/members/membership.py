@@ -25,11 +25,11 @@ from millrace.learner.members.events import (
     Failed,
     NamelessHello,
     PolicyRaised,
-    RejoinRequested,
     WorkerJoined,
     WorkerLeft,
     WorkerProcessFailed,
     WorkerRefused,
+    WorkerToldToRejoin,
 )
 from millrace.learner.members.member import Member, SharingSupervisor
 from millrace.learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
@@ -168,7 +168,7 @@ class Membership(Generic[M]):
         if isinstance(message, Hello | Alive | Goodbye | Failure):  # rule UNKNOWN_SESSION
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
-        self.events.append(RejoinRequested(name_for_people(peer), message.session, late))
+        self.events.append(WorkerToldToRejoin(name_for_people(peer), message.session, late))
         return [(peer, Rejoin(message.session))]
 
     def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:

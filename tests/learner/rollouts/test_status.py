@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from millrace.cli.status import as_table, ask, in_json, observer_name
-from millrace.learner.members.events import LoggedEvent, RejoinRequested, WorkerLeft, describe
+from millrace.learner.members.events import LoggedEvent, WorkerLeft, WorkerToldToRejoin, describe
 from millrace.learner.members.member import MAX_LATE_ACTIONS
 from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.run_status import progress_now, status
@@ -281,13 +281,13 @@ def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event(
     learner.coordinator.events.clear()
     learner.says(b"a", late)
     (event,) = learner.coordinator.events
-    assert event == RejoinRequested("a", late.session, 1)
+    assert event == WorkerToldToRejoin("a", late.session, 1)
     assert "1 transitions that it sent are counted, not used" in describe(event)
 
 
 EVENTS: list[tuple[LoggedEvent, dict[str, Any]]] = [
     (WorkerLeft("w0", "was killed", 2, False), {"event": "left", "worker": "w0", "why": "was killed", "tickets": 2}),
-    (RejoinRequested("w0", 7, 640), {"event": "asked_to_rejoin", "worker": "w0", "session": 7, "late": 640}),
+    (WorkerToldToRejoin("w0", 7, 640), {"event": "asked_to_rejoin", "worker": "w0", "session": 7, "late": 640}),
 ]
 
 
