@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from millrace.learner.algorithms import ALGORITHMS
 
-MODULES = ("torch", "millrace.learner.run")
+MODULES = ("torch", "millrace.learner.open_run")
 POLL_S = 0.05
 THREAD = "imports"
 

@@ -99,12 +99,11 @@ def _longest_order_s(config: Config) -> float:
 class SteppingPool:
     """A pool whose policy acts in a thread of this process. It is a `millrace.launch.worker_pool.WorkerPool`."""
 
-    def __init__(self, settings: ActingSettings, stepping: VectorEnvPool, own: ActingPool, resources: ExitStack) -> None:
-        """`stepping`: where workers step. `own`: where the thread joins. `resources` are released before both are closed."""
+    def __init__(self, settings: ActingSettings, stepping: VectorEnvPool, own: ActingPool) -> None:
+        """`stepping`: where workers step. `own`: where the thread joins."""
         self._settings = settings
         self._stepping = stepping
         self._own = own
-        self._resources = resources
         self._before: LobbySettings | None = None
         self._thread: Supervisor | None = None
         self._env: ZmqVectorEnv | None = None
@@ -114,17 +113,21 @@ class SteppingPool:
         """Where the workers join that step."""
         return self._stepping.bound
 
-    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
-        """Start the workers that step; of the crew, as many as there are copies for."""
+    @contextmanager
+    def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
+        """The lobby of the workers that step: of the crew, as many as there are copies for."""
         self._before = before
-        return self._stepping.start(crew, before)
+        with self._stepping.start(crew, before) as lobby:
+            try:
+                yield lobby
+            finally:
+                self.stop(AT_ONCE_S)
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
         """The lobby in which the thread joins."""
         assert self._before is not None, "start comes first"
         settings = self._settings
         env = self._env = self._stepping.vector_env(described)
-        self._resources.callback(env.close)
         before_wait = _BeforeWaits(env, settings.workers, settings.no_workers_timeout_s)
         copies = SplitVectorEnv(env, settings.lanes, before_wait, partial(_step_lanes, env), settings.facts, masked=masked)
         self._thread = self._acting_thread(copies)
@@ -137,10 +140,12 @@ class SteppingPool:
         self._env.hub.status_of_run = status
 
     def stop(self, within_s: float) -> None:
-        """Stop the thread. The workers that step are stopped when the pool is closed."""
+        """Stop the thread, then the workers that step for it."""
         if self._thread is not None:
             self._thread.ask_to_leave()  # `stop` asks a second time: then the worker leaves at once
             self._thread.stop(within_s)
+        if self._env is not None:
+            self._env.close()
 
     def _acting_thread(self, copies: SplitVectorEnv) -> Supervisor:
         evaluation_copies = copies.evaluation_lane(self._settings.evaluation_copies)
@@ -159,10 +164,8 @@ class SteppingPool:
 @contextmanager
 def open_stepping_pool(settings: ActingSettings) -> Iterator[SteppingPool]:
     """Bind the address where workers join that only step. Raises `UsageError`."""
-    with open_worker_pool(BindSettings(), "inproc") as own, ExitStack() as of_env, ExitStack() as resources:
-        pool = SteppingPool(settings, open_vector_env_pool(settings.copies, of_env), own, resources)
-        resources.callback(lambda: pool.stop(AT_ONCE_S))
-        yield pool
+    with open_worker_pool(BindSettings(), "inproc") as own, ExitStack() as of_env:
+        yield SteppingPool(settings, open_vector_env_pool(settings.copies, of_env), own)
 
 
 class _ActingProcesses(WorkerProcesses):

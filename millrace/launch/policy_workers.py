@@ -54,7 +54,8 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
                 raise KeyboardInterrupt
 
         pool = stack.enter_context(_pool(policy, which))
-        lobby = pool.start(Crew(which.workers, logs=_log_folder(which, stack)), lobby_settings(which.settings))
+        crew = Crew(which.workers, logs=_log_folder(which, stack))
+        lobby = stack.enter_context(pool.start(crew, lobby_settings(which.settings)))
         described = None
         if which.inference == "learner":
             described = lobby.describe(Unknown(policy.env.for_evaluation()), check_interrupt)

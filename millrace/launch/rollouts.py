@@ -44,7 +44,7 @@ def start(
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     pool = resources.enter_context(open_worker_pool(where, config.transport, code))
     crew = Crew() if listens else Crew(config.workers, cores=worker_cores(config))
-    lobby = pool.start(crew, lobby_settings(config))
+    lobby = resources.enter_context(pool.start(crew, lobby_settings(config)))
     described = lobby.describe(Unknown(env, config.vector), check_interrupt)
     spaces = EnvSpaces.of_description(described, config.action_masks)
     policy_spec = policy.spec(spaces.observation, spaces.action)

@@ -62,7 +62,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
             folder = folder or stack.enter_context(run_folder(config, None))
             crew = crew_of_run(config, folder.path)
         progress = progress_before(None if resume is None else resume.run, config.steps)
-        lobby = pool.start(crew, lobby_settings(config, progress))
+        lobby = stack.enter_context(pool.start(crew, lobby_settings(config, progress)))
         known = known_environment(config, env, resume, lobby)
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)

@@ -10,7 +10,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Literal
 
@@ -162,7 +162,7 @@ def make_vec(
     resources = ExitStack()
     try:
         pool = open_vector_env_pool(settings, resources)
-        lobby = pool.start(Crew(), before)
+        lobby = resources.enter_context(pool.start(Crew(), before))
         made = pool.vector_env(lobby.describe(pool.requested.to_describe))
         made.hub.on_death = died
         made.hub.while_waiting = deaths.check
@@ -199,8 +199,8 @@ class VectorEnvPool:
         """Number of workers that are started here."""
         return self._settings.local_workers
 
-    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
-        """Start the workers, as many as the settings say, with the logs and cores of this crew. Call it once."""
+    def start(self, crew: Crew, before: LobbySettings) -> AbstractContextManager[Lobby]:
+        """The lobby of the workers: as many as the settings say, with the logs and cores of this crew. Call it once."""
         crew = replace(crew, count=self.expected, inherited=self._inherited)
         return self._pool.start(crew, replace(before, wait=self.requested.wait))
 

@@ -1,17 +1,18 @@
 """The pool of workers of a learner: they are started here, or join from elsewhere.
 
-The order is: open the pool, which binds its address; `start` its workers, or log how one is started elsewhere; let a worker
-in the lobby describe the environment; `begin` with those who collect.
+The order is: open the pool, which binds its address; make or open the folder that the workers write to; `start` the workers,
+or log how one is started elsewhere; let a worker in the lobby describe the environment; `begin` with those who collect.
 
-Rule: whatever happens, no worker, thread, socket file or folder of ours outlives its pool. When a pool is closed, workers
-that still run are stopped at once. So whoever has let them work calls `stop` first, with the time that they may take.
+Rule: whatever happens, no worker or thread outlives `start`, and no socket file or folder of ours outlives the pool. Workers
+that still run at the end of `start` are stopped at once. So whoever has let them work calls `stop` first, with the time that
+they may take.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -44,8 +45,8 @@ class WorkerPool(Protocol):
         """The address where workers join, and who may."""
         ...
 
-    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
-        """Start these workers, or say how one is started elsewhere. Call it once.
+    def start(self, crew: Crew, before: LobbySettings) -> AbstractContextManager[Lobby]:
+        """The lobby of these workers, which are started, or join from elsewhere. Call it once.
 
         `before`: settings that hold until the run begins.
         """
@@ -81,14 +82,18 @@ class ActingPool:
     lobby: Lobby | None = None
     """Once they were."""
 
-    def start(self, crew: Crew, before: LobbySettings) -> Lobby:
+    @contextmanager
+    def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
         """The lobby of the workers. None is started here if they join at `where`."""
         if self.where.bind:
             self.bound.announce(self.where.advertise)
         else:
             self.processes = _LocalProcesses(crew, partial(_started, self.bound, self.token, crew))
         self.lobby = Lobby(self.bound.link, self.processes, before)
-        return self.lobby
+        try:
+            yield self.lobby
+        finally:
+            self.stop(AT_ONCE_S)
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
         """The same lobby: these workers collect."""
@@ -125,9 +130,7 @@ def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Ite
         else:
             keyring, token = _temporary_keys(transport, where.keys, insecure=where.insecure)
             bound = bind(private_address(transport, resources), keyring, resources, code)
-        pool = ActingPool(bound, where, token)
-        resources.callback(lambda: pool.stop(AT_ONCE_S))
-        yield pool
+        yield ActingPool(bound, where, token)
 
 
 def _temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:

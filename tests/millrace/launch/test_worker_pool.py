@@ -32,8 +32,8 @@ def test_a_worker_process_waits_for_its_learner_as_long_as_that_does_not_listen(
         return subprocess.Popen(["sh", "-c", "exit 0"], **how)
 
     monkeypatch.setattr(worker_process, "popen", popen)
-    with open_worker_pool(BindSettings(), "ipc") as pool:
-        pool.start(Crew(2, evaluating=1), lobby_settings(RolloutConfig()))
+    with open_worker_pool(BindSettings(), "ipc") as pool, pool.start(Crew(2, evaluating=1), lobby_settings(RolloutConfig())):
+        pass
     for command, evaluates in zip(commands, (False, True), strict=True):
         flags = parse_flags(WorkerFlags, command[command.index("millrace.workers") + 1 :], "worker")
         assert wait_limits_s(flags.join_timeout_s, stay=flags.stay) == (math.inf, math.inf)
@@ -48,8 +48,7 @@ def test_a_worker_thread_waits_for_its_learner_as_long_as_that_does_not_listen(m
         return Session(who, now, join_timeout_s=join_timeout_s, rejoin_timeout_s=rejoin_timeout_s)
 
     monkeypatch.setattr(worker_thread, "Session", session)
-    with open_worker_pool(BindSettings(), "inproc") as pool:
-        pool.start(Crew(1), lobby_settings(RolloutConfig()))
+    with open_worker_pool(BindSettings(), "inproc") as pool, pool.start(Crew(1), lobby_settings(RolloutConfig())):
         pool.stop(WITHIN_S)
         pool.processes.ended()
         assert not pool.processes.left(collecting=False)
