@@ -12,14 +12,15 @@ class Rounds:
     """The rounds of one learner, counted from 0."""
 
     def __init__(self, max_lag: int) -> None:
+        self.max_lag = max_lag
+        """L"""
         self.next = 0
         """the round of the next update"""
-        self._max_lag = max_lag
         self._versions: dict[int, int] = {}  # of each round that may be collected and was not taken
 
     def begin(self, newest: int) -> range:
         """The next update begins, while this version is the newest. Returns the rounds that it opens, once."""
-        opened = range(self.next + len(self._versions), self.next + 1 + self._max_lag)
+        opened = range(self.next + len(self._versions), self.next + 1 + self.max_lag)
         self._versions |= dict.fromkeys(opened, newest)
         return opened
 

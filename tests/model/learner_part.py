@@ -71,7 +71,7 @@ NOT_SAVED: dict[type, set[str]] = {
     TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},
-    Rounds: {"_max_lag"},
+    Rounds: {"max_lag"},
 }
 """What is not: constants, figures for people, what follows from the version, as the opponents do, or from tickets, as the
 versions that they name, and parts that no event of the model uses."""

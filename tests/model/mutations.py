@@ -55,7 +55,7 @@ class Mutation:
 
 MUTATIONS = {
     "one round too far ahead": Mutation(
-        Rule.OPEN_ROUNDS, ROUNDS, "self.next + 1 + self._max_lag)", "self.next + 2 + self._max_lag)"
+        Rule.OPEN_ROUNDS, ROUNDS, "self.next + 1 + self.max_lag)", "self.next + 2 + self.max_lag)"
     ),
     "rounds are opened twice": Mutation(
         Rule.OPEN_ROUNDS, ROUNDS, "range(self.next + len(self._versions), ", "range(self.next, "

@@ -46,11 +46,13 @@ class ReplayedLearner(learner_part.Learner):
 class Rules:
     """The rules of the model, for one learner."""
 
-    def __init__(self, coordinator: TicketCoordinator, max_lag: int, used: set[int]) -> None:
+    def __init__(self, coordinator: TicketCoordinator, used: set[int]) -> None:
         """`used`: tickets whose rollouts were used before the checkpoint from which it started."""
         self.used = used
         self._coordinator = coordinator
-        settings: Any = SimpleNamespace(lanes=coordinator.run.lanes, max_lag=max_lag, opponents=0)
+        settings: Any = SimpleNamespace(
+            lanes=coordinator.run.lanes, max_lag=coordinator.rollouts.rounds.max_lag, opponents=0
+        )
         self._learner = ReplayedLearner(settings, coordinator)
 
     def begun(self) -> None:
@@ -131,7 +133,7 @@ class Replay:
             named["check_rows"] = self._check_rows
         made = self.parts[part] = CLASSES[part](*given, **named)
         if part == "TicketCoordinator":
-            self._rules = Rules(made, named["max_lag"], {each for each in used if each < made.rollouts.ledger.issued})
+            self._rules = Rules(made, {each for each in used if each < made.rollouts.ledger.issued})
 
     def _check_rows(self, rollout: Rollout, run: RunSpec) -> None:
         """As the learner found them."""
