@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
@@ -18,7 +19,9 @@ import numpy as np
 from millrace.learner.members.describe_coordinator import Unknown, accept_any
 from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Membership
-from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
+from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import Rollout, ToLearner, ToWorker, Weights
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
@@ -84,6 +87,16 @@ class SaidMember(NamedTuple):
     """A worker as the learner sees it, by its routing id."""
 
     peer: bytes
+
+
+class SaidDealer(NamedTuple):
+    """The dealer of rollouts of a new learner: how it is made."""
+
+    lanes: int
+    max_lag: int
+    ledger: Ledger
+    incarnations: tuple[int, ...]
+    opponents: OpponentPool | None
 
 
 class SaidWaiting(NamedTuple):
@@ -167,6 +180,10 @@ def argument(value: Any) -> Any:
             return SaidMember(value.peer)
         case Membership():
             return SaidWaiting()
+        case RolloutDealer():
+            lanes, rounds = len(value.lanes), value.rounds
+            incarnations = tuple(RolloutDealer.incarnations(value))  # a call of `value` itself would be recorded
+            return SaidDealer(lanes, rounds.max_lag, value.ledger.copy(), incarnations, deepcopy(value.opponents))
         case Unknown():
             return replace(value, accept=accept_any)  # all that was asked for was accepted
         case AcceptedRollout():

@@ -20,6 +20,7 @@ from types import ModuleType
 from typing import Any
 
 FOLDER = "MILLRACE_TRACE"
+OPEN_HUB = "millrace.learner.open_hub"
 COORDINATOR = "millrace.learner.rollouts.ticket_coordinator"
 DESCRIBE = "millrace.learner.members.describe_coordinator"
 SESSION = "millrace.workers.conversation.session"
@@ -44,7 +45,7 @@ NOT_RECORDED = {  # it changes nothing, or nobody calls it
     "DescribeCoordinator": {"drain", "status", "take_over"},
     "Session": {"is_unwanted", "missing_versions"},
 }
-MADE_BY_THE_COORDINATOR = ("Membership", "RolloutDealer", "EvaluationDealer")
+PARTS_OF_THE_COORDINATOR = ("Membership", "RolloutDealer", "EvaluationDealer")
 CHANGE_NOTHING_IF_EMPTY = ("tick", "heartbeat_if_due")
 
 
@@ -148,7 +149,7 @@ def recorded(original: type[Any]) -> type[Any]:
         return call
 
     def make(self: Any, *given: Any, **named: Any) -> None:
-        if part in MADE_BY_THE_COORDINATOR:
+        if part in PARTS_OF_THE_COORDINATOR:
             original.__init__(self, *given, **named)
         else:
             _recorder_of(part, given).call(part, "__init__", original.__init__, self, *given, **named)
@@ -161,7 +162,8 @@ class _Finder(MetaPathFinder):
     """Imports some modules with recorded classes."""
 
     classes = {
-        COORDINATOR: ("TicketCoordinator", "Membership", "RolloutDealer", "EvaluationDealer"),
+        OPEN_HUB: ("RolloutDealer",),
+        COORDINATOR: ("TicketCoordinator", "Membership", "EvaluationDealer"),
         DESCRIBE: ("DescribeCoordinator", "Membership"),
         SESSION: ("Session",),
     }

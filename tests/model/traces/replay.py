@@ -13,18 +13,19 @@ from typing import Any
 import numpy as np
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator
-from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.conversation.session import Session
 from tests.model import learner_part
-from tests.model.traces.record import Digests, Record, SaidMember, SaidRollout, SaidWaiting, message_of
+from tests.model.traces.record import Digests, Record, SaidDealer, SaidMember, SaidRollout, SaidWaiting, message_of
 from tests.support.conversation.rules import waiting_rollouts
 
 CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
-MADE_BY_THE_COORDINATOR = {"Membership": "membership", "RolloutDealer": "rollouts", "EvaluationDealer": "evaluation"}
+PARTS_OF_THE_COORDINATOR = {"Membership": "membership", "RolloutDealer": "rollouts", "EvaluationDealer": "evaluation"}
 
 
 class NotAccepted(AssertionError):
@@ -122,6 +123,8 @@ class Replay:
     def _made(self, said: Any, *, to_learner: bool) -> Any:
         if isinstance(said, SaidWaiting):
             return self.parts["DescribeCoordinator"].membership
+        if isinstance(said, SaidDealer):
+            return RolloutDealer(said.lanes, Rounds(said.max_lag), said.ledger, said.incarnations, said.opponents)
         if isinstance(said, SaidRollout) and said.wrong:
             self._wrong_rows[said.digest] = said.wrong
         if isinstance(said, list):
@@ -142,7 +145,7 @@ class Replay:
 
     def _call(self, record: Record, given: list[Any], named: dict[str, Any]) -> None:
         coordinator: Any = self.parts.get("TicketCoordinator", self.parts.get("DescribeCoordinator"))
-        name = MADE_BY_THE_COORDINATOR.get(record.part)
+        name = PARTS_OF_THE_COORDINATOR.get(record.part)
         called = self.parts[record.part] if name is None else getattr(coordinator, name)
         given = [_member(each, coordinator) for each in given]
         waiting = waiting_rollouts(coordinator) if self._rules is not None else []
