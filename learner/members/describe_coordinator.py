@@ -113,8 +113,8 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         for ticket in lost:
-            del member.tickets[ticket]  # it is free again, if this was the order of an earlier environment
-        return [self._order(member)] if self._tickets in lost and self.described is None else []
+            del member.tickets[ticket]  # so `_deal` orders the description again
+        return self._deal()
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
         """The answer to what a member sent in its session."""

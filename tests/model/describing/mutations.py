@@ -38,10 +38,7 @@ MUTATIONS = {
         Rule.ONE_DESCRIBES, COORDINATOR, "member.tickets[self._tickets] = member.replies\n", "pass\n"
     ),
     "a lost order to describe is not sent again": Mutation(
-        Rule.ORDER_AGAIN,
-        COORDINATOR,
-        "return [self._order(member)] if self._tickets in lost and self.described is None else []",
-        "return []",
+        Rule.ORDER_AGAIN, COORDINATOR, "            del member.tickets[ticket]  # so", "            pass  # so"
     ),
     "a description is not taken": Mutation(Rule.FIRST_DESCRIPTION, COORDINATOR, "self.described = described\n", "pass\n"),
     "nobody is asked in place of a lost worker": Mutation(
