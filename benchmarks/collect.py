@@ -183,7 +183,7 @@ def ours(kind: str, lanes: int, images: ActingDtype, spec: EnvSpec, copies: int,
     def turn() -> int:
         nonlocal sequence
         before = collector.steps
-        collector.collect([Assignment(0, lane, 0, sequence) for lane in mine], 0, 0, _no_pulse)
+        collector.collect([Assignment(0, lane, 0, sequence, sequence) for lane in mine], 0, 0, _no_pulse)
         sequence += 1
         return collector.steps - before
 

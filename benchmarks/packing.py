@@ -96,7 +96,7 @@ def cartpole(copies: int, steps: int) -> Rollout:
     run = msgspec.structs.replace(run_spec(1), env=EnvSpec("CartPole-v1"), copies=copies, rollout_steps=steps)
     policy = make_policy(run.policy)
     policy.load(np.zeros(acting_size(run.policy), np.float32), np.zeros(0, np.float32))
-    return Collector(run, policy).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: None)[0]
+    return Collector(run, policy).collect([Assignment(0, 0, 0, 0, 0)], 0, 0, lambda: None)[0]
 
 
 def packing(rounds: int) -> list[dict[str, object]]:

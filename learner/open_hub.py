@@ -5,14 +5,16 @@ Who starts worker processes is not known here: the launchers in `millrace` pass 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.rollouts.hub import Hub, HubObserver, HubSettings
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.progress import RunProgress
@@ -27,20 +29,24 @@ def open_hub(
     lobby: Lobby,
     check_interrupt: Callable[[], None],
     observer: HubObserver = lambda hub: None,
-    past: tuple[Ledger, Sequence[int]] | None = None,
+    past: PastRollouts | None = None,
     opponents: OpponentPool | None = None,
 ) -> Hub:
     """The hub of a run, for the workers in this lobby, and for those that join later. It takes the lobby's place.
 
     An update takes one rollout for each lane. `check_interrupt` is called while the hub waits: what it
-    raises ends the wait. `observer` is called each time the hub has listened. `past`: the ledger, and the next
-    incarnation of each lane, of a run that goes on. `opponents`: those of a run with teams.
+    raises ends the wait. `observer` is called each time the hub has listened. `past`: of a run that goes on.
+    `opponents`: those of a run with teams.
     """
-    ledger, incarnations = (None, ()) if past is None else past
-    rollouts = RolloutDealer(run.lanes, Rounds(config.max_lag), ledger, incarnations, opponents)
+    past = past or PastRollouts(Ledger(), ())
+    rounds = Rounds(config.max_lag, past.rounds.next, past.rounds.versions)
+    histories = LaneHistories(run.copies, config.most_repeated_steps(), past.lanes)
+    rollouts = RolloutDealer(run.lanes, rounds, past.ledger, past.incarnations, opponents, histories)
     coordinator = TicketCoordinator(
         run, rollouts, worker_timeout_s=config.worker_timeout_s, first_session=lobby.first_session
     )
+    for weights in past.acting:
+        coordinator.keep(weights)
     limits = [most for most in (config.max_env_copies, lobby.processes.most_copies) if most]
     if limits:
         coordinator.evaluation.most_copies = min(limits) - run.lanes * run.copies

@@ -73,7 +73,6 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
     state = restore(folder, algorithm) if setup.resumed else RunState()
     # The last save gets half of what is left of the grace time, and the workers need time to leave.
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
-    past = (state.ledger, state.incarnations)
     pool = _opponent_pool(config, spec, state.opponents)
     progress_file = ProgressFile(folder.path)
 
@@ -82,7 +81,8 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
         if folder.lock is None or not folder.lock.taken_over:
             progress_file.write(listened.progress, time.time())
 
-    hub = open_hub(config, spec, lobby, setup.check_running, watch_hub, past, pool)
+    hub = open_hub(config, spec, lobby, setup.check_running, watch_hub, state.past_rollouts(), pool)
+    state.lanes = state.acting = ()
     if state.opponent_policies is not None and pool is not None:
         hub.keep_opponents(*state.opponent_policies)
     state.opponent_policies = None

@@ -18,6 +18,7 @@ from millrace.learner.config.config import Config
 from millrace.learner.resume_checks import first_difference, policy_to_start_from
 from millrace.learner.rollouts.ledger import Ledger, Past
 from millrace.learner.rollouts.opponent_pool import PoolState
+from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState, packed, unpacked
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.env_attributes import AttributesState, EnvAttributes
 from millrace.learner.run_folder.episode_window import EpisodeWindow
@@ -26,6 +27,7 @@ from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import Natural, Real, Seconds, one_line
 from millrace.protocol.errors import BadMessage, CheckpointError, UsageError
+from millrace.protocol.messages import LanePast, Weights
 from millrace.protocol.policy.layout import buffer_layout, named_views
 from millrace.protocol.rollout import Episode
 from millrace.protocol.specs import PolicySpec
@@ -35,6 +37,8 @@ log = logging.getLogger("millrace.learner")
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, BadMessage)
 """What loading a state of another form raises."""
 POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # of a `RunState`; a checkpoint has them as tensors
+RECORDS: dict[str, type[msgspec.Struct]] = {"lanes": LanePast, "acting": Weights}
+"""Of a `RunState`; a checkpoint has them as bytes."""
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
@@ -47,6 +51,11 @@ class RunState(msgspec.Struct, kw_only=True):
     ledger: Ledger = msgspec.field(default_factory=Ledger)
     incarnations: list[Past] = []
     """The next incarnation of each lane."""
+    rounds: RoundsState = RoundsState()
+    lanes: Any = ()
+    """The past of each lane, `LanePast`."""
+    acting: Any = ()
+    """The weights of open rounds, without the newest, `Weights`."""
     episodes: list[Episode] = []
     """Those of the `EpisodeWindow`."""
     facts: list[str] = []
@@ -77,8 +86,13 @@ class RunState(msgspec.Struct, kw_only=True):
 
         policies = {name: getattr(self, name) for name in POLICIES}
         tensors = {name: each and [torch.from_numpy(array) for array in each] for name, each in policies.items()}
-        past = msgspec.to_builtins(msgspec.structs.replace(self, **dict.fromkeys(POLICIES)))
-        return {"past": past, **tensors, "algorithm": algorithm.state_dict()}
+        records = {name: torch.from_numpy(packed(getattr(self, name)).copy()) for name in RECORDS}
+        past = msgspec.to_builtins(msgspec.structs.replace(self, **dict.fromkeys((*POLICIES, *RECORDS))))
+        return {"past": past, **tensors, **records, "algorithm": algorithm.state_dict()}
+
+    def past_rollouts(self) -> PastRollouts:
+        """With which the hub goes on."""
+        return PastRollouts(self.ledger, self.incarnations, self.rounds, self.lanes, self.acting)
 
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
@@ -90,6 +104,8 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
         for name in POLICIES:
             if (policy := found.state.get(name)) is not None:
                 setattr(state, name, tuple(array.numpy() for array in policy))
+        for name, kind in RECORDS.items():
+            setattr(state, name, unpacked(kind, found.state[name].numpy()))
         algorithm.load_state_dict(found.state["algorithm"])
         _check_policies(state, algorithm.weights())
         state.ledger.end_outstanding()

@@ -98,6 +98,16 @@ class RolloutKeywords(TypedDict, total=False):
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
     is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
     """
+    lost_lanes: Literal["continue", "restart"]
+    """What becomes of running episodes when their worker is lost, when lanes move to another worker, and when the run is
+    resumed. continue: each is repeated on another env copy from its beginning, with the same seed and actions, and
+    goes on where it was. With environments that repeat themselves, results then do not depend on who was lost.
+    restart: new episodes begin.
+    """
+    replay_limit: int
+    """Longest episode, in steps, that is repeated so that it can go on. Where one is longer, a new one begins. To repeat
+    an episode takes as long as its steps took, without the policy.
+    """
     no_workers_timeout_s: float
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
     local ends at once when none is left.

@@ -33,7 +33,7 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import convert_rollout_settings
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.past_rollouts import PastRollouts, packed
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.episode_window import EpisodeWindow
 from millrace.learner.run_folder.progress import Progress, steps_per_second
@@ -156,14 +156,14 @@ class RolloutService:
         check_at_least("rollout_steps", rollout_steps, 1)
         self.restored: dict[str, Array] = {}
         """The arrays of the file that was restored, by name."""
-        past: tuple[Ledger, Sequence[int]] | None = None
+        past: PastRollouts | None = None
         self._version = -1
         self.env_steps: int = 0
         """Env steps in all batches so far, those before a restore included."""
         state: ServiceState | None = None
         if restore is not None:
             state, self.restored = read(Path(restore))
-            past = state.ledger, state.incarnations
+            past = state.past
             self._version = max(state.version - 1, -1)
             self.env_steps = state.env_steps
         self.config: RolloutConfig = config
@@ -341,14 +341,17 @@ class RolloutService:
         """
         self._check_open()
         with self._lock:
-            snapshot = self._hub.snapshot()
+            past = self._hub.past()
         state = ServiceState(
             env=self.run.env.id,
             policy=digest(self.run.policy),
             version=self._version,
             env_steps=self.env_steps,
-            ledger=snapshot.ledger,
-            incarnations=snapshot.incarnations,
+            ledger=past.ledger,
+            incarnations=list(past.incarnations),
+            rounds=past.rounds,
+            lanes=packed(past.lanes).tobytes(),
+            acting=packed(past.acting).tobytes(),
             normalizer=None if self._normalizer is None else self._normalizer.state(),
         )
         write(Path(path), state, arrays)

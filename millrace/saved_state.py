@@ -14,11 +14,13 @@ import numpy as np
 from msgspec import Meta
 
 from millrace.learner.rollouts.ledger import Ledger, Past
+from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState, unpacked
 from millrace.learner.run_folder.atomic_write import write_file
 from millrace.learner.run_folder.regular_files import open_regular, reason
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import LARGEST, one_line
 from millrace.protocol.errors import CheckpointError, UsageError
+from millrace.protocol.messages import LanePast, Weights
 from millrace.protocol.specs import PolicySpec
 
 OURS = "millrace"  # name of our entry, JSON as bytes; the user's arrays have other names
@@ -39,9 +41,21 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     ledger: Ledger
     incarnations: list[Past]
     """the next incarnation of each lane"""
+    rounds: RoundsState
+    lanes: bytes
+    """the past of each lane, packed"""
+    acting: bytes
+    """the weights of open rounds, without the newest, packed"""
     normalizer: dict[str, Any] | None = None
     """the state of the normalizer, as plain data; None if it was not used"""
     format: int = FORMAT
+
+    @property
+    def past(self) -> PastRollouts:
+        """With which the hub goes on. Raises as `unpacked` does."""
+        lanes = unpacked(LanePast, np.frombuffer(self.lanes, np.uint8))
+        acting = unpacked(Weights, np.frombuffer(self.acting, np.uint8))
+        return PastRollouts(self.ledger, self.incarnations, self.rounds, lanes, acting)
 
 
 def digest(policy: PolicySpec) -> str:
@@ -75,6 +89,7 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
             arrays = {name: file[name] for name in file.files}
         state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
         state.ledger.end_outstanding()
+        _ = state.past  # it raises for what no service has
     except Exception as error:  # zipfile, numpy and msgspec raise a dozen types for damaged files
         raise unreadable(path, error) from error
     if state.format != FORMAT:

@@ -41,6 +41,8 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     """whether the environment, the policy, or the worker is to blame: it did not leave on purpose"""
     of_policy: bool = False
     """it failed in a call of a policy that the user wrote; no environment is to blame"""
+    hung: bool = False
+    """its supervisor has ended it, because a call took too long: what led there is not repeated"""
 
 
 @dataclass(frozen=True)

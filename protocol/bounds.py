@@ -25,6 +25,7 @@ MAX_TEXT = 64_000  # characters
 LARGEST = 2**53  # every whole number up to here is exact as a float64 too
 MAX_TICKETS = 1 << 16  # in one message
 MAX_WORKERS = 1_024  # that one supervisor speaks for
+MAX_COPIES = 1 << 16  # in one lane
 MAX_SEEDS = 1_024  # in one order to evaluate
 MAX_FACTS = 32  # of an episode
 MOST_FRAMES = 1_500  # that are sent of one episode: a minute of video at 25 frames a second

@@ -30,13 +30,14 @@ from millrace.protocol.bounds import (
 )
 from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.lane_past import LanePast
 from millrace.protocol.message_base import Message
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.space_spec import EnvDescription
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
-PROTOCOL_VERSION = 11
+PROTOCOL_VERSION = 12
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
 
@@ -58,6 +59,8 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     Hello keeps the number. So it also tells which process a Welcome answers (rules HELLO, HELLO_AGAIN)"""
     evaluates: bool = False
     """true: the worker only plays evaluations, and gets no lane (rule EVALUATES)"""
+    continues: bool = False
+    """true: the worker can continue a lane that another one had, from its past (rule PAST)"""
 
     @property
     def is_first_attempt(self) -> bool:
@@ -118,9 +121,13 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     incarnation: Natural
     sequence: Natural
     """number of the rollout: they are collected in this order, from 0 in every incarnation"""
+    round: Natural
+    """which update the rollout is for, counted since the run began: it decides the random numbers of the actions"""
     opponent: Whole | None = None
     """who plays the other teams in the episodes that begin in it: the version of these weights, or −1 − k for
     `RunSpec.scripted[k]` (rule OPPONENT)"""
+    past: LanePast | None = None
+    """with sequence 0: what to continue. None: new episodes begin, as the first ones of the lane do (rule PAST)"""
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
@@ -487,7 +494,7 @@ ToObserver = Status
 __all__ = [
     "PROTOCOL_VERSION", "TOLD_TO_STOP", "Alive", "Answer", "Array", "Call", "Collect", "Describe", "Described", "Doing",
     "Drain", "EpisodeRows", "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire",
-    "LaneIncarnation", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset", "Returned",
-    "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
+    "LaneIncarnation", "LanePast", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset",
+    "Returned", "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
     "WorkerActivity", "WorkerExit", "WorkerStatus", "versions_of",
 ]  # fmt: skip

@@ -28,9 +28,9 @@ class Purpose(IntEnum):
     PRIOR = 6
     """what is drawn from a dataset of prior data"""
     COPIES = 7
-    """reset seeds of env copies; lane, incarnation, copy"""
+    """reset seeds of env copies; lane, number of the start, copy"""
     ACTIONS = 8
-    """actions of rollouts, with their exploration; lane, incarnation"""
+    """actions of rollouts, with their exploration; lane, round"""
     EVALUATION = 9
     """reset seeds of a run's evaluations; episode"""
     CONFIRMATION = 10
@@ -48,9 +48,9 @@ class Purpose(IntEnum):
     CLONING = 16
     """the order of demonstrations; epoch"""
     OPPONENTS = 17
-    """actions of opponents; lane, incarnation"""
+    """actions of opponents; lane, round"""
     MATCHES = 18
-    """which opponent plays in a rollout; lane, incarnation, sequence"""
+    """which opponent plays in a rollout; lane, round"""
     PLAYED_OPPONENTS = 19
     """actions of opponents in an episode, from its reset seed"""
 

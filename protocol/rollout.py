@@ -32,7 +32,8 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds, Whole
+from millrace.protocol.bounds import MAX_COPIES, MAX_FACTS, Count, Natural, Real, Seconds, Whole
+from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.specs import RunSpec
 
 
@@ -84,6 +85,12 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     resets: Array | None = None
     """[T+1, N] bool, with seats: whether step t only resets this copy; the last row is of the next rollout's first step. The
     N of all other arrays is then `RunSpec.sent_columns`. None without seats: it is ~valid"""
+    begun: Annotated[tuple[EpisodeBegin, ...], Meta(max_length=MAX_COPIES)] = ()
+    """how the newest episode began of each copy that has one since the rollout before; none from a worker that cannot tell
+    (rule PAST)"""
+    memory: tuple[Array, ...] = ()
+    """what else the worker needs in order to continue the lane after these rows: it comes back as it is, in `LanePast`. None
+    from a worker that cannot continue one (rule PAST)"""
 
     @property
     def env_steps(self) -> int:
@@ -108,7 +115,22 @@ def rollout_bytes(run: RunSpec) -> int:
     steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
     fixed = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
     fixed += (T + 1) * run.copies if run.seats else 0  # resets
+    fixed += memory_bytes(run)
     return fixed + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
+
+
+def memory_bytes(run: RunSpec) -> int:
+    """Number of bytes of `Rollout.memory`, at most; without seats, exactly that, if the worker can continue a lane."""
+    if run.teams:
+        return 0
+    of_copies = run.copies * (run.seats_of_copy + 1) * 8
+    of_state = run.columns * run.policy.state_size * 4
+    if not run.seats:
+        return of_copies + of_state
+    action = run.policy.action
+    chosen = 32 * (sum(action.sizes) + math.prod(action.shape) + 1)  # action, numbers of the distribution, noise
+    extras = sum(math.prod(extra.shape) * np.dtype(extra.dtype).itemsize for extra in run.extras)
+    return of_copies + 2 * of_state + run.columns * (1 + chosen + extras)
 
 
 class Batch(msgspec.Struct, frozen=True):
@@ -147,10 +169,16 @@ class Batch(msgspec.Struct, frozen=True):
         return _env_steps(self.valid, self.resets)
 
 
-def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = None) -> Batch:
+def _by_column(flags: bool | Bools, columns: int) -> Bools:
+    """One flag, or [N] one for each env copy, for each of its columns."""
+    return np.repeat(np.atleast_1d(flags), columns // np.size(flags))
+
+
+def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | None = None) -> Batch:
     """Copy rollouts into one writable batch [T, ΣN], in lane order; those of one lane stay in the order they came in.
 
-    `fresh`: for each rollout, whether nothing carries over from an earlier one; None: that is so for the first of a lane.
+    `fresh`: for each rollout, whether nothing carries over from an earlier one, or [copies] for each env copy; None: that is
+    so for the first of a lane.
     """
     if fresh is None:
         fresh = [rollout.sequence == 0 for rollout in rollouts]
@@ -175,7 +203,7 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = N
         valid=side_by_side([one.valid for one in ordered]),
         state=np.concatenate([one.state for one in ordered]),
         lane=np.repeat([one.lane for one in ordered], copies),
-        fresh=np.repeat([fresh[index] for index in order], copies),
+        fresh=np.concatenate([_by_column(fresh[index], copies) for index in order]),
         copies=copies,
         episodes=tuple(episode for one in ordered for episode in one.episodes),
         extras=tuple(side_by_side(arrays) for arrays in zip(*(one.extras for one in ordered), strict=True)),

@@ -93,6 +93,7 @@ class Rule(Enum):
 
     # Permit
     OPPONENT = auto()
+    PAST = auto()
 
     # Episode
     EPISODES = auto()

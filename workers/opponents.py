@@ -83,9 +83,11 @@ class Match(NamedTuple):
 class OtherTeams:
     """The other teams in some env copies."""
 
-    def __init__(self, run: RunSpec, matches: Sequence[Match], generator: np.random.Generator) -> None:
+    generator: np.random.Generator
+    """draws the actions of opponents"""
+
+    def __init__(self, run: RunSpec, matches: Sequence[Match]) -> None:
         self._run = run
-        self._generator = generator
         self._matches = list(matches)
         seats = np.zeros((len(matches), run.seats_of_copy), bool)
         for n, match in enumerate(matches):
@@ -101,7 +103,7 @@ class OtherTeams:
             playing = np.repeat([match.opponent is opponent for match in self._matches], self._run.seats_of_copy)
             if (columns := np.flatnonzero(playing & theirs)).size:
                 state = self._state[None, columns, : opponent.state_size]
-                chosen = opponent.acting.choose([leaf[None, columns] for leaf in obs], state, self._generator, greedy=False)
+                chosen = opponent.acting.choose([leaf[None, columns] for leaf in obs], state, self.generator, greedy=False)
                 self._state[columns, : opponent.state_size] = state[0]
                 taken[columns] = opponent.to_env_action(chosen)
 

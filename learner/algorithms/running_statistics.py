@@ -213,8 +213,7 @@ class RewardScaler:
             columns = slice(at, at + batch.copies)
             lane = int(batch.lane[at])
             start = self._returns.get(lane)
-            if start is None or batch.fresh[at]:
-                start = np.zeros(batch.copies)
+            start = np.zeros(batch.copies) if start is None else np.where(batch.fresh[columns], 0.0, start)
             found, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )

@@ -173,12 +173,15 @@ class RunFiles:
         self._make_folder_again()
         spec = self._spec
         env_steps = self._state.env_steps
-        snapshot = self._hub.snapshot()
+        past = self._hub.past()
         state = msgspec.structs.replace(
             self._state,
-            wall_s=self._tally.wall_s(snapshot),
-            ledger=snapshot.ledger,
-            incarnations=snapshot.incarnations,
+            wall_s=self._tally.wall_s(self._hub.snapshot()),
+            ledger=past.ledger,
+            incarnations=list(past.incarnations),
+            rounds=past.rounds,
+            lanes=past.lanes,
+            acting=past.acting,
             opponent_policies=self._hub.opponent_policies(),
             episodes=self._tally.window.state(),
             facts=list(spec.facts),

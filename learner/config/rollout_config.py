@@ -132,6 +132,16 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
     is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
     """
+    lost_lanes: Free[Literal["continue", "restart"]] = "continue"
+    """What becomes of running episodes when their worker is lost, when lanes move to another worker, and when the run is
+    resumed. continue: each is repeated on another env copy from its beginning, with the same seed and actions, and goes on
+    where it was. With environments that repeat themselves, results then do not depend on who was lost. restart: new episodes
+    begin.
+    """
+    replay_limit: Free[Natural] = 1000
+    """Longest episode, in steps, that is repeated so that it can go on. Where one is longer, a new one begins. To repeat an
+    episode takes as long as its steps took, without the policy.
+    """
     no_workers_timeout_s: Free[Positive] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
     local ends at once when none is left.
@@ -163,6 +173,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     def call_timeouts(self) -> CallTimeouts:
         """How long a call of an env copy may take."""
         return CallTimeouts(self.start_timeout_s, self.step_timeout_s)
+
+    def most_repeated_steps(self) -> int:
+        """The longest episode that is repeated; -1: none is."""
+        return self.replay_limit if self.lost_lanes == "continue" else -1
 
     def stall_timeout_s(self) -> float:
         """The run ends if no env step, reset or construction has ended for so long, which is longer than each may take."""

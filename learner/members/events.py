@@ -131,6 +131,19 @@ class EnvironmentNoted:
 
 
 @dataclass(frozen=True)
+class LaneContinued:
+    """A lane whose rollouts another worker collected goes on with this one."""
+
+    json_name: ClassVar[str] = "lane_continued"
+    worker: str
+    lane: int
+    repeated_steps: int
+    """Env steps that are repeated before it goes on."""
+    new_episodes: int
+    """How many of its env copies begin new episodes instead."""
+
+
+@dataclass(frozen=True)
 class RolloutRejected:
     """A member sent a rollout that cannot be used."""
 
@@ -164,6 +177,7 @@ LoggedEvent = (
     | Failed
     | WorkerToldToRejoin
     | EnvironmentNoted
+    | LaneContinued
 )
 Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
 
@@ -203,6 +217,11 @@ def _line(event: LoggedEvent) -> str:
             return f"worker {worker} was told to join again: its session had ended{counted}"
         case EnvironmentNoted(worker, note):
             return f"worker {worker}: {note}"
+        case LaneContinued(worker, lane, repeated, new):
+            parts = [f"{repeated:,} env steps are repeated first"] if repeated or not new else []
+            if new:
+                parts.append(f"{new:,} env {'copies begin new episodes' if new > 1 else 'copy begins a new episode'}")
+            return f"lane {lane} goes on with worker {worker}: {', and '.join(parts)}"
 
 
 def _dealt_again(tickets: int) -> str:

@@ -99,6 +99,8 @@ class Member:
     """What the worker does, as its supervisor said last."""
     activity_s: float = 0.0
     """Time when the supervisor said that."""
+    hung: bool = False
+    """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
     """Time when the supervisor said last that the worker is in the user's code: until then the worker was not silent."""
     supervisor: SharingSupervisor | None = None

@@ -25,6 +25,7 @@ from millrace.learner.members.events import (
     EpisodesArrived,
     Event,
     Failed,
+    LaneContinued,
     LoggedEvent,
     NamelessHello,
     PolicyRaised,
@@ -331,7 +332,7 @@ class MemberServer:
     def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
         """Log an event. `told`: the worker of whose failure the log has just told. Returns who that is now."""
         line = describe(event)
-        expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello)
+        expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello | LaneContinued)
         match event:
             case WorkerRefused(_, why) | NamelessHello(_, why):
                 self._last_turned_away = f"was refused: {one_line(why)}"

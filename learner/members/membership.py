@@ -303,6 +303,7 @@ class Membership(Generic[M]):
         reason = worker_exit.reason
         member = self._of_process.get((worker, worker_exit.process_nonce))
         if member is not None and (key is None or key == key_of_peer(member.peer)):
+            member.hung = worker_exit.hung
             if worker_exit.failed:
                 spare = self.is_spare(member)
                 kind = PolicyRaised if worker_exit.of_policy and self.has_policy_code else WorkerProcessFailed

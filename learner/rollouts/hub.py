@@ -24,6 +24,7 @@ from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.run_status import progress_now, status
 from millrace.learner.rollouts.stall_watch import Overdue, StallWatch, Standstill
@@ -185,6 +186,10 @@ class Hub:
             return None
         found = [kept[version] for version in pool.versions]
         return np.stack([to_float32(each.parameters) for each in found]), np.stack([each.buffers for each in found])
+
+    def past(self) -> PastRollouts:
+        """With which a resumed run goes on after the update that was made last."""
+        return self.coordinator.past()
 
     def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.

@@ -7,16 +7,21 @@ computes. Once update u has begun, the rounds up to u + L may be collected.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 
 class Rounds:
-    """The rounds of one learner, counted from 0."""
+    """The rounds of one run, counted from 0."""
 
-    def __init__(self, max_lag: int) -> None:
+    def __init__(self, max_lag: int, next_round: int = 0, versions: Mapping[int, int] = MappingProxyType({})) -> None:
+        """`next_round`, `versions`: of a run that goes on, the round of its next update, and what acts in open rounds."""
         self.max_lag = max_lag
         """L"""
-        self.next = 0
+        self.next = next_round
         """the round of the next update"""
-        self._versions: dict[int, int] = {}  # of each round that may be collected and was not taken
+        self._versions = {number: versions[number] for number in sorted(versions) if number <= next_round + max_lag}
+        # of each round that may be collected and was not taken
 
     def begin(self, newest: int) -> range:
         """The next update begins, while this version is the newest. Returns the rounds that it opens, once."""
@@ -32,6 +37,11 @@ class Rounds:
     def version(self, number: int) -> int:
         """The version that acts in this round, which is open."""
         return self._versions[number]
+
+    @property
+    def versions(self) -> Mapping[int, int]:
+        """The version that acts in each round that is open."""
+        return self._versions
 
     def acting(self) -> set[int]:
         """The versions that act in rounds that are open."""

@@ -1,14 +1,24 @@
 """The coordinator's records of lanes and tickets. Pure.
 
-Rule: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
-from 0 again.
+Rule: a lane has one owner at a time. A new owner has it on new env copies: its incarnation rises, and its rollouts are
+counted from 0 again. It continues the lane's past, unless the environment has failed there, or every attempt to continue it
+was lost: then the copies start anew, so that they do not run into the same end for ever.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from millrace.learner.members.lane_placement import PlacedLane
+from millrace.learner.rollouts.lane_history import LaneHistories, LaneHistory
+from millrace.protocol.arrays import Bools
+from millrace.protocol.messages import Hello, LanePast, Permit
+from millrace.protocol.rollout import Rollout
+
+MOST_ATTEMPTS = 3  # to continue a lane, each of which ended with the loss of its worker
 
 
 @dataclass
@@ -25,8 +35,14 @@ class TicketedLane(PlacedLane):
     """Every rollout of this incarnation with a smaller sequence number has arrived."""
     out_of_order: set[int] = field(default_factory=set)
     """Sequence numbers that have arrived out of order."""
-    newest_used: tuple[int, int] | None = None
-    """Incarnation and sequence number of the rollout that an update used last; None: none since the learner began."""
+    newest_taken: tuple[int, int] | None = None
+    """Incarnation and sequence number of the rollout that was taken last; None: none since the learner began."""
+    history: LaneHistory | None = None
+    """Of the rollouts that were taken; None: none since the run began."""
+    failures: int = 0
+    """How often its environment has failed since a rollout of it came."""
+    losses: int = 0
+    """How often its worker was lost while it collected, since a rollout of it came."""
 
     @property
     def busy(self) -> int:
@@ -42,22 +58,51 @@ class TicketedLane(PlacedLane):
             self.next_sequence = 0
             self.out_of_order = set()
 
-    def deal(self, number: int, round_number: int, version: int, opponent: int | None) -> Ticket:
-        """A ticket for the next rollout, for the lane's owner."""
+    def deal(
+        self, number: int, round_number: int, version: int, opponent: int | None, past: LanePast | None = None
+    ) -> Ticket:
+        """A ticket for the next rollout, for the lane's owner. `past`: for the first one of this incarnation."""
         assert self.owner is not None
-        ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner, opponent)
+        ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner, opponent, past)
         self.outstanding.add(number)
         self.dealt += 1
         return ticket
 
-    def use(self, incarnation: int, sequence: int) -> bool:
-        """An update uses this rollout. Returns whether it continues the one that was used before it."""
-        continues = self.newest_used == (incarnation, sequence - 1)
-        self.newest_used = (incarnation, sequence)
-        return continues
+    def past(self, histories: LaneHistories, waiting: Iterable[tuple[Rollout, bytes]]) -> LanePast | None:
+        """What a new owner is to continue; None if the lane is to begin.
+
+        `waiting`: the rollouts that have come since the history, in order, with the attributes of their env copies.
+        """
+        history = None if self.history is None else self.history.copy()
+        for rollout, attributes in waiting:
+            history = history or histories.begin()
+            history.add(rollout, attributes)
+        if attempts := self.failures + self.losses // MOST_ATTEMPTS:
+            history = history or histories.begin()
+            history.start_anew(attempts)
+        return None if history is None else history.past(self.number)
+
+    def take(
+        self, incarnation: int, rollout: Rollout, attributes: bytes, histories: LaneHistories, *, from_past: bool
+    ) -> Bools:
+        """The rollout of the next round is taken. Returns [N] for which env copies it does not continue the one before it.
+
+        `from_past`: whether its worker was told to continue the lane.
+        """
+        sequence = rollout.sequence
+        continues = self.newest_taken == (incarnation, sequence - 1)
+        begins = sequence == 0 and not (from_past and rollout.memory)
+        self.newest_taken = (incarnation, sequence)
+        if self.history is None:
+            self.history = histories.begin()
+        elif sequence and not continues:  # the one between was rejected
+            self.history.forget()
+        anew = self.history.add(rollout, attributes)
+        return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
     def arrived(self, sequence: int) -> None:
         """The rollout with this sequence number has arrived."""
+        self.failures = self.losses = 0
         self.out_of_order.add(sequence)
         while self.next_sequence in self.out_of_order:
             self.out_of_order.remove(self.next_sequence)
@@ -78,4 +123,10 @@ class Ticket:
     """Version of the weights that act."""
     peer: bytes
     opponent: int | None = None
-    """As in a `Permit`."""
+    past: LanePast | None = None
+    """As in a `Permit`, these two."""
+
+    def permit(self, worker: Hello) -> Permit:
+        """The ticket as it travels to this worker."""
+        past = self.past if worker.continues else None
+        return Permit(self.number, self.lane, self.incarnation, self.sequence, self.round, self.opponent, past)

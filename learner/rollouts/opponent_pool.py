@@ -115,11 +115,11 @@ class OpponentPool:
         del snapshots[1 : max(1, len(snapshots) - settings.window - settings.max_lag)]
         return True
 
-    def of(self, lane: int, incarnation: int, sequence: int, version: int) -> int:
+    def of(self, lane: int, round_number: int, version: int) -> int:
         """The opponent in the episodes that begin in this rollout, in which this version acts."""
         settings = self._settings
         window = [each for each in self.versions if each <= version][-settings.window :] if settings.window else []
-        drawn = generator(settings.seed, Purpose.MATCHES, lane, incarnation, sequence)
+        drawn = generator(settings.seed, Purpose.MATCHES, lane, round_number)
         others = [*window, *(-1 - k for k in range(settings.scripted))]
         if settings.window and (not others or drawn.random() < settings.latest):
             return version

@@ -2,7 +2,8 @@
 
 Rule: a ticket is the permission for one rollout: of this lane, in this round, under this version. `lag_rule.py` says which
 rounds are open, and each lane gets a ticket for every one of them. When a ticket is lost, its round is dealt again, under
-the same version. Every ticket and every transition is counted in the ledger.
+the same version, and whoever gets it continues the lane where its last rollout ended. Every ticket and every transition is
+counted in the ledger.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ from dataclasses import dataclass, replace
 from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.protocol.arrays import Bools
 from millrace.protocol.errors import BadRollout
-from millrace.protocol.messages import Collect, Permit, Received, Rollout
+from millrace.protocol.messages import Collect, LanePast, Received, Rollout
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +31,12 @@ class AcceptedRollout:
     rollout: Rollout
     incarnation: int
     """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
-    fresh: bool = True
-    """Whether nothing carries over to it from an earlier rollout: it does not continue the one of its lane that was used
-    last, because the lane was started anew, the learner was, or the rollout between the two was rejected."""
+    fresh: Bools | bool = True
+    """[N] for each env copy, whether nothing carries over to it from an earlier rollout: it does not continue the one of its
+    lane that was taken last, because the copy has started anew, or the rollout between the two was rejected. One value
+    stands for all."""
+    from_past: bool = False
+    """Whether its worker was told to continue the lane with it."""
 
 
 class RolloutDealer:
@@ -43,19 +49,32 @@ class RolloutDealer:
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
         opponents: OpponentPool | None = None,
+        histories: LaneHistories | None = None,
     ) -> None:
         """`ledger` and `incarnations` come from a checkpoint: the incarnations are the first of each lane, and there may be
-        more or fewer of them than lanes. `opponents`: those of a run with teams.
+        more or fewer of them than lanes. `opponents`: those of a run with teams. `histories`: None: no lane continues.
         """
         self.opponents = opponents
-        self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(lanes)]
+        self.histories = histories or LaneHistories()
+        self.lanes = [
+            TicketedLane(
+                n,
+                incarnations[n] if n < len(incarnations) else 0,
+                due=list(rounds.versions),
+                history=self.histories.of(n),
+            )
+            for n in range(lanes)
+        ]
         self.ledger = ledger or Ledger()
         self.held: dict[int, Ticket] = {}
         """the tickets that workers hold, by number"""
         self.ready: dict[int, dict[int, AcceptedRollout]] = {}
         """the rollouts that have come and were not taken, by round and by lane"""
         self.rounds = rounds
+        self.attributes: dict[int, bytes] = {}
+        """those of env copies, packed, by the version that acts with them; of versions without any there may be none"""
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had, and may have again
+        self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
         self._to_deal = set[int]()  # lanes with rounds that are to be dealt
 
     # ---------------------------------------------------------------- the learner's side
@@ -65,6 +84,8 @@ class RolloutDealer:
         for number in self.rounds.begin(version):
             for lane in self.lanes:
                 lane.due.append(number)
+        acting = self.rounds.acting()
+        self.attributes = {each: packed for each, packed in self.attributes.items() if each in acting}
         self._to_deal |= {lane.number for lane in self.lanes if lane.due}
 
     def take(self) -> list[AcceptedRollout] | None:
@@ -101,6 +122,11 @@ class RolloutDealer:
         """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
         return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
 
+    def pasts(self) -> list[LanePast]:
+        """What each lane is to continue after the last round that was taken, for a checkpoint."""
+        here = [lane.history.past(lane.number) for lane in self.lanes if lane.history is not None]
+        return [*here, *self._absent_pasts]
+
     # ---------------------------------------------------------------- out
 
     def deal(self, members: Mapping[bytes, Member]) -> list[Outgoing]:
@@ -109,12 +135,13 @@ class RolloutDealer:
         for lane in [self.lanes[number] for number in sorted(self._to_deal)]:
             if lane.owner is None or lane.moving:
                 continue
+            if not lane.dealt and lane.due:
+                self._drop_after(lane, lane.due[0])
             for round_number in lane.due:
                 version = self.rounds.version(round_number)
-                opponent = (
-                    None if self.opponents is None else self.opponents.of(lane.number, lane.incarnation, lane.dealt, version)
-                )
-                ticket = lane.deal(self.ledger.issued, round_number, version, opponent)
+                opponent = None if self.opponents is None else self.opponents.of(lane.number, round_number, version)
+                past = None if lane.dealt else self._past(lane, round_number)
+                ticket = lane.deal(self.ledger.issued, round_number, version, opponent, past)
                 self.held[ticket.number] = ticket
                 dealt.setdefault(lane.owner, []).append(ticket.number)
                 self.ledger.issued += 1
@@ -123,17 +150,20 @@ class RolloutDealer:
         return [order for peer, numbers in dealt.items() for order in self.send(members[peer], numbers)]
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for these tickets, those of a rollout among them: one for each version that they name."""
+        """The orders for these tickets, those of a rollout among them: one for each version that they name.
+
+        A ticket that brings the past of a lane has an order of its own, because a past is long.
+        """
         chosen = [self.held[number] for number in tickets if number in self.held]
         member.tickets |= {ticket.number: member.replies for ticket in chosen}
         out: list[Outgoing] = []
         for version in sorted({ticket.version for ticket in chosen}):
-            permits = tuple(
-                Permit(each.number, each.lane, each.incarnation, each.sequence, each.opponent)
-                for each in chosen
-                if each.version == version
-            )
-            out.append((member.peer, Collect(member.session, version, permits, self.received(member), keep=())))
+            of_version = [each.permit(member.hello) for each in chosen if each.version == version]
+            together = tuple(each for each in of_version if each.past is None)
+            alone = [(each,) for each in of_version if each.past is not None]
+            orders = [*alone, together] if together else alone
+            received = self.received(member)
+            out += [(member.peer, Collect(member.session, version, permits, received, keep=())) for permits in orders]
         return out
 
     def received(self, member: Member) -> tuple[Received, ...]:
@@ -161,8 +191,27 @@ class RolloutDealer:
         self.ledger.transitions_received += rollout.env_steps
         self._end(member, ticket).arrived(rollout.sequence)
         member.has_stepped()
-        self.ready.setdefault(ticket.round, {})[ticket.lane] = AcceptedRollout(rollout, ticket.incarnation)
+        accepted = AcceptedRollout(rollout, ticket.incarnation, from_past=ticket.past is not None)
+        self.ready.setdefault(ticket.round, {})[ticket.lane] = accepted
         return True
+
+    def most_steps(self, number: int) -> int:
+        """How many steps an episode can have by the rollout of this ticket, in rollouts."""
+        ticket = self.held.get(number)
+        return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
+
+    def failed(self, member: Member, lane: int) -> None:
+        """The environment of a lane of this member has failed: what led there is not repeated."""
+        if lane in member.lanes:
+            self.lanes[lane].failures += 1
+
+    def worker_lost(self, member: Member, *, hung: bool) -> None:
+        """A member is gone with its tickets. `hung`: because of a call of the environment that took too long."""
+        for number in member.lanes:
+            lane = self.lanes[number]
+            if lane.outstanding:
+                lane.losses += 1
+                lane.failures += hung
 
     def late(self, rollout: Rollout) -> None:
         """Count a rollout of a session that has ended. Nobody has checked it."""
@@ -196,7 +245,31 @@ class RolloutDealer:
         lane.outstanding.remove(ticket.number)
         return lane
 
+    def _past(self, lane: TicketedLane, first: int) -> LanePast | None:
+        """What the lane's new owner is to continue. The first round that it collects is `first`."""
+        come = [self.ready[number][lane.number].rollout for number in range(self.rounds.next, first)]
+        return lane.past(self.histories, [(rollout, self._attributes_of(rollout)) for rollout in come])
+
+    def _drop_after(self, lane: TicketedLane, first: int) -> None:
+        """Drop the lane's rollouts of later rounds than this one, which was lost: they did not follow what is to come."""
+        for number in [number for number in self.ready if number > first and lane.number in self.ready[number]]:
+            dropped = self.ready[number].pop(lane.number)
+            self.ledger.lost += 1
+            self.ledger.transitions_late += dropped.rollout.env_steps
+            insort(lane.due, number)
+
+    def _attributes_of(self, rollout: Rollout) -> bytes:
+        """Those that its env copies had."""
+        return self.attributes.get(rollout.version, b"")
+
     def _marked(self, arrived: AcceptedRollout) -> AcceptedRollout:
         """The rollout, which an update uses next, marked as fresh or not."""
-        lane = self.lanes[arrived.rollout.lane]
-        return replace(arrived, fresh=not lane.use(arrived.incarnation, arrived.rollout.sequence))
+        rollout = arrived.rollout
+        fresh = self.lanes[rollout.lane].take(
+            arrived.incarnation,
+            rollout,
+            self._attributes_of(rollout),
+            self.histories,
+            from_past=arrived.from_past,
+        )
+        return replace(arrived, fresh=fresh)

@@ -2,9 +2,9 @@
 
 Rule: whatever a worker is asked for has a ticket. Two dealers decide what is asked and what an answer means:
 `rollout_dealer.py` and `evaluation_dealer.py`. Here they meet the workers. A lane has one owner at a time and moves only
-between rollouts; its new owner starts it afresh, so its incarnation rises. When a worker is lost, its lanes go to other
-workers, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows that a message was lost on
-the way, the message is sent again.
+between rollouts; its new owner has it on new env copies, so its incarnation rises. When a worker is lost, its lanes go to
+other workers, which continue them, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows
+that a message was lost on the way, the message is sent again.
 
 While an evaluation is pending, no ticket for a rollout is dealt, unless the evaluation is beside training: then workers that
 only evaluate play it, whatever the others do.
@@ -16,18 +16,20 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, RolloutArrived, RolloutRejected
+from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, LaneContinued, RolloutArrived, RolloutRejected
 from millrace.learner.members.lane_placement import LanePlacement, is_spare
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import SentUnusable
 from millrace.learner.members.membership import Answered, Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
+from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import (
     Array,
+    Collect,
     EpisodeRows,
     Evaluated,
     Failure,
@@ -42,8 +44,9 @@ from millrace.protocol.messages import (
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import RunSpec
 
-CheckRows = Callable[[Rollout, RunSpec], None]
-"""Raises `BadRollout` if the rows of a rollout break the row format, or are not those of the run."""
+CheckRows = Callable[[Rollout, RunSpec, int], None]
+"""Raises `BadRollout` if the rows of a rollout break the row format, or are not those of the run, or if an episode is longer
+than this number of steps."""
 
 MOST_NOTES = 10  # of all workers together
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
@@ -115,7 +118,27 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         if self.rollouts.opponents is not None and env_steps is not None:
             self.rollouts.opponents.made(version, env_steps)
         self.version = version
-        self.weights.keep(Weights(version, parameters, buffers, env_attributes), self._needed())
+        weights = Weights(version, parameters, buffers, env_attributes)
+        self.keep(weights)
+        self.weights.keep(weights, self._needed())
+
+    def keep(self, weights: Weights) -> None:
+        """Keep weights that act in an open round of a run that goes on."""
+        self.weights.kept[weights.version] = weights
+        if weights.env_attributes is not None:
+            self.rollouts.attributes[weights.version] = weights.env_attributes.tobytes()
+
+    def past(self) -> PastRollouts:
+        """With which another learner goes on after the last round that was taken."""
+        rounds = self.rollouts.rounds
+        older = sorted(rounds.acting() - {self.version})
+        return PastRollouts(
+            ledger=self.rollouts.ledger.copy(),
+            incarnations=self.rollouts.incarnations(),
+            rounds=RoundsState(rounds.next, dict(rounds.versions)),
+            lanes=self.rollouts.pasts(),
+            acting=[self.weights.kept[version] for version in older if version in self.weights.kept],
+        )
 
     def begin_update(self) -> list[Outgoing]:
         """The next update begins, unless it has begun, with the newest weights: deal the rounds that it opens."""
@@ -162,8 +185,17 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         if self.evaluation.pending:
             out += self.evaluation.deal(self.membership.active())
         if self.evaluation.beside or not self.evaluation.pending:
-            out += self.rollouts.deal(self.members)
+            out += self._deal_rollouts()
         return self.weights.after(out, self.members)
+
+    def _deal_rollouts(self) -> list[Outgoing]:
+        dealt = self.rollouts.deal(self.members)
+        for peer, order in dealt:
+            for permit in order.permits if isinstance(order, Collect) else ():
+                if (past := permit.past) is not None and past.memory:  # rollouts of it have come
+                    worker = self.members[peer].hello.worker
+                    self.events.append(LaneContinued(worker, permit.lane, past.repeated_steps, past.new_episodes))
+        return dealt
 
     def _needed(self) -> set[int]:
         """The versions that orders may name, beside the newest."""
@@ -190,13 +222,15 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
             case Failure():
+                if message.lane is not None:
+                    self.rollouts.failed(member, message.lane)
                 self.membership.fail(member, message)
         return []  # also to answers to orders that a run does not give
 
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         """Accept a rollout, unless it came before. One that cannot be used is counted, and its ticket is lost."""
         try:
-            self._check_rows(rollout, self.run)
+            self._check_rows(rollout, self.run, self.rollouts.most_steps(rollout.ticket) * self.run.rollout_steps)
             accepted = self.rollouts.take_in(member, rollout)
         except BadRollout as error:
             return self._reject(member, rollout, f"rollout of ticket {rollout.ticket}: {error}")
@@ -246,6 +280,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _removed(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
+        self.rollouts.worker_lost(member, hung=member.hung)
         for number in list(member.tickets):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation
             dealer.lose(member, number)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 
 from millrace.launch.crew import Crew, worker_cores
@@ -15,7 +15,7 @@ from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.open_hub import lobby_settings, open_hub
 from millrace.learner.rollout_spec import rollout_spec
 from millrace.learner.rollouts.hub import Hub
-from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
 from millrace.protocol.env_spec import EnvSpec
@@ -33,7 +33,7 @@ def start(
     resources: ExitStack,
     *,
     listens: bool,
-    past: tuple[Ledger, Sequence[int]] | None = None,
+    past: PastRollouts | None = None,
 ) -> tuple[Hub, RunSpec, DescribedEnv]:
     """A hub whose workers have joined, with its run and environment. Closing `resources` releases all that was acquired.
 

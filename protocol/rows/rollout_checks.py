@@ -12,9 +12,10 @@ import math
 import numpy as np
 
 from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import LARGEST
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.policy.masks import no_choice, not_allowed
-from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rollout import Episode, Rollout, memory_bytes
 from millrace.protocol.rows.array_checks import Axes, Expected, place_of, wrong_arrays, wrong_observation
 from millrace.protocol.specs import ActionSpec, RunSpec
 
@@ -22,8 +23,11 @@ LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 """No larger number is finite as a float32: returns are sums of rewards before they are rounded."""
 
 
-def validate(rollout: Rollout, run: RunSpec) -> None:
-    """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
+def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
+    """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format.
+
+    `most_steps`: that an episode can have.
+    """
     T = run.rollout_steps
     N = run.sent_columns
     action = run.policy.action
@@ -66,10 +70,14 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         count = int(np.count_nonzero(ended & rollout.valid))
     if len(rollout.episodes) != count:
         raise BadRollout(f"episodes: expected {count}, got {len(rollout.episodes)}")
-    steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
     for episode in rollout.episodes:
-        if why := wrong_episode(episode, run, steps_so_far):
+        if why := wrong_episode(episode, run, most_steps):
             raise BadRollout(f"episode: {why}")
+    begun = [each.copy for each in rollout.begun]
+    if len(set(begun)) < len(begun) or max(begun, default=0) >= run.copies:
+        raise BadRollout(f"begun: expected each of the copies 0 to {run.copies - 1} at most once, got {begun[:100]}")
+    if (size := sum(array.nbytes for array in rollout.memory)) > (most := memory_bytes(run)):
+        raise BadRollout(f"memory: expected at most {most} bytes, got {size}")
 
 
 def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:

@@ -51,9 +51,9 @@ from millrace.protocol.specs import RunSpec, StepSpec
 from millrace.protocol.wire.codec import Buffer, decode_to_learner, encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.worker_link import WorkerLink
-from millrace.workers.collect import collector
 from millrace.workers.conversation.held import Held, HeldEvaluations
 from millrace.workers.conversation.session import Session
+from millrace.workers.lanes import lane
 from millrace.workers.worker import Worker, WorkerOptions, identity
 from tests.support.conversation.example_messages import example
 
@@ -397,7 +397,7 @@ _noise = Categorical.noise
 def main(mutant: str, address: str) -> int:
     """Run the mutant until it leaves."""
     if mutant == "one seed for all copies":
-        vars(collector)["copy_seeds"] = lambda seed, lane, incarnation, copies: [1] * copies
+        vars(lane)["copy_seed"] = lambda seed, lane, start, copy: 1
     if mutant == "goes on with an evaluation that is over":
         HeldEvaluations.take = Held.take  # type: ignore[method-assign]
     if mutant == "one random number for all copies":

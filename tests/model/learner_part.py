@@ -12,6 +12,7 @@ from millrace.learner.members.lane_placement import LanePlacement
 from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
@@ -34,9 +35,10 @@ from tests.model.message_content import (
 )
 from tests.model.names import Kind, Name, name
 from tests.model.settings import TIMEOUT_S, Settings
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, any_rows
+from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, any_rows, fake_past, place_of
 from tests.support.conversation.rules import check_tickets, waiting_rollouts
 
+MOST_STEPS = 1_000  # of an episode that is repeated
 SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},
     RolloutDealer: {"lanes", "ledger", "held", "ready", "rounds", "_to_deal"},
@@ -46,21 +48,22 @@ SAVED: dict[type, set[str]] = {
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
     | {"strikes", "takeovers", "welcomed", "describes"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
-    | {"out_of_order"},
-    Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent"},
+    | {"out_of_order", "history"},
+    Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent", "past"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
     Rounds: {"next", "_versions"},
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes", "_check_rows"},
-    RolloutDealer: {"_absent", "opponents"},
+    RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "attributes"},
     SentWeights: set(),
     WeightsHeld: {"by_supervisor", "named"},
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare", "has_policy_code"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
         "joined_s",
+        "hung",
         "state",
         "heartbeat",
         "stages_before",
@@ -68,7 +71,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity_s",
     }
     | {"in_env_code_s", "speed", "first_step_s", "ended_steps", "supervisor"},
-    TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
+    TicketedLane: {"newest_taken", "failures", "losses"},  # it marks rollouts as fresh; no worker is lost three times here
     Ticket: set(),
     LanePlacement: {"_tie_break"},
     Rounds: {"max_lag"},
@@ -84,8 +87,6 @@ class Learner:
         self.settings, self.coordinator = settings, coordinator
         self.updating = False
         """whether rollouts were taken, and the weights made of them are not published"""
-        self.lag = 0
-        """how old the weights are that act in the round of the next update: it takes `max_lag` updates until so old"""
         self.checkpoints: list[Content] = []
         """of each version so far: ticket to issue next, tickets used, incarnations, newest incarnations accepted"""
         self.used: set[int] = set()
@@ -125,22 +126,24 @@ class Learner:
 
     def restarted(self, version: int) -> tuple[Self, list[Outgoing]]:
         """A new learner, from the checkpoint of this version."""
-        issued, used, incarnations, accepted = self.checkpoints[version]
+        issued, used, incarnations, accepted, rounds, places = self.checkpoints[version]
         settings = self.settings
         coordinator = TicketCoordinator(
             settings.run,
             RolloutDealer(
                 settings.run.lanes,
-                Rounds(settings.max_lag),
+                Rounds(settings.max_lag, rounds[0], dict(rounds[1])),
                 ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used),
                 incarnations=[number.value for number in incarnations],
                 opponents=settings.pool(version - 1),
+                histories=_histories(places),
             ),
             worker_timeout_s=TIMEOUT_S,
             first_session=self.coordinator.membership._next_session,
             check_rows=any_rows,
         )
-        coordinator.weights.kept = {each: weights(each) for each in _snapshots(coordinator)}
+        acting = coordinator.rollouts.rounds.acting() - {version}
+        coordinator.weights.kept = {each: weights(each) for each in (*_snapshots(coordinator), *acting)}
         learner = type(self)(settings, coordinator)
         learner.checkpoints = self.checkpoints[:version]
         learner.used = {number for number in self.used if number < issued.value}
@@ -186,17 +189,18 @@ class Learner:
         return out + self._learn()
 
     def acts(self, number: int) -> int:
-        """The version that must act in this open round."""
-        ahead = self.settings.max_lag - (number - self.coordinator.rollouts.rounds.next)
-        return self.coordinator.version + self.updating - min(self.lag, ahead)
+        """The version that must act in this round."""
+        return max(0, number - self.settings.max_lag)
 
     def _checkpoint(self) -> list[Outgoing]:
         coordinator = self.coordinator
         incarnations = tuple(incarnation(lane, number) for lane, number in enumerate(coordinator.rollouts.incarnations()))
         accepted = tuple(_accepted(lane, number) for lane, (number, _, _) in enumerate(self.accepted))
-        self.checkpoints.append(
-            (ticket(coordinator.rollouts.ledger.issued), coordinator.rollouts.ledger.used, incarnations, accepted)
-        )
+        past = coordinator.past()
+        rounds = past.rounds.next, tuple(past.rounds.versions.items())
+        places = tuple(map(_place, coordinator.rollouts.lanes))
+        issued = ticket(coordinator.rollouts.ledger.issued)
+        self.checkpoints.append((issued, coordinator.rollouts.ledger.used, incarnations, accepted, rounds, places))
         return []
 
     def _accept(self, arrived: AcceptedRollout) -> None:
@@ -217,7 +221,7 @@ class Learner:
         if self.updating:
             return []
         coordinator, ledger = self.coordinator, self.coordinator.rollouts.ledger
-        before = ledger.transitions_used
+        before, number = ledger.transitions_used, coordinator.rollouts.rounds.next
         taken = coordinator.rollouts.take()
         if taken is None:
             return []
@@ -225,11 +229,15 @@ class Learner:
         for rollout in (arrived.rollout for arrived in taken):
             assert rollout.ticket not in self.used, f"{Rule.TICKET_NUMBERS}: a ticket was used twice"
             self.used.add(rollout.ticket)
-            lag = coordinator.version - rollout.version
-            assert lag == self.lag, f"{Rule.ROUND_VERSION}: a rollout of lag {lag} was used, instead of {self.lag}"
+            assert rollout.version == self.acts(number), (
+                f"{Rule.ROUND_VERSION}: version {rollout.version} acted in round {number}, instead of {self.acts(number)}"
+            )
+            assert place_of(rollout.memory) == number + 1, (
+                f"{Rule.PAST}: a rollout does not follow the one that its lane made in the round before"
+            )
         lanes = [arrived.rollout.lane for arrived in taken]
         assert lanes == list(range(self.settings.lanes)), f"{Rule.ROUND}: an update has not one rollout of each lane"
-        self.updating, self.lag = True, min(self.lag + 1, self.settings.max_lag)
+        self.updating = True
         return []
 
     def check(self) -> None:
@@ -291,11 +299,11 @@ def saved(learner: Learner, now: float) -> Content:
         ticket(coordinator.rollouts.ledger.issued),
         coordinator.rollouts.ledger.used,
         coordinator.version,
-        tuple(rounds._versions.values()),
-        tuple(_lane(lane, rounds.next) for lane in lanes),
-        tuple(_ticket(each, rounds.next) for each in tickets),
+        (rounds.next, tuple(rounds.versions.values())),
+        tuple(_lane(lane) for lane in lanes),
+        tuple(_ticket(each) for each in tickets),
         tuple(
-            (number - rounds.next, rollout_content(each.rollout), incarnation(lane, each.incarnation))
+            (number, rollout_content(each.rollout), incarnation(lane, each.incarnation))
             for number, of_round in sorted(coordinator.rollouts.ready.items())
             for lane, each in sorted(of_round.items())
         ),
@@ -316,7 +324,6 @@ def saved(learner: Learner, now: float) -> Content:
             )
             for lane, (number, collected_in, sequences) in enumerate(learner.accepted)
         ),
-        learner.lag,
     )
 
 
@@ -352,25 +359,36 @@ def _worker(number: int) -> Name:
     return name(Kind.WORKER, number)
 
 
-def _lane(lane: TicketedLane, next_round: int) -> Content:
-    """Rounds are counted from the next one, because only their order matters."""
+def _place(lane: TicketedLane) -> int | None:
+    """How many rollouts its env copies had made when the last one was taken; None: none was."""
+    return None if lane.history is None else place_of(lane.history.memory)
+
+
+def _histories(places: Content) -> LaneHistories:
+    """Those of lanes at these places."""
+    pasts = [fake_past(lane, place) for lane, place in enumerate(places) if place is not None]
+    return LaneHistories(1, MOST_STEPS, pasts)
+
+
+def _lane(lane: TicketedLane) -> Content:
     owner = None if lane.owner is None else _worker(worker_of(lane.owner))
     number = incarnation(lane.number, lane.incarnation)
-    due = tuple(each - next_round for each in lane.due)
-    return number, owner, lane.moving, due, lane.dealt, lane.next_sequence, tuple(sorted(lane.out_of_order))
+    out_of_order = tuple(sorted(lane.out_of_order))
+    return number, owner, lane.moving, tuple(lane.due), lane.dealt, lane.next_sequence, out_of_order, _place(lane)
 
 
-def _ticket(each: Ticket, next_round: int) -> Content:
+def _ticket(each: Ticket) -> Content:
     number, worker = incarnation(each.lane, each.incarnation), _worker(worker_of(each.peer))
     return (
         ticket(each.number),
         each.lane,
         number,
         each.sequence,
-        each.round - next_round,
+        each.round,
         each.version,
         each.opponent,
         worker,
+        None if each.past is None else place_of(each.past.memory),
     )
 
 
@@ -380,15 +398,16 @@ def without_checkpoints(content: Content) -> Content:
 
 def loaded(content: Content, settings: Settings) -> Learner:
     """A learner at the time 0 with this content."""
-    issued, used, version, versions, lanes, tickets, ready, members, *rest = content
+    issued, used, version, (next_round, versions), lanes, tickets, ready, members, *rest = content
     unplaced, settled, waiting_for, to_deal, (kept, held), *mine = rest
     coordinator = TicketCoordinator(
         settings.run,
         RolloutDealer(
             settings.run.lanes,
-            Rounds(settings.max_lag),
+            Rounds(settings.max_lag, next_round),
             ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
             opponents=settings.pool(version),
+            histories=_histories(tuple(lane[-1] for lane in lanes)),
         ),
         worker_timeout_s=TIMEOUT_S,
         first_session=members[1].value,
@@ -396,20 +415,21 @@ def loaded(content: Content, settings: Settings) -> Learner:
     )
     coordinator.version = version
     coordinator.rollouts.ledger.transitions_received = len(ready)
-    coordinator.rollouts.rounds._versions = dict(enumerate(versions))
+    coordinator.rollouts.rounds._versions = dict(enumerate(versions, next_round))
     coordinator.rollouts._to_deal = set(to_deal)
     coordinator.weights.kept = {each: weights(each) for each in kept}
     for of_round, fields, number in ready:
         arrived = AcceptedRollout(rollout_of(fields), number.value)
         coordinator.rollouts.ready.setdefault(of_round, {})[arrived.rollout.lane] = arrived
-    for lane, (number, owner, moving, due, dealt, following, out_of_order) in zip(
+    for lane, (number, owner, moving, due, dealt, following, out_of_order, _) in zip(
         coordinator.rollouts.lanes, lanes, strict=True
     ):
         lane.incarnation, lane.owner = number.value, None if owner is None else peer_of(owner.value)
         lane.moving, lane.due, lane.dealt = moving, list(due), dealt
         lane.next_sequence, lane.out_of_order = following, set(out_of_order)
-    for number, of_lane, inc, sequence, of_round, under, opponent, worker in tickets:
-        each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value), opponent)
+    for number, of_lane, inc, sequence, of_round, under, opponent, worker, place in tickets:
+        past = None if place is None else fake_past(of_lane, place)
+        each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value), opponent, past)
         coordinator.rollouts.held[number.value] = each
         coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
         coordinator.weights.held.named.setdefault(each.peer, {})[number.value] = versions_of(under, [opponent])
@@ -428,7 +448,6 @@ def loaded(content: Content, settings: Settings) -> Learner:
         (-1 if number is None else number.value, collected_in[0].value if collected_in else None, set(sequences))
         for number, collected_in, sequences in mine[3]
     ]
-    learner.lag = mine[4]
     return learner
 
 
@@ -450,12 +469,12 @@ def first_learner(settings: Settings, kind: type[L]) -> tuple[L, list[Outgoing]]
         settings,
         TicketCoordinator(
             settings.run,
-            RolloutDealer(settings.run.lanes, Rounds(settings.max_lag)),
+            RolloutDealer(settings.run.lanes, Rounds(settings.max_lag), histories=_histories(())),
             worker_timeout_s=TIMEOUT_S,
             first_session=0,
             check_rows=any_rows,
         ),
     )
     none = tuple(incarnation(lane, 0) for lane in range(settings.lanes))
-    before.checkpoints = [(ticket(0), 0, none, (None,) * settings.lanes)]
+    before.checkpoints = [(ticket(0), 0, none, (None,) * settings.lanes, (0, ()), (None,) * settings.lanes)]
     return before.restarted(0)

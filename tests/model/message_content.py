@@ -3,6 +3,7 @@
 Rule: only what the two halves read is kept: numbers, flags, and records of these. What is kept follows from the types of the
 fields, and which numbers are names from the names of the fields (`NAMED`); so a new field of a message is in the model.
 Texts, arrays, seconds by stage and descriptions of an environment are always the same. A rollout is one valid transition.
+All that a worker remembers of its env copies is how many rollouts they have made.
 """
 
 from __future__ import annotations
@@ -37,7 +38,15 @@ from tests.model.conversation import Content
 from tests.model.names import FIRST_OF, Kind, Name, name
 from tests.model.settings import TICK_S, TIMEOUT_S
 from tests.support.conversation.example_messages import example
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
+from tests.support.conversation.fake_ends import (
+    BUFFERS,
+    PARAMETERS,
+    fake_memory,
+    fake_past,
+    fake_rollout,
+    fake_rows,
+    place_of,
+)
 
 T = TypeVar("T")
 
@@ -88,7 +97,14 @@ NAMED: Mapping[str, Read] = {
     "received": lambda value, record, worker: tuple(sorted(fields_of(each, worker) for each in value)),
     "out_of_order": lambda value, record, worker: tuple(sorted(value)),
     "run": lambda value, record, worker: isinstance(value, WaitSpec),
+    "past": lambda value, record, worker: None if value is None else place_of(value.memory),
+    "memory": lambda value, record, worker: place_of(value),
 }
+MADE: Mapping[str, Callable[[Any, Mapping[str, Any]], Any]] = {
+    "past": lambda place, kept: None if place is None else fake_past(kept["lane"], place),
+    "memory": lambda place, kept: fake_memory(place),
+}
+"""What is made of the content of a field, from it and the fields before it."""
 """Fields whose numbers are names, whose order does not matter, or which say only whether the run is known."""
 KINDS: Mapping[str, type] = {kind.__name__: kind for kind in (*get_args(ToLearner), *get_args(ToWorker))}
 ROLLOUT = fake_rollout(0, 0, 0, 0, 0)
@@ -122,7 +138,7 @@ def _is_kept(kind: mi.Type) -> bool:
         case mi.VarTupleType(item_type=inner):
             return _is_kept(inner)
         case mi.StructType(fields=fields):
-            return all(_is_kept(field.type) for field in fields)
+            return all(field.name in NAMED or _is_kept(field.type) for field in fields)
     return False
 
 
@@ -161,7 +177,10 @@ def fields_of(record: Any, worker: int = 0) -> Content:
 def record_of(kind: type[T], content: Content) -> T:
     """The record with these fields, of which all are kept."""
     fields: Any = kind
-    return kind(**dict(zip(_kept(fields), map(_value, content), strict=True)))
+    kept: dict[str, Any] = {}
+    for field, value in zip(_kept(fields), content, strict=True):
+        kept[field] = MADE[field](value, kept) if field in MADE else _value(value)
+    return kind(**kept)
 
 
 def _value(content: Any) -> Any:
@@ -188,6 +207,8 @@ def message_of(content: Content, worker: int, run: WaitSpec | RunSpec | StepSpec
             kept[field] = WAIT if value else run
         elif field in inner:
             kept[field] = tuple(record_of(inner[field], each) for each in value)
+        elif field in MADE:
+            kept[field] = MADE[field](value, kept)
         else:
             kept[field] = _value(value)
     if kind in OTHERS:

@@ -257,7 +257,22 @@ MUTATIONS = {
     ),
     "an opponent is drawn from versions that came later": Mutation(None, POOL, " if each <= version]", "]"),
     "an order does not name its opponent": Mutation(
-        Rule.OPPONENT, ROLLOUTS, "each.sequence, each.opponent)", "each.sequence)"
+        Rule.OPPONENT, LANES, "self.round, self.opponent, past)", "self.round, None, past)"
+    ),
+    "an order does not bring the past of its lane": Mutation(
+        Rule.PAST, LANES, "past = self.past if worker.continues else None", "past = None"
+    ),
+    "a lane continues without the rollouts that wait": Mutation(
+        Rule.PAST, ROLLOUTS, "for number in range(self.rounds.next, first)]", "for number in range(0)]"
+    ),
+    "what came after a lost rollout is kept": Mutation(
+        Rule.PAST, ROLLOUTS, "                self._drop_after(lane, lane.due[0])\n", "                pass\n"
+    ),
+    "a checkpoint counts its rounds from 0": Mutation(
+        Rule.PAST, COORDINATOR, "RoundsState(rounds.next, ", "RoundsState(0, "
+    ),
+    "a worker forgets what a lane continues": Mutation(
+        Rule.PAST, HELD, "self.round, self.opponent, self.past)", "self.round, self.opponent)"
     ),
     "later rollouts are collected first": Mutation(
         Rule.LOWEST_VERSION_FIRST, HELD, "version = min(startable, default=-1)", "version = max(startable, default=-1)"
@@ -349,6 +364,7 @@ def runs() -> list[Conversation]:
         Training(workers=2, lanes=2, updates=2, faults=1, only=("drop down",)),
         Training(workers=2, lanes=2, updates=1, faults=1),
         Training(workers=2, lanes=2, updates=2, faults=2, only=("drop down", "kill, reported")),
+        Training(workers=1, lanes=1, updates=3, faults=2, max_lag=1, only=("drop up", "kill, reported")),
     ]
 
 

@@ -21,10 +21,10 @@ SEED = 16  # of the pool: a version meets itself, the one before it, or the one 
 
 
 class DrawnOpponents(OpponentPool):
-    """Every version is a snapshot. All incarnations of a lane meet the same, because the model numbers them anew."""
+    """Every version is a snapshot. All rounds meet the same, because the model numbers them anew."""
 
-    def of(self, lane: int, incarnation: int, sequence: int, version: int) -> int:
-        return super().of(lane, 0, sequence, version)
+    def of(self, lane: int, round_number: int, version: int) -> int:
+        return super().of(lane, 0, version)
 
 
 @dataclass(frozen=True)

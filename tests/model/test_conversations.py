@@ -93,7 +93,7 @@ def test_larger_runs(run: Conversation) -> None:
 def test_a_mistake_is_found_and_told_as_a_story() -> None:
     """One mistake that only liveness shows, in every `make test`, so that it is known that the checker can fail."""
     story = find("a lost Collect is not sent again")
-    assert "Collect(session 0, 0, ((ticket 0, 0, incarnation 0:0, 0, None),)," in story
+    assert "Collect(session 0, 0, ((ticket 0, 0, incarnation 0:0, 0, 0, None, None),)," in story
     assert " to worker 0 is lost." in story
     assert story.endswith("Then: and so on: the run never reaches its target")
 

@@ -7,18 +7,20 @@ is due. To finish work is an event.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
-from millrace.protocol.messages import Collect, Describe, Evaluate, HeartbeatReply, ToLearner, ToWorker
+from millrace.protocol.messages import Collect, Describe, Evaluate, HeartbeatReply, Rollout, ToLearner, ToWorker
 from millrace.protocol.rules import Rule
 from millrace.workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
 from millrace.workers.conversation.session import (
+    CloseLanes,
     EvaluationTask,
     Leave,
     RolloutTask,
     SendMessage,
     Session,
+    StartSession,
     WorkAnswer,
     WorkerEffect,
     _SessionState,
@@ -38,7 +40,7 @@ from tests.model.message_content import (
 )
 from tests.model.process_part import Process
 from tests.model.settings import Settings
-from tests.support.conversation.fake_ends import fake_evaluated, fake_rollouts, held_count
+from tests.support.conversation.fake_ends import fake_evaluated, fake_past, fake_rollout, held_count, place_of
 
 SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
@@ -60,10 +62,13 @@ class Worker(Process):
 
     settings: Settings
     task: RolloutTask | EvaluationTask | Describe | None = None
+    places: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """of the lanes that are open: the incarnation, and how many rollouts their env copies have made"""
 
     def end(self) -> None:
         super().end()
         self.task = None
+        self.places = {}
 
     def handle(self, message: ToWorker, now: float) -> list[ToLearner]:
         assert self.session is not None
@@ -88,7 +93,7 @@ class Worker(Process):
         assert self.session is not None
         assert self.task is not None
         task, self.task = self.task, None
-        answers = _answers(task)
+        answers = self._answers(task)
         held = self.session._current
         before = set(held.weights)
         effects = self.session.work_ended(answers)
@@ -107,11 +112,12 @@ class Worker(Process):
                 assert each.sequence == lane.sequence, (
                     f"{Rule.IN_ORDER}: rollouts of a lane are not collected in their order"
                 )
-                expected = (each.sequence, version, each.opponent)
-                assert lane.asked[each.ticket] == expected, f"{Rule.VERSION}: other weights act than the order names"
-                assert held.weights.keys() >= _versions(lane.asked[each.ticket]), (
-                    f"{Rule.OPPONENTS}: a rollout starts without its weights"
+                asked = lane.asked[each.ticket]
+                assert (asked.version, asked.opponent) == (version, each.opponent), (
+                    f"{Rule.VERSION}: other weights act than the order names"
                 )
+                assert held.weights.keys() >= _versions(asked), f"{Rule.OPPONENTS}: a rollout starts without its weights"
+                self._open(each)
             startable = [
                 asked.version
                 for lane in lanes.values()
@@ -124,10 +130,34 @@ class Worker(Process):
             )
         return []
 
+    def _open(self, each: Assignment) -> None:
+        """The env copies of a lane are here in this incarnation, or they are made, and continue its past."""
+        if self.places.get(each.lane, (-1, 0))[0] != each.incarnation:
+            assert each.sequence == 0, f"{Rule.PAST}: a lane goes on with env copies that are not here"
+            self.places[each.lane] = each.incarnation, 0 if each.past is None else place_of(each.past.memory)
+
+    def _answers(self, task: RolloutTask | EvaluationTask | Describe) -> Sequence[WorkAnswer]:
+        """What this work leads to."""
+        match task:
+            case RolloutTask():
+                return [self._rollout(task, each) for each in task.assignments]
+            case EvaluationTask():
+                return [fake_evaluated(task)]
+        return [described(task.session, task.ticket)]
+
+    def _rollout(self, task: RolloutTask, each: Assignment) -> Rollout:
+        """What a collector would have made. Its env copies have made one rollout more."""
+        incarnation, place = self.places[each.lane]
+        self.places[each.lane] = incarnation, place + 1
+        return fake_rollout(task.session, each.lane, each.ticket, task.weights.version, each.sequence, place + 1)
+
     def turn(self, effects: list[WorkerEffect], now: float) -> list[ToLearner]:
         current = self.session
         assert current is not None
+        self._close(effects)
         if self.task is not None and current.is_unwanted(self.task):
+            for each in self.task.assignments if isinstance(self.task, RolloutTask) else ():
+                self.places.pop(each.lane, None)
             self.task = None
             effects = effects + current.work_ended([])
         work = current.next_work()
@@ -149,21 +179,22 @@ class Worker(Process):
         assert versions <= most, f"{Rule.HOLDS_WEIGHTS}: a worker holds {versions} versions, of at most {most}"
         sent: list[ToLearner] = []
         for effect in effects:
-            if isinstance(effect, SendMessage):
-                sent.append(effect.message)
-            if isinstance(effect, Leave):
-                self.end()
+            match effect:
+                case SendMessage(said):
+                    sent.append(said)
+                case Leave():
+                    self.end()
         return sent
 
-
-def _answers(task: RolloutTask | EvaluationTask | Describe) -> Sequence[WorkAnswer]:
-    """What this work leads to."""
-    match task:
-        case RolloutTask():
-            return fake_rollouts(task)
-        case EvaluationTask():
-            return [fake_evaluated(task)]
-    return [described(task.session, task.ticket)]
+    def _close(self, effects: list[WorkerEffect]) -> None:
+        """Close the env copies that are no longer wanted."""
+        for effect in effects:
+            match effect:
+                case StartSession():
+                    self.places.clear()
+                case CloseLanes(closed):
+                    for lane in closed:
+                        self.places.pop(lane.lane, None)
 
 
 # -------------------------------------------------------------------- to tuples and back
@@ -175,7 +206,8 @@ def saved(worker: Worker, now: float) -> Content:
     if worker.session is not None:
         held = worker.session._current
         lanes = tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items())
-        more = lanes, tuple(sorted(held.weights))
+        places = tuple((number, incarnation(number, each), place) for number, (each, place) in sorted(worker.places.items()))
+        more = lanes, tuple(sorted(held.weights)), places
     work = None
     if isinstance(task, RolloutTask):
         work = session(task.session), task.weights.version, tuple(map(fields_of, task.assignments))
@@ -201,9 +233,20 @@ def _versions(asked: Permitted) -> set[int]:
 
 
 def _lane(number: int, lane: RolloutLane) -> Content:
-    tickets = tuple((ticket(each), *permitted) for each, permitted in sorted(lane.asked.items()))
+    tickets = tuple((ticket(each), *_plain(lane.asked[each])) for each in sorted(lane.asked))
     kept = tuple(rollout_content(rollout) for rollout in lane.answered.values())
     return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept
+
+
+def _plain(permitted: Permitted) -> Content:
+    """What is permitted, with the place of a lane instead of its past."""
+    place = None if permitted.past is None else place_of(permitted.past.memory)
+    return (*permitted._replace(past=None), place)
+
+
+def _permitted(lane: int, content: Content) -> Permitted:
+    sequence, version, of_round, opponent, _, place = content
+    return Permitted(sequence, version, of_round, opponent, None if place is None else fake_past(lane, place))
 
 
 W = TypeVar("W", bound=Worker)
@@ -214,13 +257,14 @@ def loaded(content: Content, number: int, settings: Settings, kind: type[W]) -> 
     worker, more = process_part.loaded(kind, content, number, settings)
     if worker.session is None:
         return worker
-    (lanes, versions), work = more, content[3]
+    (lanes, versions, places), work = more, content[3]
     held = worker.session._current
     held.weights = {version: weights(version) for version in versions}
     for lane, of_incarnation, sequence, tickets, kept in lanes:
         here = held.rollouts._lanes[lane] = RolloutLane(of_incarnation.value, sequence)
-        here.asked = {each.value: Permitted(*permitted) for each, *permitted in tickets}
+        here.asked = {each.value: _permitted(lane, permitted) for each, *permitted in tickets}
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
+    worker.places = {number: (each.value, place) for number, each, place in places}
     if work is not None:
         assignments = tuple(record_of(Assignment, each) for each in work[2])
         worker.task = RolloutTask(work[0].value, weights(work[1]), assignments, {})

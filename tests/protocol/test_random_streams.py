@@ -129,8 +129,8 @@ def test_no_two_generators_of_a_run_coincide(monkeypatch: pytest.MonkeyPatch) ->
 
     guess = RandomGuess()
     collector = Collector(msgspec.structs.replace(COIN, seed=seed, copies=2), guess)
-    for incarnation in (0, 1):
-        collector.collect([Assignment(n, n, incarnation, 0) for n in (0, 1)], 0, 3, no_pulse)
+    for number in (0, 1):
+        collector.collect([Assignment(n, n, 0, number, number) for n in (0, 1)], 0, 3, no_pulse)
     streams |= {f"actions of lane {n}": guess.streams[at] for n, at in enumerate((0, 1, 8, 9))}
     (recorded, *_) = seeds = list(islice(recording_seeds(seed), 2))
     of_episodes = [episode_seeds(seed, 2, p) for p in (Purpose.EPISODES, Purpose.EVALUATION, Purpose.CONFIRMATION)]

@@ -84,7 +84,7 @@ def refusal(rollout: Rollout, run: RunSpec) -> str:
 def against_opponents(run: RunSpec, number: int) -> list[Rollout]:
     """Rollouts of a lane whose copies the policy shares with opponents."""
     collector, held = random_collector(run), {VERSION: Weights(VERSION, *random_weights(run.policy))}
-    asked = ([Assignment(100, 0, 0, k, opponent=VERSION)] for k in range(number))
+    asked = ([Assignment(100, 0, 0, k, k, opponent=VERSION)] for k in range(number))
     return [collector.collect(each, VERSION, SESSION, no_pulse, held)[0] for each in asked]
 
 

@@ -24,7 +24,17 @@ import pytest
 from millrace.learner.members import join_limiter, membership
 from millrace.learner.members import member_states as standing
 from millrace.learner.rollouts import ticket_coordinator
-from millrace.protocol import bounds, call_timeouts, env_spec, messages, progress, rollout, space_spec, specs
+from millrace.protocol import (
+    bounds,
+    call_timeouts,
+    env_spec,
+    lane_past,
+    messages,
+    progress,
+    rollout,
+    space_spec,
+    specs,
+)
 from millrace.protocol.keys import handshake_failures
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
@@ -50,6 +60,9 @@ BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!--
 # Records that travel inside messages, in the order in which a reader meets them.
 RECORDS: tuple[type, ...] = (
     messages.Permit,
+    lane_past.LanePast,
+    lane_past.LastEpisode,
+    lane_past.AttributesFrom,
     messages.Received,
     messages.LaneIncarnation,
     messages.WorkerActivity,
@@ -57,6 +70,7 @@ RECORDS: tuple[type, ...] = (
     progress.RunProgress,
     messages.WorkerStatus,
     rollout.Episode,
+    lane_past.EpisodeBegin,
     space_spec.EnvDescription,
     *typing.get_args(space_spec.SpaceSpec),
     specs.WaitSpec,
@@ -108,7 +122,7 @@ WORDS: Mapping[str, str] = {
     "seconds": "wall-clock seconds",
     "env": "the environment",
     "policy": "the policy that acts",
-    "seed": "seed of the run; env copies and action generators are seeded by (seed, lane, incarnation, …)",
+    "seed": "seed of the run; env copies and action generators are seeded by (seed, lane, …)",
     "heartbeat_s": "seconds between two heartbeats of a worker",
     "observation": "the arrays of an observation, in order",
     "action": "what the policy chooses",
@@ -149,6 +163,8 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MAX_TEXT"): "characters of a `Text`",
     (bounds, "MAX_TICKETS"): "tickets in one message; also versions in a Heartbeat",
     (bounds, "MAX_WORKERS"): "workers that one supervisor speaks for",
+    (bounds, "MAX_COPIES"): "env copies of one lane",
+    (lane_past, "MAX_RANDOM_BYTES"): "bytes of a `RandomState`",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
     (bounds, "MAX_FACTS"): "facts of an episode",
     (bounds, "MOST_FRAMES"): "observations of an episode that come with a frame: the first ones",
@@ -373,7 +389,7 @@ def part_types() -> str:
     """A row for each bounded type: its base and its bounds."""
     lines = ["| type | is | bounds |", "|---|---|---|"]
     seen = set[str]()
-    for module in (bounds, space_spec, env_spec, messages, specs):
+    for module in (bounds, space_spec, env_spec, messages, specs, lane_past):
         for name, kind in vars(module).items():
             if name in seen or not (name[0].isupper() and typing.get_origin(kind)):
                 continue
@@ -486,7 +502,7 @@ def test_every_record_that_travels_is_described() -> None:
 def test_every_limit_is_in_the_document() -> None:
     for module in (
         bounds, space_spec, env_spec, codec, message_sizes, socket_options, packing, session, held, ticket_coordinator,
-        messages, rollout, specs,
+        messages, rollout, specs, lane_past,
     ):  # fmt: skip
         for name in re.findall(r"^((?:MAX|MOST)_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"

@@ -165,7 +165,8 @@ def test_a_worker_compresses_if_the_run_and_its_link_let_it() -> None:
         link = FakeLink(said_to_a_worker(msgspec.structs.replace(RUN, zstd=run_may)), zstd=link_may)
         assert work(link).exit_code == 0
         (rollout,) = (message for message in link.heard(rollout_bytes(RUN)) if isinstance(message, Rollout))
-        rollouts.append([bytes(frame) for frame in encode(rollout)[1:]])
+        without_times = msgspec.structs.replace(rollout, memory=())
+        rollouts.append([bytes(frame) for frame in encode(without_times)[1:]])
         bytes_sent += [sum(map(len, frames)) for frames in link.sent if len(frames) > 1]
     assert rollouts[0] == rollouts[1] == rollouts[2]
     assert bytes_sent[0] == bytes_sent[1] > bytes_sent[2] / 0.75

@@ -1,7 +1,8 @@
 """Collects rollouts that keep the row format (`protocol/rollout.py`), from a policy and the env copies of lanes.
 
 Lanes that are collected together are stepped in lock-step, with one forward pass for all of them [L, N, ·]. The rollout of
-a lane depends on the run's seed, the lane, its incarnation and the weights, and on nothing else: not on the other lanes.
+a lane depends on the run's seed, the lane, the round, the weights and what the lane did before, and on nothing else: not on
+the other lanes, and not on who collected the rollouts before it.
 The arrays of a rollout are new each time and are never written again, so they can be sent without a copy.
 """
 
@@ -24,15 +25,16 @@ from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import ActedRows
 from millrace.workers.conversation.held import Assignment
-from millrace.workers.copies.env_copies import EnvCopies, check_spaces, copy_seeds
+from millrace.workers.copies.env_copies import EnvCopies, check_spaces
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.open_lanes import OpenLanes
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
+from millrace.workers.lanes.bring_back import bring_back
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.rows import Rows, RowsOfLane
 from millrace.workers.lanes.runner import LaneRunner, StepAll, no_step_for_all
-from millrace.workers.opponents import KnownOpponents, Match, Opponent, Opponents, OtherTeams
+from millrace.workers.opponents import KnownOpponents, Match, Opponents, OtherTeams
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""
@@ -111,10 +113,12 @@ class Collector:
         lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
         for lane, assignment in zip(lanes, assignments, strict=True):  # rule ATTRIBUTES
             lane.set_attributes(self.env_attributes, pulse)
-            self._meet(lane, None if assignment.opponent is None else opponents(assignment.opponent))
+            self._meet(lane, assignment, opponents)
         states = [lane.state if lane.seats is None else lane.seats.state_before(lane.state) for lane in lanes]
-        actions = self._runner.acting.begin([lane.generator for lane in lanes])
-        rows = self._under_way = Rows(self._run, lanes, self._run.rollout_steps)
+        run = self._run
+        drawn = [generator(run.seed, Purpose.ACTIONS, each.lane, each.round) for each in assignments]
+        actions = self._runner.acting.begin(drawn)
+        rows = self._under_way = Rows(run, lanes, run.rollout_steps)
         try:
             self._runner.run(rows, actions, pulse)
         finally:
@@ -138,28 +142,30 @@ class Collector:
                 copies = self._open_copies(run, number, pulse)
             except CopyFailed as error:
                 raise environment_failed(number, error, "made") from error
-            seeds = copy_seeds(run.seed, number, incarnation, run.copies)
-            drawn = generator(run.seed, Purpose.ACTIONS, number, incarnation)
-            return Lane(run, copies, seeds, drawn, number=number, incarnation=incarnation)
+            return Lane(run, copies, run.copies, number=number, incarnation=incarnation)
 
         began = perf_counter()
         lane = self.lanes.open(number, made)
-        lane.set_attributes(self.env_attributes, pulse)
         check_spaces(run, lane.copies)
-        lane.reset(pulse)
+        if assignment.past is None:
+            lane.set_attributes(self.env_attributes, pulse)
+            lane.start([0] * run.copies, pulse)
+        else:  # rule PAST
+            self.note = bring_back(run, lane, assignment.past, self.env_attributes, pulse) or self.note
         self.note = self.note or lane.copies.note
         self.stages["open"] += perf_counter() - began
         return lane
 
-    def _meet(self, lane: Lane, opponent: Opponent | None) -> None:
-        """The episodes that begin in the next rollout are played against this opponent; None: the policy plays all seats."""
-        lane.opponent = opponent
-        if opponent is not None and lane.others is None:
-            run = self._run
-            number = lane.number
-            assert number is not None
-            matches = [Match(run.team_of(number, n), opponent) for n in range(run.copies)]
-            lane.others = OtherTeams(run, matches, generator(run.seed, Purpose.OPPONENTS, number, lane.incarnation))
+    def _meet(self, lane: Lane, assignment: Assignment, opponents: Opponents) -> None:
+        """The episodes that begin in the next rollout are played against the opponent that it names, if it names one."""
+        if assignment.opponent is None:
+            return
+        run = self._run
+        number = assignment.lane
+        lane.opponent = opponents(assignment.opponent)
+        if lane.others is None:
+            lane.others = OtherTeams(run, [Match(run.team_of(number, n), lane.opponent) for n in range(run.copies)])
+        lane.others.generator = generator(run.seed, Purpose.OPPONENTS, number, assignment.round)
 
     def _rollout(
         self, rows: RowsOfLane, state: Floats, acted: ActedRows, assignment: Assignment, version: int, session: int
@@ -192,4 +198,6 @@ class Collector:
             mask=rows.obs[-1][:, sent] if masked else None,
             extras=tuple(extra[:, sent] for extra in acted.extras),
             resets=None if lane.seats is None else rows.resets,
+            begun=lane.begun(),
+            memory=lane.memory(),
         )

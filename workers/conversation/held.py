@@ -23,6 +23,7 @@ from millrace.protocol.messages import (
     Evaluate,
     Evaluated,
     LaneIncarnation,
+    LanePast,
     Order,
     Permit,
     Received,
@@ -162,8 +163,12 @@ class Assignment:
     incarnation: int
     """If the worker has another incarnation of the lane, the lane starts on new env copies."""
     sequence: int
+    round: int
+    """Decides the random numbers of the actions."""
     opponent: int | None = None
     """Who plays the other teams in the episodes that begin in it."""
+    past: LanePast | None = None
+    """What a lane continues that is not open in this incarnation; None: it begins its first episodes."""
 
 
 class Permitted(NamedTuple):
@@ -172,8 +177,14 @@ class Permitted(NamedTuple):
     sequence: int
     version: int
     """of the weights to act under"""
+    round: int
     opponent: int | None
-    """as in the `Permit`"""
+    past: LanePast | None
+    """as in the `Permit`, these three"""
+
+    def assignment(self, ticket: int, lane: int, incarnation: int) -> Assignment:
+        """What to collect on this lane."""
+        return Assignment(ticket, lane, incarnation, self.sequence, self.round, self.opponent, self.past)
 
     @property
     def versions(self) -> set[int]:
@@ -204,7 +215,8 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
             return None  # a late repeat: the learner has this rollout
-        return lane.take(permit.ticket, Permitted(permit.sequence, version, permit.opponent))
+        permitted = Permitted(permit.sequence, version, permit.round, permit.opponent, permit.past)
+        return lane.take(permit.ticket, permitted)
 
     # rules IN_ORDER, VERSION, LOWEST_VERSION_FIRST
     def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
@@ -216,8 +228,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         for number, lane in sorted(self._lanes.items()):
             for ticket, asked in lane.asked.items():
                 if asked.sequence == lane.sequence and asked.versions.issubset(versions):
-                    assignment = Assignment(ticket, number, lane.incarnation, asked.sequence, asked.opponent)
-                    startable.setdefault(asked.version, []).append(assignment)
+                    startable.setdefault(asked.version, []).append(asked.assignment(ticket, number, lane.incarnation))
         version = min(startable, default=-1)
         return version, tuple(startable.get(version, ()))
 

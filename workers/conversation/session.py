@@ -162,6 +162,7 @@ class WorkerIdentity:
             software=self.software,
             attempt=attempt,
             evaluates=self.evaluates,
+            continues=True,
         )
 
 

@@ -29,6 +29,7 @@ from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from millrace.workers.copies.episode_facts import Facts, facts_of_info
 from millrace.workers.copies.mask_reader import MaskReader, unused_mask
+from millrace.workers.copies.random_state import pack as pack_random_state
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.row_writers import read_leaves
 
@@ -124,9 +125,9 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
         )
 
 
-def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]:  # rule INDEPENDENT
-    """A reset seed for each copy of a lane."""
-    return [env_seed(seed, Purpose.COPIES, lane, incarnation, copy) for copy in range(copies)]
+def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
+    """The reset seed of a copy of a lane, at its start of this number."""
+    return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
 class LoopedCopies:
@@ -191,6 +192,42 @@ class LoopedCopies:
             return StepResult(leaves, loop.reward, loop.terminated, loop.truncated)
         facts = {n: facts_of_info(self._facts, info, n) for n, info in infos if loop.terminated[n] or loop.truncated[n]}
         return StepResult(leaves, loop.reward, loop.terminated, loop.truncated, facts=facts)
+
+    def reset_some(self, copies: Sequence[int], seeds: Sequence[int | None], pulse: Pulse) -> StepResult:
+        """Begin episodes in these copies alone, with a seed for each, or without. The result has a row for each copy."""
+        infos = self._loop.reset(copies, seeds, self._observations, pulse)
+        self._fill_in(copies)
+        return self._after_reset(copies, infos)
+
+    def _fill_in(self, copies: Sequence[int]) -> None:
+        """A copy that was never reset shows what another one shows, because every row must show something."""
+        for n, observation in enumerate(self._observations):
+            if observation is None:
+                self._observations[n] = self._observations[copies[0]]
+
+    def _after_reset(self, copies: Sequence[int], infos: CopyInfos) -> StepResult:
+        leaves = self._leaves()
+        if self._masks is not None:
+            leaves = (*leaves, self._read_masks(self._masks, infos, copies))
+        return StepResult(leaves, self._loop.reward, self._loop.terminated, self._loop.truncated)
+
+    def end(self, copies: Sequence[int]) -> None:
+        """The episodes of these copies are over: the next step resets them."""
+        for n in copies:
+            self._loop.truncated[n] = True
+
+    def set_random_state(self, copy: int, packed: bytes) -> bool:
+        """Set the state of a copy's random generator. False if it has none that this state fits."""
+        return self._loop.set_random_state(copy, packed)
+
+    def begun(self, over: Sequence[int]) -> dict[int, bytes | None]:
+        """From which random numbers the newest episode began of each copy that a step has reset since this was last asked;
+        or will begin, of those that are `over`. None: the copy has no generator that can be read.
+        """
+        loop = self._loop
+        states = loop.random_states | {n: loop.random_state(n) for n in over}
+        loop.random_states = {}
+        return {n: pack_random_state(state) for n, state in states.items()}
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of every copy; of its wrappers, the outermost one that has it gets it."""

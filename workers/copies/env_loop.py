@@ -32,6 +32,7 @@ from millrace.workers.activity import (
     activity,
 )
 from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.random_state import repeatable, set_state, state_of
 from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
@@ -85,7 +86,10 @@ class EnvLoop:
         """[N] of the last step"""
         self.truncated: list[Any] = [ended] * len(self.envs)
         """[N] of the last step"""
+        self.random_states: dict[int, dict[str, Any] | None] = {}
+        """by copy: state of its environment's random generator before the last reset that a step made"""
         self._step_functions = [env.step for env in self.envs]
+        self._inner = [repeatable(env) for env in self.envs]
         self._stepping = stepping
         self._all = range(len(self.envs))
         # rules NEXT_STEP, SAME_STEP, DISABLED
@@ -147,6 +151,7 @@ class EnvLoop:
             resets = next_step and (terminated[n] or truncated[n])
             try:
                 if resets:
+                    self.random_states[n] = state_of(self._inner[n])
                     begin(RESETTING)
                     observation, info = reset_answer(self.envs[n].reset())
                     begin(stepping)
@@ -190,6 +195,14 @@ class EnvLoop:
             self._check_numbers(chosen)
         self.steps += 1
         return infos
+
+    def random_state(self, copy: int) -> dict[str, Any] | None:
+        """State of the copy's random generator now; None if it has none that can be read."""
+        return state_of(self._inner[copy])
+
+    def set_random_state(self, copy: int, packed: bytes) -> bool:
+        """Set it. False if the copy has none that this state fits."""
+        return set_state(self._inner[copy], packed)
 
     def _check_numbers(self, copies: Iterable[int]) -> None:
         """Raise `CopyFailed` for a text as a number, and for no reward: numpy would take them for True, 1 or NaN."""

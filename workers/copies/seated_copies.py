@@ -16,7 +16,7 @@ from millrace.protocol.envs.seats import SeatedEnv, SeatStep, side_by_side
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from millrace.workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
 from millrace.workers.copies.env_errors import CopyFailed
-from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.env_loop import CopyInfos, Pulse
 from millrace.workers.copies.episode_facts import facts_of_info
 from millrace.workers.copies.mask_reader import unused_mask
 from millrace.workers.copies.row_writers import read_leaves
@@ -58,6 +58,11 @@ class SeatedCopies(LoopedCopies):
         of_copies = actions.reshape(-1, self._seats, *actions.shape[1:])
         self._loop.step(of_copies, self._observations, pulse, copies)
         return self._result(range(self.count) if copies is None else copies)
+
+    def _after_reset(self, copies: Sequence[int], infos: CopyInfos) -> StepResult:
+        for n in copies:
+            self._allowed[n * self._seats : (n + 1) * self._seats] = [None] * self._seats
+        return self._result(copies)
 
     def _result(self, stepped: Sequence[int]) -> StepResult:
         """What the last step of these copies returned. The others show their last step; copies never reset are left out."""

@@ -108,9 +108,9 @@ class Evaluator:
         k = len(order.seeds)
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         drawn = generator(order.seeds[0], Purpose.PLAYED_ACTIONS)  # rule EVALUATE_SEEDS
-        lane = Lane(run, copies, order.seeds, drawn, number=None, most_steps=order.most_steps)
+        lane = Lane(run, copies, k, number=None, most_steps=order.most_steps)
         lane.others = others
-        lane.reset(pulse)
+        lane.reset(order.seeds, pulse)
         rows = Rows(run, [lane], 1)
         (of_lane,) = rows.of_lanes
         self._check_observed(of_lane, 0, 0)
@@ -119,7 +119,7 @@ class Evaluator:
             senders = [RowSender(order, n, run.policy, send) for n in range(k)]
         for sender in senders:
             self._observe(sender, of_lane, 0, copies)
-        actions = _PlayedActions(run, self._runner.acting, rows, greedy=order.greedy)  # rule GREEDY
+        actions = _PlayedActions(run, self._runner.acting, rows, drawn, greedy=order.greedy)  # rule GREEDY
         found: dict[int, EndedEpisode] = {}
         while lane.playing.any():
             playing = np.flatnonzero(lane.playing).tolist()
@@ -142,7 +142,11 @@ class Evaluator:
         """The other teams, if the order says who plays them."""
         find = self._opponents.among(held)
         matches = [Match(team, find(number)) for team, number in zip(order.teams, order.opponents, strict=True)]
-        return OtherTeams(self._run, matches, generator(order.seeds[0], Purpose.PLAYED_OPPONENTS)) if matches else None
+        if not matches:
+            return None
+        others = OtherTeams(self._run, matches)
+        others.generator = generator(order.seeds[0], Purpose.PLAYED_OPPONENTS)
+        return others
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
         """At least this number of copies. Raises `UsageError` when their spaces are not those of the run."""
@@ -190,13 +194,14 @@ class Evaluator:
 class _PlayedActions:
     """The actions of an evaluation. They are checked before an environment gets them, and only the newest are kept."""
 
-    def __init__(self, run: RunSpec, acting: Acting, rows: Rows, *, greedy: bool) -> None:
+    def __init__(self, run: RunSpec, acting: Acting, rows: Rows, drawn: np.random.Generator, *, greedy: bool) -> None:
         self.chosen: Array
         """[k · A, *action] of the newest step"""
         self._run = run
         self._acting = acting
         self._rows = rows
         self._lane = rows.of_lanes[0].lane
+        self._drawn = drawn
         self._greedy = greedy
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
@@ -204,7 +209,7 @@ class _PlayedActions:
 
         The action of a copy whose episode has ended does not count.
         """
-        self.chosen = self._acting.choose(obs, state, self._lane.generator, greedy=self._greedy)
+        self.chosen = self._acting.choose(obs, state, self._drawn, greedy=self._greedy)
         if self.chosen.dtype.kind == "f":
             acted = np.zeros_like(self.chosen)
             playing = np.repeat(self._lane.playing, self._run.seats_of_copy)

@@ -1,8 +1,8 @@
 """A lane: N env copies that are stepped together, and all that one step of them passes on to the next.
 
 Rule: whatever a lane remembers is here: its copies and what was set in them, the observations and the policy's state, which
-copies are playing, their running episodes, seats that wait, opponents, and the generator of its random numbers. What steps
-lanes (`runner.py`) remembers nothing.
+copies are playing, their running episodes, seats that wait, opponents, and how its newest episodes began. What steps lanes
+(`runner.py`) remembers nothing. `bring_back.py` gives a new lane the memory of one that was lost.
 """
 
 from __future__ import annotations
@@ -13,14 +13,16 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
-from millrace.protocol.arrays import Doubles
+from millrace.protocol.arrays import Array, Doubles
 from millrace.protocol.bounds import LARGEST
+from millrace.protocol.envs.seats import columns_of
+from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import pack, unpack
-from millrace.workers.copies.env_copies import EnvCopies
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, copy_seed
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.row_writers import ObservationWriter
@@ -38,14 +40,13 @@ class Lane:
         self,
         run: RunSpec,
         copies: EnvCopies,
-        seeds: Sequence[int],
-        generator: np.random.Generator,
+        count: int,
         *,
         number: int | None,
         incarnation: int = 0,
         most_steps: int = LARGEST,
     ) -> None:
-        """`seeds`: of the first episodes, one for each copy. `generator`: of actions.
+        """`count`: N, the first so many of the copies.
 
         `number`: None if the lane plays an evaluation. Then no step resets a copy, and one whose episode is over is not
         stepped. `most_steps`: an episode that reaches so many is cut.
@@ -53,10 +54,15 @@ class Lane:
         self.number = number
         self.incarnation = incarnation
         self.copies = copies
-        self.generator = generator
         self.autoresets = number is not None
-        self.count = len(seeds)
+        self.count = count
         """N"""
+        self.starts: list[int] = []
+        """[N] the number of each copy's start, which decides its seed; none in an evaluation"""
+        self.new_starts: Sequence[int] = ()
+        """the copies that have started since `begun` was asked"""
+        self.remembers = isinstance(copies, LoopedCopies) and not run.teams
+        """whether its episodes can be continued on other copies"""
         self.columns = self.count * run.seats_of_copy
         """N · A"""
         leaves = stored_leaves(run)
@@ -74,7 +80,6 @@ class Lane:
         """who plays them in the episodes that begin from now on; None: as before"""
         self.writer = ObservationWriter(leaves, self.columns, run.seats)
         self._run = run
-        self._seeds = seeds
         self._attributes = b""  # that were set in the copies
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
@@ -91,11 +96,18 @@ class Lane:
                 raise environment_failed(self.number, error, f"set_env_attr {name}") from error
         self._attributes = packed
 
-    def reset(self, pulse: Pulse) -> None:
-        """Start the first episodes. Raises `EnvironmentFailed`."""
+    def start(self, starts: list[int], pulse: Pulse) -> None:
+        """Start all copies, under these numbers. Raises `EnvironmentFailed`."""
+        assert self.number is not None
+        self.starts = starts
+        self.new_starts = range(self.count)
+        self.reset([copy_seed(self._run.seed, self.number, start, n) for n, start in enumerate(starts)], pulse)
+
+    def reset(self, seeds: Sequence[int], pulse: Pulse) -> None:
+        """Begin the first episodes, with a seed for each copy. Raises `EnvironmentFailed`."""
         self.episodes.begin(perf_counter())
         try:
-            leaves = self.copies.reset(self._seeds, pulse)
+            leaves = self.copies.reset(seeds, pulse)
             self.writer.write_some(self.obs, range(self.columns), leaves)
         except CopyFailed as error:
             raise environment_failed(self.number, error, "first reset" if self.autoresets else "reset") from error
@@ -115,6 +127,37 @@ class Lane:
     def sent(self) -> slice | npt.NDArray[np.intp]:
         """The columns whose rows a rollout has."""
         return slice(None) if self.others is None else np.flatnonzero(self.others.mine)
+
+    def begun(self) -> tuple[EpisodeBegin, ...]:  # rule PAST
+        """How the newest episodes began, of the copies that have new ones since this was last asked."""
+        random: dict[int, bytes | None] = dict.fromkeys(self.new_starts, b"" if self.remembers else None)
+        self.new_starts = ()
+        if self.remembers and isinstance(self.copies, LoopedCopies):
+            random |= self.copies.begun(np.flatnonzero(~self.playing).tolist())
+        return tuple(EpisodeBegin(n, self.starts[n], state) for n, state in sorted(random.items()))
+
+    def memory(self) -> tuple[Array, ...]:  # rule PAST
+        """What `recall` needs beside the observations, the actions, and how the episodes began."""
+        if not self.remembers:
+            return ()
+        state = (self.state,) if self.state.size else ()
+        return (self.episodes.memory(perf_counter()), *state, *(() if self.seats is None else self.seats.memory()))
+
+    def can_recall(self, memory: Sequence[Array]) -> bool:
+        """Whether this is the memory of such a lane."""
+        own = self.memory()
+        fits = [each.shape == mine.shape and each.dtype == mine.dtype for each, mine in zip(memory, own, strict=False)]
+        return all(fits) and (len(memory) == len(own) or (self.seats is not None and len(memory) > len(own)))
+
+    def recall(self, memory: Sequence[Array], copies: Sequence[int]) -> None:
+        """Take over, for these copies, what `memory` said of another lane. `can_recall` must hold."""
+        left = list(memory)
+        columns = columns_of(copies, self.columns // self.count)
+        self.episodes.recall(left.pop(0), copies, perf_counter())
+        if self.state.size:
+            self.state[columns] = left.pop(0)[columns]
+        if self.seats is not None:
+            self.seats.recall(left, columns)
 
     def close(self) -> None:
         """Close the copies. Raises nothing."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.arrays import Array, Bools, Doubles
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.rollout import Episode
 from millrace.protocol.rows.rollout_checks import wrong_episode
@@ -49,6 +49,17 @@ class RunningEpisodes:
         self._run = run
         self._lane = lane
         self._no_facts = (math.nan,) * len(run.info_keys)
+
+    def memory(self, now_s: float) -> Doubles:
+        """[N, A + 1]: the returns so far, and the seconds."""
+        seconds = [[now_s - began_s] for began_s in self.began_s]
+        return np.concatenate([self.returns, seconds], axis=1)
+
+    def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
+        """Take over, for these copies, what `memory` said elsewhere."""
+        for n in copies:
+            self.returns[n] = memory[n, :-1]
+            self.began_s[n] = now_s - float(memory[n, -1])
 
     def begin(self, now_s: float) -> None:
         """The first episodes of all copies begin with a reset."""

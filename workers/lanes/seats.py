@@ -27,6 +27,19 @@ class Seats:
         self._held: list[Array] = []  # what the policy wrote when each seat acted last
         self._held_state = zero_state(policy, columns)  # [N · A, S] before that
 
+    def memory(self) -> tuple[Array, ...]:
+        """What `recall` needs: who waits, the states in which they acted, and what was written then, if any has acted."""
+        return (self._waits.copy(), self._held_state.copy(), *(held.copy() for held in self._held))
+
+    def recall(self, memory: Sequence[Array], columns: Sequence[int]) -> None:
+        """Take over, for these columns, what `memory` said of other seats."""
+        waits, held_state, *held = memory
+        self._waits[columns] = waits[columns]
+        self._held_state[columns] = held_state[columns]
+        self._held = [np.zeros_like(array) for array in held]
+        for mine, array in zip(self._held, held, strict=True):
+            mine[columns] = array[columns]
+
     def state_before(self, state: Floats) -> Floats:
         """The state before the first of the next rows, if the policy is in this state [N · A, S] now."""
         return np.where(self._waits[:, None], self._held_state, state)

@@ -19,6 +19,8 @@ class Ending:
     """Its environment, the policy, or the worker is to blame: it ended neither on purpose nor before it ran their code."""
     of_policy: bool = False
     """It failed in a call of the policy."""
+    hung: bool = False
+    """It was ended because a call of its environment, or of the policy, took too long."""
     worked: bool = False
     """Calls of its environment have returned."""
     last_lines: str | None = None

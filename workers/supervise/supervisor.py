@@ -164,7 +164,7 @@ class Supervisor:
                 nonce = worker.running.process_nonce
                 self._record_end(worker, end, now)
                 reason = end.reason + (GIVEN_UP if worker.failed_starts == MOST_FAILED_STARTS else "")
-                ended.append((WorkerExit(name, nonce, one_line(reason), end.failed, end.of_policy), end))
+                ended.append((WorkerExit(name, nonce, one_line(reason), end.failed, end.of_policy, end.hung), end))
             if worker.restart_s is not None and now >= worker.restart_s and not self._stopping:
                 self._restart(worker, now)
         return ended

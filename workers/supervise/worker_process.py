@@ -255,7 +255,15 @@ class WorkerProcess:
         failed = page.doing != "closing" and (worked or page.doing not in OUR_CODE)
         of_policy = failed and page.doing in OF_POLICY
         last_lines = _end_of(output) if page.doing == "starting" else None
-        return Ending(code, one_line(line), failed=failed, of_policy=of_policy, worked=worked, last_lines=last_lines)
+        return Ending(
+            code=code,
+            reason=one_line(line),
+            failed=failed,
+            of_policy=of_policy,
+            hung=failed and bool(self._because),
+            worked=worked,
+            last_lines=last_lines,
+        )
 
     def _output(self) -> str:
         """What it has written to its log, the end of it if that is long: a simulator may write without a limit."""

@@ -190,8 +190,9 @@ class ReplayBuffer:
         most = valid.size + valid.shape[1]
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
-        newest = self._newest.get(lane) if not batch.fresh[columns.start] else None
-        continues, newest = self._continues([leaf[0] for leaf in obs], newest, most)
+        newest = self._newest.get(lane, NO_SLOT)
+        newest = np.where(batch.fresh[columns], NO_SLOT, newest)
+        continues = self._continues([leaf[0] for leaf in obs], newest, most)
         goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
         needed = np.zeros(goes_on.shape, bool)  # [T+1, N] observations to store
         needed[:-1] = valid & ~goes_on[:-1]
@@ -234,19 +235,17 @@ class ReplayBuffer:
         """The arrays with one entry for each stored observation: its leaves, and its mask if there are masks."""
         return self._obs if self._mask is None else (*self._obs, self._mask)
 
-    def _continues(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
-        """[N] whether a copy's rollout begins with the newest observation that is stored for it; [N] where that was written.
+    def _continues(self, first: Sequence[Array], newest: Ints, room: int) -> Bools:
+        """[N] whether a copy's rollout begins with the newest observation that is stored for it. `newest` [N]: where.
 
         The observations are compared, in case a caller that stacks rollouts itself has left one out. The stored observation
         must also be so new that adding this rollout does not overwrite it.
         """
-        if newest is None:
-            newest = np.full(len(first[0]), NO_SLOT)
-        continues = (newest != NO_SLOT) & (newest + self.size >= self._written + room)
+        continues: Bools = (newest != NO_SLOT) & (newest + self.size >= self._written + room)
         for kept, leaf in zip(self._obs, first, strict=True):
             same = kept[newest % self.size] == leaf
             continues &= same.reshape(len(leaf), -1).all(1)
-        return continues, newest
+        return continues
 
     # ---------------------------------------------------------------- reading
 

@@ -91,7 +91,7 @@ class Collecting:
         """The next ticket, for this lane."""
         sequence = self._sequences[lane, incarnation]
         self._sequences[lane, incarnation] += 1
-        return Permit(next(self.learner.tickets), lane, incarnation, sequence)
+        return Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence)
 
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
         """Send a Collect, without the weights that it names. `keep`: versions to hold although no ticket names them."""

@@ -519,7 +519,7 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     run = run_of(f"{TOY}Countdown-v0", T=6, N=1)  # an episode, and the reset after it
     collector = Collector(run, random_policy(run.policy))
     first, second = (
-        Progress(rollouts=(collector.collect([Assignment(n, 0, 0, n)], 0, 1, no_pulse)[0],), incarnations=(0,))
+        Progress(rollouts=(collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)[0],), incarnations=(0,))
         for n in range(2)
     )
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
@@ -548,7 +548,7 @@ def test_a_run_that_ends_before_a_whole_episode_leaves_no_dataset(root: Path, ca
     collector = Collector(run, random_policy(run.policy))
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
     recorder.on_rollouts(
-        Progress(rollouts=tuple(collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)), incarnations=(0,))
+        Progress(rollouts=tuple(collector.collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)), incarnations=(0,))
     )
     recorder.on_end(Progress())
     assert caplog.messages == ["dataset ns/countdown-v0: 0 training episodes; 3 steps of others left out"]

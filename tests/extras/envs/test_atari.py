@@ -21,7 +21,7 @@ from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
-from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, copy_seeds
+from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, copy_seed
 from tests.support.in_process.collectors import bits, collect, no_pulse, random_collector
 from tests.support.in_process.described import run_spec
 
@@ -230,7 +230,7 @@ def test_lanes_are_the_same_again_and_others_than_their_neighbours(kind: str) ->
 def test_the_step_after_an_end_only_resets(kind: str) -> None:
     N = 3
     copies = OPEN[kind](BREAKOUT, N)
-    copies.reset(copy_seeds(1, 0, 0, N), no_pulse)
+    copies.reset([copy_seed(1, 0, 0, n) for n in range(N)], no_pulse)
     generator, ended, ends = np.random.default_rng(1), np.zeros(N, bool), 0
     for _ in range(400):
         row = copies.step(generator.integers(4, size=N), no_pulse)

@@ -25,7 +25,7 @@ from millrace.learner.config.layers import resolve
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import RunSpec
-from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seeds
+from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
 from tests.support.envs.toy import Countdown
 from tests.support.examples import examples
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
@@ -59,7 +59,7 @@ def test_it_steps_as_the_loop_does_from_the_same_states(vector: Vector, rtol: fl
     N, env = 16, EnvSpec("CartPole-v1", {"max_episode_steps": 40})
     loop_envs = [env.make() for _ in range(N)]
     one, other = cartpoles(N, 40, vector), LoopedCopies([iter(loop_envs).__next__] * N, no_pulse)
-    obs = np.asarray(one.reset(copy_seeds(1, 0, 0, N), no_pulse)[0])
+    obs = np.asarray(one.reset([copy_seed(1, 0, 0, n) for n in range(N)], no_pulse)[0])
     other.reset(range(N), no_pulse)
     generator, began, ended = np.random.default_rng(2), np.ones(N, bool), {"terminated": 0, "truncated": 0}
     for _ in range(300):

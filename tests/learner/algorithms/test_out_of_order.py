@@ -9,6 +9,7 @@ import pytest
 
 from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer
 from millrace.learner.algorithms.running_statistics import RewardScaler, RunningMoments
+from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TicketedLane
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Batch, Rollout, stack_rollouts
@@ -27,9 +28,12 @@ def collected(run: RunSpec) -> list[Rollout]:
     policy = make_policy(run.policy)
     policy.load(*random_weights(run.policy))
     collector = Collector(run, policy)
-    found = [collector.collect([Assignment(n, 0, 0, n)], 0, 1, lambda: None)[0] for n in range(len(ORDER))]
+    found = [collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, lambda: None)[0] for n in range(len(ORDER))]
     collector.lanes.close_all()
     return found
+
+
+HISTORIES = LaneHistories(copies=2, most_steps=1000)
 
 
 def batches(rollouts: Sequence[Rollout], split: Sequence[int]) -> list[Batch]:
@@ -37,7 +41,7 @@ def batches(rollouts: Sequence[Rollout], split: Sequence[int]) -> list[Batch]:
     lane, found, at = TicketedLane(0), list[Batch](), 0
     for count in split:
         used = [rollouts[n] for n in ORDER[at : at + count]]
-        found.append(stack_rollouts(used, [not lane.use(0, rollout.sequence) for rollout in used]))
+        found.append(stack_rollouts(used, [lane.take(0, rollout, b"", HISTORIES, from_past=False) for rollout in used]))
         at += count
     return found
 

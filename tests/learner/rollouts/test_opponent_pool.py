@@ -38,7 +38,7 @@ def pool_of(
 
 def drawn(pool: OpponentPool, version: int, draws: int = DRAWS) -> Counter[int]:
     """How often this version meets whom."""
-    return Counter(pool.of(n % 7, n % 3, n, version) for n in range(draws))
+    return Counter(pool.of(n % 7, n, version) for n in range(draws))
 
 
 def is_fair(count: int, share: float) -> bool:
@@ -105,10 +105,10 @@ def test_who_meets_a_version_is_settled_when_it_is_made(
         if pool.made(version, sum(steps[:version])):
             snapshots.append(version)
         playing[version] = snapshots[-window:]
-        expected[version] = [pool.of(lane, 1, 2, version) for lane in range(12)]
+        expected[version] = [pool.of(lane, 2, version) for lane in range(12)]
         pool.played([met(each, 0.0) for each in expected[version]])
         for acting in range(max(0, version - max_lag), version + 1):
-            assert [pool.of(lane, 1, 2, acting) for lane in range(12)] == expected[acting]
+            assert [pool.of(lane, 2, acting) for lane in range(12)] == expected[acting]
             assert set(playing[acting]) <= set(pool.versions)
             assert set(expected[acting]) <= {acting, *playing[acting], *range(-scripted, 0)}
         assert len(pool.versions) <= 1 + window + max_lag
@@ -142,10 +142,10 @@ def test_without_snapshots_the_programs_play_alone() -> None:
     assert all(is_fair(count, 1 / 2) for count in counts.values()), counts
 
 
-@pytest.mark.parametrize("differs", ["seed", "lane", "incarnation", "sequence"])
+@pytest.mark.parametrize("differs", ["seed", "lane", "round_number"])
 def test_each_rollout_draws_anew(differs: str) -> None:
     def of(number: int) -> int:
-        where = {"lane": 1, "incarnation": 2, "sequence": 3, differs: number}
+        where = {"lane": 1, "round_number": 3, differs: number}
         seed = where.pop("seed", 1)
         return pool_of(window=8, made=8, seed=seed).of(**where, version=7)
 

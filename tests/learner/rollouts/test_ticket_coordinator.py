@@ -27,6 +27,7 @@ from millrace.learner.members.member_states import TABLE, MemberState, SentUnusa
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
@@ -466,7 +467,7 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(chan
     outs = learner.says(A, msgspec.structs.replace(learner.rollout_of(number), **change))
     ledger = learner.coordinator.rollouts.ledger
     assert (learner.coordinator.rollouts.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
-    assert permits(outs) == [example(Permit, ticket=other + 1, sequence=2)]
+    assert permits(outs) == [example(Permit, ticket=other + 1, sequence=2, round=1)]
     assert learner.coordinator.members[A].strikes == 1
 
 
@@ -1189,7 +1190,11 @@ def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -
 def test_a_rollout_continues_only_one_of_its_own_incarnation() -> None:
     """The first of the new incarnation was rejected."""
     lane = TicketedLane(0)
-    assert [lane.use(0, 0), lane.use(0, 1), lane.use(1, 2), lane.use(1, 3)] == [False, True, False, True]
+    used = [
+        lane.take(incarnation, fake_rollout(1, 0, 0, 0, sequence), b"", LaneHistories(), from_past=False)
+        for incarnation, sequence in ((0, 0), (0, 1), (1, 2), (1, 3))
+    ]
+    assert [bool(fresh) for fresh in used] == [True, False, True, False]
 
 
 # -------------------------------------------------------------------- the table

@@ -29,7 +29,7 @@ METHODS = {
     "TicketCoordinator": (
         *COMMON,
         *("refuse", "publish", "begin_update", "begin_evaluation", "await_evaluation"),
-        *("share_evaluation", "drain", "take_over"),
+        *("share_evaluation", "drain", "take_over", "keep"),
     ),
     "RolloutDealer": ("take", "not_used", "incarnations"),
     "EvaluationDealer": ("end",),
@@ -41,7 +41,7 @@ METHODS = {
     ),
 }
 NOT_RECORDED = {  # it changes nothing, or nobody calls it
-    "TicketCoordinator": {"collected", "steps_of_update"},
+    "TicketCoordinator": {"collected", "steps_of_update", "past"},
     "DescribeCoordinator": {"drain", "status", "take_over"},
     "Session": {"is_unwanted", "missing_versions"},
 }

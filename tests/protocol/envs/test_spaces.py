@@ -186,7 +186,7 @@ def altered(observation: str = "box", action_space: str = "discrete", **changes:
         name: change(getattr(good, name)) for name, change in changes.items() if callable(change)
     }
     with pytest.raises(BadRollout) as caught:
-        validate(Rollout(**fields), run)
+        validate(Rollout(**fields), run, most_steps=100)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

@@ -287,7 +287,7 @@ def learned(name: str, core: Core | None, updates: int) -> float:
     collector = Collector(run, make_policy(spec))
     for k in range(updates):
         collector.load(*algorithm.weights())
-        rollouts = collector.collect([Assignment(k, lane, 0, k) for lane in range(lanes)], k, 1, no_pulse)
+        rollouts = collector.collect([Assignment(k, lane, 0, k, k) for lane in range(lanes)], k, 1, no_pulse)
         algorithm.update(stack_rollouts(rollouts), no_pulse)
     collector.lanes.close_all()
     policy = make_policy(spec)

@@ -242,11 +242,11 @@ def test_what_is_wrong_in_a_head_is_named(content: object, says: str) -> None:
 
 def test_what_is_wrong_in_a_record_within_a_message_is_named() -> None:
     for permit, says in (
-        ([1, 2], "Expected `array` of at least length 4, got 2 - at `Collect.permits[1]`"),
-        ([1, 2, [], 0], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
+        ([1, 2], "Expected `array` of at least length 5, got 2 - at `Collect.permits[1]`"),
+        ([1, 2, [], 0, 0], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
     ):
         with pytest.raises(BadMessage) as caught:
-            decode_to_worker(head(head_of(Collect, permits=[[1, 0, 0, 0], permit])))
+            decode_to_worker(head(head_of(Collect, permits=[[1, 0, 0, 0, 0], permit])))
         assert says in str(caught.value)
 
 
@@ -256,10 +256,9 @@ def test_hello_and_refuse_are_for_ever_what_they_were() -> None:
         "88a474797065a548656c6c6fa870726f746f636f6c02a6776f726b6572a27730a4686f7374a168a370696407ad70726f6365"
         "73735f6e6f6e63654da8736f667477617265a173a7617474656d707401"
     )
-    assert decode_to_learner([hello]) == example(Hello, protocol=2, host="h", pid=7, process_nonce=77, software="s")
-    assert msgpack.unpackb(
-        *sent(example(Hello, protocol=2, host="h", pid=7, process_nonce=77, software="s"))
-    ) == msgpack.unpackb(hello) | {"evaluates": False}
+    said = example(Hello, protocol=2, host="h", pid=7, process_nonce=77, software="s", continues=False)
+    assert decode_to_learner([hello]) == said
+    assert msgpack.unpackb(*sent(said)) == msgpack.unpackb(hello) | {"evaluates": False, "continues": False}
     refuse = bytes.fromhex("82a474797065a6526566757365a6726561736f6ea26e6f")
     assert decode_to_worker([refuse]) == Refuse("no")
     assert sent(Refuse("no")) == [refuse]

@@ -26,6 +26,7 @@ SAID: dict[type, dict[str, Any]] = {
         "process_nonce": 1,
         "software": "fake",
         "attempt": 1,
+        "continues": True,
     },
     Weights: {"parameters": np.zeros(1, np.float32), "buffers": np.zeros(0, np.float32)},
     Welcome: {"run": WaitSpec()},

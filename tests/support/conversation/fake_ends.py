@@ -11,6 +11,7 @@ import itertools
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -20,11 +21,13 @@ from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.lane_history import LaneHistory
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.lane_past import EpisodeBegin, LanePast
 from millrace.protocol.messages import (
     Alive,
     EpisodeRows,
@@ -64,8 +67,8 @@ def run_spec(lanes: int = 4, **changes: object) -> RunSpec:
     return msgspec.structs.replace(spec, **changes)
 
 
-def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: int) -> Rollout:
-    """One valid transition."""
+def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: int, place: int = 0) -> Rollout:
+    """One valid transition. `place`: how many rollouts its env copies have made since the run began, this one included."""
     return example(
         Rollout,
         session=session,
@@ -81,7 +84,27 @@ def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: i
         truncated=np.zeros((1, 1), bool),
         valid=np.ones((1, 1), bool),
         state=np.zeros((1, 0), np.float32),
+        begun=(EpisodeBegin(0, 0, b""),),
+        memory=fake_memory(place),
     )
+
+
+def fake_memory(place: int) -> tuple[Array]:
+    """What a worker remembers of fake env copies, which have made so many rollouts."""
+    return (np.array([place]),)
+
+
+def place_of(memory: Sequence[Array]) -> int:
+    """How many rollouts the fake env copies have made."""
+    return int(memory[0][0])
+
+
+@cache
+def fake_past(lane: int, place: int) -> LanePast:
+    """The past of a lane whose fake env copies have made so many rollouts."""
+    history = LaneHistory.of_nothing(1, most_steps=1)
+    history.add(fake_rollout(0, lane, 0, 0, 0, place), b"")
+    return history.past(lane)
 
 
 def spoiled(rollout: Rollout) -> Rollout:
@@ -89,7 +112,7 @@ def spoiled(rollout: Rollout) -> Rollout:
     return msgspec.structs.replace(rollout, reward=np.full(rollout.reward.shape, np.nan, np.float32))
 
 
-def any_rows(rollout: Rollout, run: RunSpec) -> None:
+def any_rows(rollout: Rollout, run: RunSpec, most_steps: int) -> None:
     """Every rollout passes: for runs whose fake rollouts have no rows of the run."""
 
 

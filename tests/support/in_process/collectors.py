@@ -103,7 +103,7 @@ def collect(
     collector: Collector, run: RunSpec, sequence: int = 0, lanes: Iterable[int] = (0,), incarnation: int = 0
 ) -> list[Rollout]:
     """Rollout number `sequence` of each lane, after a check that it keeps the row format."""
-    assignments = [Assignment(100 + lane, lane, incarnation, sequence) for lane in lanes]
+    assignments = [Assignment(100 + lane, lane, incarnation, sequence, sequence) for lane in lanes]
     rollouts = collector.collect(assignments, VERSION, SESSION, no_pulse)
     for assignment, rollout in zip(assignments, rollouts, strict=True):
         validate(rollout, run)

@@ -14,7 +14,7 @@ import zmq
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import Inquire, Status
 from millrace.protocol.wire.codec import decode_to_observer, encode
-from millrace.workers.copies.env_copies import copy_seeds
+from millrace.workers.copies.env_copies import copy_seed
 from tests.support.conversation.hostile_messages import hostile, real
 from tests.system.stage.processes import START_S, Learner, Stage, free_port
 from tests.system.stage.run_folders import policy_of
@@ -95,7 +95,7 @@ def test_invalid_messages_of_strangers_do_not_change_the_weights(tmp_path: Path)
 def test_two_runs_in_which_the_same_ticket_kills_its_worker_give_the_same_weights(tmp_path: Path) -> None:
     """Until that ticket, they are equal to the run without a death. After it, only the incarnation of the lane differs."""
     steps, seed, deadly_update = 16, 2, 4
-    doomed = copy_seeds(seed, lane=1, incarnation=0, copies=2)[1]
+    doomed = copy_seed(seed, lane=1, start=0, copy=1)
     after = ((deadly_update - 1) * steps + steps // 2) * 5 // 6  # env steps: every sixth row only resets
 
     def learn(name: str, only_seed: int) -> tuple[bytes, dict[str, Any], list[dict[str, Any]]]:

@@ -24,7 +24,7 @@ from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.specs import Leaf, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
-from millrace.workers.copies.env_copies import copy_seeds
+from millrace.workers.copies.env_copies import copy_seed
 from tests.support.envs.toy import Countdown, Scripted
 from tests.support.in_process.collectors import (
     TOY,
@@ -110,25 +110,23 @@ def test_every_copy_of_every_incarnation_of_every_lane_has_its_own_seed() -> Non
         seed
         for run_seed in (0, 1)
         for lane in range(8)
-        for incarnation in range(3)
-        for seed in copy_seeds(run_seed, lane, incarnation, 16)
+        for start in range(3)
+        for seed in [copy_seed(run_seed, lane, start, copy) for copy in range(16)]
     ]
     assert len(set(seeds)) == len(seeds) == 2 * 8 * 3 * 16
     assert all(0 <= seed < 2**31 for seed in seeds)
 
 
-def test_copies_and_incarnations_start_differently() -> None:
+def test_copies_of_all_lanes_start_differently() -> None:
     run = run_of("CartPole-v1", T=2, N=4)
-    collector = random_collector(run)
-    firsts = [rollout.obs[0][0] for rollout in collect(collector, run, lanes=(0, 1))]
-    firsts += [rollout.obs[0][0] for rollout in collect(collector, run, lanes=(0, 1), incarnation=1)]
+    firsts = [rollout.obs[0][0] for rollout in collect(random_collector(run), run, lanes=(0, 1, 2, 3))]
     assert len(np.unique(np.concatenate(firsts), axis=0)) == 16
 
 
-def test_actions_of_lanes_and_incarnations_are_drawn_independently() -> None:
+def test_actions_of_lanes_and_rounds_are_drawn_independently() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=64, N=2)
     collector = random_collector(run)
-    rollouts = collect(collector, run, lanes=(0, 1)) + collect(collector, run, lanes=(0, 1), incarnation=1)
+    rollouts = collect(collector, run, lanes=(0, 1)) + collect(collector, run, 1, lanes=(0, 1))
     assert len({rollout.action.tobytes() for rollout in rollouts}) == 4
 
 
@@ -280,7 +278,7 @@ def test_a_pulse_may_abandon_the_collection() -> None:
     run, collector, said = closable(T=50)
     collect(collector, run, lanes=(2,))
     with pytest.raises(Enough):
-        collector.collect([Assignment(0, 0, 0, 0), Assignment(1, 1, 0, 0)], 0, 0, pulse)
+        collector.collect([Assignment(0, 0, 0, 0, 0), Assignment(1, 1, 0, 0, 0)], 0, 0, pulse)
     assert sorted(said) == ["b", "c"]
     collect(collector, run, 1, lanes=(2,))  # lane 2 goes on,
     assert collector.steps == 80 + 2  # two lanes had made a step each when they were abandoned
@@ -289,7 +287,7 @@ def test_a_pulse_may_abandon_the_collection() -> None:
 
 def test_a_lane_released_by_a_pulse_is_closed_after_the_collection() -> None:
     _, collector, said = closable()
-    collector.collect([Assignment(0, 0, 0, 0), Assignment(1, 1, 0, 0)], 0, 0, lambda: collector.lanes.close([1]))
+    collector.collect([Assignment(0, 0, 0, 0, 0), Assignment(1, 1, 0, 0, 0)], 0, 0, lambda: collector.lanes.close([1]))
     assert said == ["b"]
 
 
@@ -312,14 +310,14 @@ def test_the_pulse_is_called_between_slow_copies(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("millrace.workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
-    random_collector(run).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
+    random_collector(run).collect([Assignment(0, 0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
     assert len(pulses) >= 3 * 5
 
 
 def test_one_lane_cannot_be_collected_twice_at_once() -> None:
     run = run_of(f"{TOY}Countdown-v0")
     with pytest.raises(ValueError, match="one assignment for each lane"):
-        random_collector(run).collect([Assignment(0, 3, 0, 0), Assignment(1, 3, 0, 1)], 0, 0, no_pulse)
+        random_collector(run).collect([Assignment(0, 3, 0, 0, 0), Assignment(1, 3, 0, 1, 1)], 0, 0, no_pulse)
 
 
 def test_stages_and_steps_are_counted() -> None:
@@ -354,7 +352,7 @@ def test_steps_are_counted_while_a_rollout_is_under_way(
     collector, seen = random_collector(run), list[tuple[int, int]]()
     for k in range(3):
         pulse = lambda: seen.append((collector.steps, made))  # noqa: E731
-        collector.collect([Assignment(10 * k + lane, lane, 0, k) for lane in lanes], 0, 0, pulse)
+        collector.collect([Assignment(10 * k + lane, lane, 0, k, k) for lane in lanes], 0, 0, pulse)
         assert collector.steps == made
     reported = [steps for steps, _ in seen]
     assert reported == sorted(reported)

@@ -67,7 +67,7 @@ def collect(collector: Collector, run: RunSpec, opponents: Sequence[int | None],
     held = {number: always(number, number, run.policy) for number in opponents if number is not None and number >= 0}
     found = []
     for sequence, opponent in enumerate(opponents):
-        found += collector.collect([Assignment(sequence, lane, 0, sequence, opponent)], 0, 1, no_pulse, held)
+        found += collector.collect([Assignment(sequence, lane, 0, sequence, sequence, opponent)], 0, 1, no_pulse, held)
         validate(found[-1], run)
     return found
 
@@ -173,7 +173,7 @@ def test_the_learner_finds_the_log_probabilities_of_its_team(form: str) -> None:
     collector, other = Collector(run, policy), PPO(PPOConfig(core="gru", core_size=7), run.policy, total_steps=1, seed=4)
     held = {4: Weights(4, *other.weights())}
     for k in range(6):
-        (rollout,) = collector.collect([Assignment(k, 0, 0, k, 4)], 0, 1, no_pulse, held)
+        (rollout,) = collector.collect([Assignment(k, 0, 0, k, k, 4)], 0, 1, no_pulse, held)
         batch = stack_rollouts([rollout])
         found = log_probs(ppo.net, ppo.observations(batch), batch, no_pulse)
         # A chain of some hundred float32 operations on numbers of the size of 1, in other orders.
@@ -198,7 +198,8 @@ def test_an_opponent_has_a_state_of_its_own_which_is_zeros_when_an_episode_begin
     acting: Any = _Counts()
     opponent = Opponent.__new__(Opponent)
     opponent.number, opponent.acting, opponent.to_env_action, opponent.state_size = 3, acting, lambda action: action, 7
-    others = OtherTeams(run, [Match(0, opponent), Match(1, opponent)], np.random.default_rng(0))
+    others = OtherTeams(run, [Match(0, opponent), Match(1, opponent)])
+    others.generator = np.random.default_rng(0)
     obs, taken = [np.zeros((6, 1), np.float32)], np.zeros(6, np.int64)
     everybody = np.ones(6, bool)
     others.act(obs, everybody, taken)
@@ -221,11 +222,11 @@ def test_the_score_compares_the_return_of_the_team_with_the_best_of_the_others()
         (1, (2.0, 2.0, 2.0), (2.0, 1 / 3, 9)),
         (2, (2.0, 2.0, 1.0), (1.0, 0.0, 9)),
     ):
-        assert OtherTeams(run, [Match(team, opponent)], np.random.default_rng(0)).result(0, returns) == result
+        assert OtherTeams(run, [Match(team, opponent)]).result(0, returns) == result
     pairs = msgspec.structs.replace(
         run, seats=("r1", "b1", "r2", "b2"), teams=teams_of(("r1", "b1", "r2", "b2"), ("r*", "b*"))
     )
-    others = OtherTeams(pairs, [Match(1, opponent)], np.random.default_rng(0))
+    others = OtherTeams(pairs, [Match(1, opponent)])
     assert others.mine.tolist() == [False, True, False, True]
     assert others.result(0, (1.0, 2.0, 3.0, 1.0)) == (3.0, 0.0, 9)
 
@@ -239,7 +240,7 @@ def test_the_scores_of_all_teams_of_an_episode_add_up_to_one(returns: list[int])
     opponent.number = 9
     scores = []
     for team in range(len(returns)):
-        others = OtherTeams(run, [Match(team, opponent)], np.random.default_rng(0))
+        others = OtherTeams(run, [Match(team, opponent)])
         own, score, _ = others.result(0, returns)
         assert own == returns[team]
         assert wrong_facts(Episode(own, 1, 0.0, (score,), 9), run) == ""

@@ -54,7 +54,7 @@ def test_a_lane_gets_the_bits_of_a_loop_over_its_copies(name: str) -> None:
 def test_a_lane_of_a_new_incarnation_starts_anew_and_the_others_go_on() -> None:
     run = RUNS["discrete"]
     loop = random_collector(run)
-    assignments = [Assignment(n, n, 1 if n == 1 else 0, 0 if n == 1 else 1) for n in range(LANES)]
+    assignments = [Assignment(n, n, 1 if n == 1 else 0, 0 if n == 1 else 1, 1) for n in range(LANES)]
     with split_collector(run) as split:
         found = []
         for collector in (split, loop):

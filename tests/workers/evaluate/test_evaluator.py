@@ -264,7 +264,7 @@ def test_an_observation_from_which_no_policy_can_act_is_named_as_in_training() -
     with pytest.raises(EnvironmentFailed, match=f"while the policy was evaluated: {says}"):
         play(Evaluator(run, random_policy(run.policy)), order(1, 2))
     with pytest.raises(EnvironmentFailed, match=f"lane 0, {says}"):
-        Collector(run, random_policy(run.policy)).collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
+        Collector(run, random_policy(run.policy)).collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
 
 
 def test_no_row_is_sent_with_an_observation_that_is_not_finite() -> None:

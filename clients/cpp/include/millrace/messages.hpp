@@ -11,7 +11,7 @@
 
 namespace millrace {
 
-constexpr std::uint64_t PROTOCOL_VERSION = 11;
+constexpr std::uint64_t PROTOCOL_VERSION = 12;
 constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16,
                       MAX_SEATS = 1 << 10;
 
@@ -129,9 +129,10 @@ class Decoder {
     } else if (name == "Collect") {
       m.type = Type::Collect, expect(fields == 5), session(), m.version = r.natural();
       for (std::size_t n = r.array(); n; --n) {
-        expect(r.array() == 5);
+        expect(r.array() == 7);
         Permit permit{r.natural(), r.natural(), r.natural(), r.natural()};
-        m.permits.push_back(permit), r.skip();  // the opponent: a run with teams is declined
+        m.permits.push_back(permit), r.natural();  // the round: random numbers are drawn in another way here
+        r.skip(), expect(r.nil());  // the opponent: a run with teams is declined; and no past, because Hello asks for none
       }
       received(r, m), keep(r, m);
     } else if (name == "Release") {

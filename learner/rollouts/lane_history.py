@@ -1,0 +1,196 @@
+"""What the learner knows of a lane's past: the sum of the rollouts that have come of it. Pure.
+
+Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them, and whether or
+not they are used. It keeps no more than what a worker needs to go on where they end (`protocol/lane_past.py`): of each copy,
+how its newest episode began, and the actions since. An episode that is longer than the limit, or began in a way that nobody
+knows, cannot be repeated: when the lane is lost, the copy starts anew.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.lane_past import AttributesFrom, EpisodeBegin, LanePast, LastEpisode
+from millrace.protocol.rollout import Rollout
+
+
+@dataclass(frozen=True, slots=True)
+class _OfRound:
+    """The rows of one rollout."""
+
+    first: int
+    """number of the first one, counted since the history began"""
+    action: Array
+    """[T, N · A, *action]"""
+    attributes: bytes
+    """packed, those that the copies had"""
+
+
+@dataclass
+class LaneHistory:
+    """The past of one lane of N env copies, as it grows."""
+
+    copies: list[LastEpisode]
+    """[N]; their rows are counted since the history began"""
+    most_steps: int
+    """of an episode that is repeated"""
+    rows: deque[_OfRound] = field(default_factory=deque)
+    """since the earliest of the episodes that can be repeated"""
+    count: int = 0
+    """number of rows since the history began"""
+    obs: tuple[Array, ...] = ()
+    """[N · A, *leaf] each, then the mask if there are masks, after the last row"""
+    memory: tuple[Array, ...] = ()
+    no_rows: Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    """[0, N · A, *action]"""
+
+    def copy(self) -> LaneHistory:
+        """The same, which the other one does not change."""
+        return replace(self, copies=list(self.copies), rows=self.rows.copy())
+
+    def add(self, rollout: Rollout, attributes: bytes) -> Bools:
+        """The next rollout of the lane has come. Returns [N] which copies had started anew when it began.
+
+        `attributes`: those of its env copies, packed.
+        """
+        T = len(rollout.action)
+        began = {each.copy: each for each in rollout.begun}
+        resets = _resets(rollout)
+        before = self.copies
+        self.copies = [self._after(last, began.get(n), resets[:, n], T) for n, last in enumerate(before)]
+        action = np.array(rollout.action)
+        self.rows.append(_OfRound(self.count, action, attributes))
+        self.no_rows = action[:0]
+        self.count += T
+        mask = () if rollout.mask is None else (rollout.mask,)
+        self.obs = tuple(np.array(leaf[-1]) for leaf in (*rollout.obs, *mask))
+        self.memory = tuple(np.array(each) for each in rollout.memory)
+        self._forget_long_ones(known=bool(rollout.memory))
+        return np.array([new.start != old.start for new, old in zip(self.copies, before, strict=True)])
+
+    def forget(self) -> None:
+        """Nobody knows what the copies do after the last row: none of their episodes can be repeated."""
+        self.copies = [LastEpisode(last.start, None, self.count, False) for last in self.copies]
+        self.rows.clear()
+
+    def start_anew(self, attempts: int) -> None:
+        """All copies are to start anew, although so many attempts to go on have failed: none uses a number again."""
+        tried = [last.start + (last.random is None) for last in self.copies]  # in the first attempt
+        self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
+        self.rows.clear()
+
+    def past(self, lane: int) -> LanePast:
+        """What a worker needs to go on."""
+        first_row = min((_needed_from(last) for last in self.copies if last.random is not None), default=self.count)
+        kept = [rows for rows in self.rows if rows.first + len(rows.action) > first_row]
+        action = np.concatenate([self.no_rows, *(rows.action for rows in kept)])
+        start = kept[0].first if kept else self.count
+        return LanePast(
+            lane=lane,
+            copies=tuple(self._shifted(last, start) for last in self.copies),
+            action=action,
+            attributes=tuple(_changes(kept, start)),
+            obs=self.obs,
+            memory=self.memory,
+        )
+
+    @classmethod
+    def of(cls, past: LanePast, most_steps: int) -> LaneHistory:
+        """The history that a checkpoint has as the past of a lane."""
+        found = cls(
+            list(past.copies),
+            most_steps,
+            count=len(past.action),
+            obs=past.obs,
+            memory=past.memory,
+            no_rows=past.action[:0],
+        )
+        ends = [*(each.row for each in past.attributes[1:]), len(past.action)]
+        begins = past.attributes or (AttributesFrom(0, np.zeros(0, np.uint8)),)
+        for each, end in zip(begins, ends, strict=True):
+            found.rows.append(_OfRound(each.row, past.action[each.row : end], each.packed.tobytes()))
+        return found
+
+    @classmethod
+    def of_nothing(cls, copies: int, most_steps: int) -> LaneHistory:
+        """Nothing has come of the lane yet. Its copies have not started."""
+        return cls([LastEpisode(0, b"", 0, False)] * copies, most_steps)
+
+    def _after(self, last: LastEpisode, began: EpisodeBegin | None, resets: Bools, T: int) -> LastEpisode:
+        """The newest episode of copy n, after T more rows. `resets` [T+1]: which of them only reset it."""
+        start = last.start if began is None else began.start
+        random = None if began is None else began.random
+        if resets[T]:
+            return LastEpisode(start, random, self.count + T, True)
+        if resets.any():
+            return LastEpisode(start, random, self.count + int(np.flatnonzero(resets)[-1]) + 1, False)
+        return last if began is None else LastEpisode(start, random, self.count, False)
+
+    def _forget_long_ones(self, *, known: bool) -> None:
+        """Mark what is not repeated, and keep only the rows of the rest. `known`: whether the worker can go on at all."""
+        for n, last in enumerate(self.copies):
+            if last.random is not None and (not known or self.count - last.first > self.most_steps):
+                self.copies[n] = LastEpisode(last.start, None, self.count, False)
+        first_row = min((_needed_from(last) for last in self.copies if last.random is not None), default=self.count)
+        while self.rows and self.rows[0].first + len(self.rows[0].action) <= first_row:
+            self.rows.popleft()
+
+    def _shifted(self, last: LastEpisode, start: int) -> LastEpisode:
+        first = 0 if last.random is None else last.first - start
+        return LastEpisode(last.start, last.random, first, last.over)
+
+
+def _needed_from(last: LastEpisode) -> int:
+    """The first row that is needed to repeat an episode: the one that reset the copy, whose attributes it began with."""
+    return last.first - 1 if last.random and not last.over else last.first
+
+
+def _resets(rollout: Rollout) -> Bools:
+    """[T+1, N] which rows only reset a copy; the last one is of the next rollout's first step."""
+    if rollout.resets is not None:
+        return np.asarray(rollout.resets, bool)
+    over = rollout.terminated[-1:] | rollout.truncated[-1:]
+    return np.concatenate([~rollout.valid, over])
+
+
+def _changes(kept: Iterable[_OfRound], start: int) -> Iterable[AttributesFrom]:
+    """Where the attributes of these rows change, counted from `start`."""
+    before = b""
+    for rows in kept:
+        if rows.attributes != before:
+            before = rows.attributes
+            yield AttributesFrom(rows.first - start, np.frombuffer(before, np.uint8))
+
+
+@dataclass(frozen=True)
+class LaneHistories:
+    """How histories are kept, and those with which a run goes on."""
+
+    copies: int = 1
+    """N"""
+    most_steps: int = -1
+    """of an episode that is repeated; -1: none is"""
+    pasts: Sequence[LanePast] = ()
+    """of lanes, from a checkpoint"""
+
+    def of(self, lane: int) -> LaneHistory | None:
+        """The history of a lane when the run goes on; None if nothing has come of it.
+
+        If the lane had another number of copies, none of them continues.
+        """
+        past = next((past for past in self.pasts if past.lane == lane), None)
+        if past is None:
+            return None
+        if len(past.copies) == self.copies:
+            return LaneHistory.of(past, self.most_steps)
+        newest = max(last.start for last in past.copies)
+        return LaneHistory([LastEpisode(newest, None, 0, False)] * self.copies, self.most_steps)
+
+    def begin(self) -> LaneHistory:
+        """The history of a lane of which nothing has come."""
+        return LaneHistory.of_nothing(self.copies, self.most_steps)

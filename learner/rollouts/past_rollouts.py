@@ -1,0 +1,63 @@
+"""What a run that goes on knows of the rollouts so far: numbers, the past of each lane, and the weights of open rounds.
+
+Rule: with it, the next learner deals what the last one would have dealt: the same rounds, under the same versions, on lanes
+that go on where their last rollout ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+
+from millrace.learner.rollouts.ledger import Ledger, Past
+from millrace.protocol.arrays import Array, Bytes
+from millrace.protocol.messages import LanePast, Weights
+from millrace.protocol.wire.codec import DTYPES
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class RoundsState(msgspec.Struct, frozen=True):
+    """Which rounds are open (`lag_rule.py`)."""
+
+    next: Past = 0
+    """the round of the next update"""
+    versions: dict[Past, Past] = {}
+    """the version that acts in each open round"""
+
+
+class PastRollouts(NamedTuple):
+    """The rollouts so far."""
+
+    ledger: Ledger
+    incarnations: Sequence[int]
+    """the next incarnation of each lane"""
+    rounds: RoundsState = RoundsState()
+    lanes: Sequence[LanePast] = ()
+    """those of which rollouts were taken"""
+    acting: Sequence[Weights] = ()
+    """those that act in open rounds, without the newest"""
+
+
+def packed(records: Sequence[msgspec.Struct]) -> Bytes:
+    """Records as bytes, for a file. Their arrays are copied."""
+    return np.frombuffer(msgspec.msgpack.encode(records, enc_hook=_described), np.uint8)
+
+
+def unpacked(kind: type[T], data: Bytes) -> list[T]:
+    """Records of one type. Raises `ValueError` or `msgspec.ValidationError` for anything else."""
+    return msgspec.msgpack.decode(data.tobytes(), type=list[kind], dec_hook=_array)  # type: ignore[valid-type]
+
+
+def _described(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return [value.dtype.str, list(value.shape), value.tobytes()]
+    raise TypeError(f"cannot write a {type(value).__name__}")
+
+
+def _array(wanted: type, value: Any) -> Array:
+    name, shape, data = value
+    return np.frombuffer(data, DTYPES[name]).reshape(shape)

@@ -1,0 +1,86 @@
+"""What a lane has done so far, as far as it is needed to continue the lane on new env copies. Plain data.
+
+Law: an episode is how it began and its actions. A copy is seeded once, when it starts. Each later episode begins with a
+reset without a seed, from the random numbers that the environment then has. So whoever seeds a new copy as the old one was,
+gives it the random numbers that it had before its last reset, resets it and repeats the actions, has the old copy again, if
+the environment repeats itself. A worker tells with each rollout which episodes began in it (`EpisodeBegin`). The learner
+adds up the rollouts, and hands what it has (`LanePast`) to the worker that is to continue the lane.
+
+The number of a start decides the seed, and rises when a copy starts anew: when it failed, or could not be continued.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import MAX_COPIES, Natural
+
+MAX_RANDOM_BYTES = 64
+
+RandomState = Annotated[bytes, Meta(max_length=MAX_RANDOM_BYTES)]
+"""State of an environment's random generator (`workers/copies/random_state.py`), from which a reset without a seed begins an
+episode. No bytes: the episode began with the seed of the copy's start."""
+
+
+class EpisodeBegin(msgspec.Struct, frozen=True, array_like=True):
+    """How the newest episode of a copy began, or will begin if the next step only resets the copy."""
+
+    copy: Natural
+    """number of the copy in its lane"""
+    start: Natural
+    """number of the copy's start"""
+    random: RandomState | None
+    """None: the episode cannot be repeated"""
+
+
+class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
+    """The episode that a copy was playing, or is about to begin."""
+
+    start: Natural
+    """number of the copy's start"""
+    random: RandomState | None
+    """None: the episode cannot be repeated, so the copy is to start anew, under the next number"""
+    first: Natural
+    """its first row in `LanePast.action`"""
+    over: bool
+    """whether the episode before it is over, and the next step begins it"""
+
+
+class AttributesFrom(msgspec.Struct, frozen=True, array_like=True):
+    """Attributes that the env copies had from a row on (`Weights.env_attributes`)."""
+
+    row: Natural
+    """in `LanePast.action`"""
+    packed: Array
+    """[bytes] uint8"""
+
+
+class LanePast(msgspec.Struct, frozen=True, array_like=True):
+    """The past of a lane of N env copies with A columns each, up to the round that its next rollout is for."""
+
+    lane: Natural
+    copies: Annotated[tuple[LastEpisode, ...], Meta(max_length=MAX_COPIES)]
+    """one for each env copy"""
+    action: Array
+    """[K, N · A, *action], as in rollouts: of the rows since the earliest of these episodes began"""
+    attributes: tuple[AttributesFrom, ...]
+    """by row, the first one from row 0 on; none if no attributes were set"""
+    obs: tuple[Array, ...]
+    """[N · A, *leaf] for each leaf, then the mask if there are masks: the observations that follow the last row"""
+    memory: tuple[Array, ...]
+    """`Rollout.memory` of the last rollout"""
+
+    @property
+    def repeated_steps(self) -> int:
+        """Number of env steps that are repeated."""
+        played = [last for last in self.copies if last.random is not None and not last.over]
+        return sum(len(self.action) - last.first for last in played)
+
+    @property
+    def new_episodes(self) -> int:
+        """Number of copies that start anew."""
+        return sum(last.random is None for last in self.copies)

@@ -1,0 +1,72 @@
+"""The state of an environment's own random generator: what a reset without a seed depends on, in environments that repeat
+themselves.
+
+Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` makes. An environment that draws from
+anything else, or has none, cannot tell in which state it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from millrace.protocol.envs.seats import SeatedEnv
+from millrace.workers.copies.reset_ahead import ResetAhead
+
+BYTES = 16 + 16 + 4 + 1
+"""of a packed state: PCG64's state and increment, and half of a number that it has drawn and not given yet"""
+ATTRIBUTES = ("_np_random", "np_random")
+"""Where environments keep their generator: those of gymnasium, and those of PettingZoo by convention."""
+
+
+def repeatable(env: gymnasium.Env[Any, Any]) -> Any | None:
+    """The environment inside all wrappers, if its generator alone decides what a reset without a seed does; else None."""
+    inner: Any = env
+    while isinstance(inner, gymnasium.Wrapper):
+        if isinstance(inner, ResetAhead):
+            return None  # two instances take turns, each with a generator of its own
+        inner = inner.env
+    if isinstance(inner, SeatedEnv):
+        inner = getattr(inner.env, "unwrapped", inner.env)
+    return inner
+
+
+def state_of(inner: Any | None) -> dict[str, Any] | None:
+    """The state of the generator of an environment inside all wrappers; None if it has none that can be read."""
+    generator = _generator(inner)
+    return None if generator is None else dict(generator.bit_generator.state)
+
+
+def pack(state: dict[str, Any] | None) -> bytes | None:
+    """The state in `BYTES` bytes."""
+    if state is None:
+        return None
+    of_pcg64 = state["state"]
+    halves = of_pcg64["state"].to_bytes(16, "little"), of_pcg64["inc"].to_bytes(16, "little")
+    return b"".join((*halves, state["uinteger"].to_bytes(4, "little"), bytes([state["has_uint32"]])))
+
+
+def set_state(inner: Any | None, packed: bytes) -> bool:
+    """Set a packed state. False if the environment has no generator that it fits."""
+    generator = _generator(inner)
+    if generator is None or len(packed) != BYTES:
+        return False
+    generator.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": int.from_bytes(packed[:16], "little"), "inc": int.from_bytes(packed[16:32], "little")},
+        "uinteger": int.from_bytes(packed[32:36], "little"),
+        "has_uint32": packed[36],
+    }
+    return True
+
+
+def _generator(inner: Any | None) -> np.random.Generator | None:
+    """Its generator, unless the class computes it: reading it would make one."""
+    own = getattr(inner, "__dict__", {})
+    for name in ATTRIBUTES:
+        generator = own.get(name)
+        if isinstance(generator, np.random.Generator) and type(generator.bit_generator) is np.random.PCG64:
+            return generator
+    return None

@@ -1,0 +1,227 @@
+"""Brings a lane back: continues on new env copies what they did elsewhere, from the lane's past (`protocol/lane_past.py`).
+
+Rule: each episode is begun as it was, and its actions are repeated without the policy, row by row, in all copies together.
+Then what the copies show and what they gave is compared with the past. A copy that shows something else does not repeat
+itself: it starts anew, under the next number. Repeated steps are work of the environment, with its timeouts, and count as
+nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from time import perf_counter
+
+import numpy as np
+
+from millrace.protocol.arrays import Array, Doubles
+from millrace.protocol.envs.env_actions import action_converter_of
+from millrace.protocol.envs.seats import columns_of
+from millrace.protocol.lane_past import LanePast
+from millrace.protocol.policy.masks import stored_leaves
+from millrace.protocol.specs import RunSpec
+from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.lanes.lane import Lane
+
+NOT_REPEATED = (
+    "the environment does not repeat itself: after a lost episode was begun again with the same seed and its actions were "
+    "repeated, {}; so a new episode began in its place, and the run depends on which workers were lost"
+)
+
+
+def bring_back(run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse) -> str:
+    """Continue this past on a new lane, whose copies were not reset yet. At the end they have these `attributes`, packed.
+
+    Returns what whoever trains should know, in one line; empty if there is nothing. Raises `EnvironmentFailed`.
+    """
+    copies = lane.copies
+    continued = []
+    if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, lane, run):
+        continued = [n for n, last in enumerate(past.copies) if last.random is not None]
+    if not isinstance(copies, LoopedCopies) or not continued:  # the learner knows why
+        lane.set_attributes(attributes, pulse)
+        lane.start([last.start + 1 for last in past.copies], pulse)
+        return ""
+    repeated = _Repeated(run, lane, copies, past, continued, pulse)
+    try:
+        repeated.repeat()
+        lane.set_attributes(attributes, pulse)
+        repeated.compare()
+        repeated.start_others()
+    except CopyFailed as error:
+        raise environment_failed(lane.number, error, f"{error.doing}, while its episode was continued") from error
+    repeated.hand_over()
+    return NOT_REPEATED.format(repeated.why) if repeated.why else ""
+
+
+class _Repeated:
+    """The copies of a lane while their episodes are repeated."""
+
+    def __init__(
+        self, run: RunSpec, lane: Lane, copies: LoopedCopies, past: LanePast, continued: list[int], pulse: Pulse
+    ) -> None:
+        self.continued = continued
+        """the copies that are as they were, so far as it is known"""
+        self.why = ""
+        """in what a copy differed"""
+        self._run = run
+        self._lane = lane
+        self._copies = copies
+        self._past = past
+        self._pulse = pulse
+        self._seats = run.seats_of_copy
+        self._acts = np.zeros(lane.columns, bool)
+        self._obs = [np.empty_like(leaf) for leaf in past.obs]
+        self._returns = np.zeros((lane.count, self._seats))
+        self._sizes = np.zeros(lane.count)  # [N] sum of what the rewards are without their signs
+
+    def repeat(self) -> None:
+        """Begin the episodes as they began, and repeat their actions. Raises `CopyFailed`."""
+        past = self._past
+        attributes = {each.row: each.packed.tobytes() for each in past.attributes}
+        taken = action_converter_of(self._run.policy)(past.action)
+        self._lane.set_attributes(attributes.get(0, b""), self._pulse)
+        self._seed(self.continued)
+        for row in range(len(past.action)):
+            if row and row in attributes:
+                self._lane.set_attributes(attributes[row], self._pulse)
+            if late := [n for n in self.continued if self._first(n) == row > 0 and past.copies[n].random == b""]:
+                self._seed(late)
+            if playing := [n for n in self.continued if self._first(n) <= row and not past.copies[n].over]:
+                result = self._step(taken[row], playing)
+                if row == len(past.action) - 1:
+                    self._see(result, playing)
+            if next_ones := [n for n in self.continued if self._first(n) == row + 1 and self._follows(n)]:
+                self._reset(next_ones)
+        for n in list(self.continued):
+            if past.copies[n].over:
+                self._set_random(n)
+        self._copies.end([n for n in self.continued if past.copies[n].over])
+
+    def compare(self) -> None:
+        """A copy that is not as it was is continued no more."""
+        past = self._past
+        returns = past.memory[0][:, :-1]
+        for n in list(self.continued):
+            if past.copies[n].over:
+                continue
+            columns = columns_of([n], self._seats)
+            most = self._sizes[n] * np.finfo(np.float64).eps * (len(past.action) - self._first(n) + 1)
+            if any((new[columns] != old[columns]).any() for new, old in zip(self._obs, past.obs, strict=True)):
+                self._differs(n, "it shows another observation")
+            elif np.abs(self._returns[n] - returns[n]).max() > most:  # sums of the same numbers in another order
+                self._differs(n, "its rewards add up to another return")
+
+    def start_others(self) -> None:
+        """Each copy that is not continued starts anew."""
+        lane = self._lane
+        past = self._past
+        anew = [n for n in range(lane.count) if n not in self.continued]
+        lane.starts = [last.start for last in past.copies]
+        for n in anew:
+            lane.starts[n] += 1
+        lane.new_starts = anew
+        self._seed(anew)
+
+    def hand_over(self) -> None:
+        """The lane is as it was at its last row, but for the copies that have started anew."""
+        lane = self._lane
+        past = self._past
+        over = [n for n in self.continued if past.copies[n].over]
+        for new, old in zip(self._obs, past.obs, strict=True):
+            new[columns_of(over, self._seats)] = old[columns_of(over, self._seats)]
+        lane.obs = tuple(self._obs)
+        lane.playing[over] = False
+        lane.episodes.begin(perf_counter())
+        lane.episodes.returns += self._returns
+        lane.recall(past.memory, self.continued)
+        for n in self.continued:
+            lane.episodes.lengths[n] = 0 if past.copies[n].over else len(past.action) - self._first(n)
+        if lane.seats is not None:
+            lane.seats.acts = self._acts
+
+    def _first(self, n: int) -> int:
+        """The row of the first action of the episode of copy n."""
+        return self._past.copies[n].first
+
+    def _follows(self, n: int) -> bool:
+        """Whether the episode of copy n began with a reset without a seed, which a step made."""
+        last = self._past.copies[n]
+        return bool(last.random) and not last.over
+
+    def _seed(self, copies: list[int]) -> None:
+        """Start these copies, each with the seed of its start."""
+        if copies:
+            lane = self._lane
+            starts = lane.starts or [last.start for last in self._past.copies]
+            assert lane.number is not None
+            self._began(copies, [copy_seed(self._run.seed, lane.number, starts[n], n) for n in copies])
+
+    def _reset(self, copies: list[int]) -> None:
+        """Begin the next episodes of these copies, from the random numbers that they had then."""
+        if able := [n for n in copies if self._set_random(n)]:
+            self._began(able, [None] * len(able))
+
+    def _set_random(self, n: int) -> bool:
+        random = self._past.copies[n].random
+        if random and self._copies.set_random_state(n, random):
+            return True
+        self._differs(n, "it has no np_random")
+        return False
+
+    def _began(self, copies: list[int], seeds: Sequence[int | None]) -> None:
+        result = self._copies.reset_some(copies, seeds, self._pulse)
+        self._see(result, copies)
+        self._returns[copies] = 0.0
+        self._sizes[copies] = 0.0
+        if result.columns is not None:
+            self._count(copies, result.columns.outside)
+
+    def _see(self, result: StepResult, copies: list[int]) -> None:
+        """Keep what these copies show."""
+        columns = columns_of(copies, self._seats)
+        self._lane.writer.write_some(self._obs, columns, result.leaves)
+        if result.columns is not None:
+            self._acts[columns] = result.columns.acts[columns]
+
+    def _step(self, taken: Array, copies: list[int]) -> StepResult:
+        """Step these copies, and count what they gave."""
+        self._pulse()
+        result = self._copies.step(taken[columns_of(copies, self._seats)], self._pulse, copies)
+        self._count(copies, np.asarray(result.reward, np.float64))
+        if result.columns is None:
+            ended = [n for n in copies if result.terminated[n] or result.truncated[n]]
+        else:
+            self._count(copies, result.columns.outside)
+            ended = np.flatnonzero(result.columns.over).tolist()
+        for n in ended:
+            if n in copies:
+                self._differs(n, "it ended earlier")
+        return result
+
+    def _count(self, copies: list[int], rewards: Doubles) -> None:
+        """Add the rewards [N · A] of these copies."""
+        by_copy = rewards.reshape(-1, self._seats)[copies]
+        self._returns[copies] += by_copy
+        self._sizes[copies] += np.abs(by_copy).sum(axis=1)
+
+    def _differs(self, n: int, why: str) -> None:
+        self.continued.remove(n)
+        self.why = self.why or why
+
+
+def _fits(past: LanePast, lane: Lane, run: RunSpec) -> bool:
+    """Whether the arrays are those of this lane. They come from another worker, through the learner."""
+    action = run.policy.action
+    expected: Iterable[tuple[Array, tuple[int, ...], str]] = [
+        (past.action, (len(past.action), lane.columns, *action.shape), action.stored_dtype),
+        *(
+            (array, (lane.columns, *leaf.shape), leaf.dtype)
+            for array, leaf in zip(past.obs, stored_leaves(run), strict=False)
+        ),
+    ]
+    shapes = all(array.shape == shape and array.dtype == dtype for array, shape, dtype in expected)
+    rows = all(last.first <= len(past.action) for last in past.copies)
+    counts = len(past.copies) == lane.count and len(past.obs) == len(stored_leaves(run))
+    return shapes and rows and counts and lane.can_recall(past.memory)
