@@ -1,7 +1,9 @@
 """All settings of a run, in one record. The texts under the fields are the help of the command line. Pure.
 
-Its base, `RolloutConfig`, has the settings of collecting rollouts. How the settings of a run are put together from presets,
-files and flags: learner/config/layers.py.
+Here is how a run learns. Its base, `RolloutConfig` (learner/config/rollout_config.py), has the settings of collecting
+rollouts: the environment, workers, env copies, lanes, timeouts and the transport. How the settings of a run are put
+together from presets, files and flags: learner/config/layers.py. The groups that `--help` shows: `GROUPS` in
+learner/config/command_line.py.
 """
 
 from __future__ import annotations
@@ -98,7 +100,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     agent is a team. In different env copies, the policy plays different teams.
     """
 
-    # ------------------------------------------------------------------------------------------------------------ workers
+    # ---------------------------------------------------------------------------------------------- the learner's process
 
     inference: Free[Literal["workers", "learner"]] = "workers"
     """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at once;
