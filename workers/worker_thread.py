@@ -17,7 +17,7 @@ from millrace.workers.activity import Activity, ActivityReader, share_activity
 from millrace.workers.actors import MakeActors, make_local_actors
 from millrace.workers.conversation.connection_rules import LEARNER_STARTED_IT_S, wait_limits_s
 from millrace.workers.conversation.session import Leave, Session
-from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.how_it_ended import Ending
 from millrace.workers.worker import Worker, WorkerOptions, identity
 
 

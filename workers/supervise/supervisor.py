@@ -25,7 +25,7 @@ from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError
 from millrace.workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
-from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.how_it_ended import Ending
 
 log = logging.getLogger("millrace.worker")
 

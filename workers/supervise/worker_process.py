@@ -27,7 +27,7 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers.activity import STACK_SIGNAL, ActivityReader
 from millrace.workers.machine_slots import free_all, open_slots, touch
-from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.how_it_ended import Ending
 from millrace.workers.supervise.process_group import kill, live_members, process_stat
 from millrace.workers.supervise.short_log import keep_short
 from millrace.workers.watchdog import deepest_frame, where_it_hung

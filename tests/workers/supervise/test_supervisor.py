@@ -11,7 +11,7 @@ import pytest
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.call_timeouts import Doing
 from millrace.workers.exit_codes import EXIT_NO_LEARNER, EXIT_UNSUITABLE
-from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.how_it_ended import Ending
 from millrace.workers.supervise.supervisor import (
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,

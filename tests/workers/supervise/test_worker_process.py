@@ -21,7 +21,7 @@ from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers import activity, program
 from millrace.workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
 from millrace.workers.supervise import worker_process
-from millrace.workers.supervise.ending import Ending
+from millrace.workers.supervise.how_it_ended import Ending
 from millrace.workers.supervise.worker_process import MOST_LAST_LINES, WorkerCommand, WorkerProcess
 
 WITHIN_S = 60.0
