@@ -14,6 +14,7 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # those of more than float32's 24 bits
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
+HEARTBEAT_S = 1.0  # between two heartbeats of a worker, unless the learner wants them more often
 
 
 class Leaf(msgspec.Struct, frozen=True):
@@ -194,7 +195,7 @@ class WaitSpec(msgspec.Struct, frozen=True, tag=True):
 
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
-    heartbeat_s: float = 1.0
+    heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The learner may read
     a checkpoint or a dataset for long before the run begins, without reading messages
@@ -239,7 +240,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """the policy of opponents, if it is not `policy`"""
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
-    heartbeat_s: float = 1.0
+    heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 30.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
 
@@ -348,7 +349,7 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
-    heartbeat_s: float = 1.0
+    heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
     """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The caller may
     compute for long between two steps, without reading messages; workers that end with the learner's process wait for ever

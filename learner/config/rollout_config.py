@@ -19,9 +19,9 @@ from millrace.protocol.env_spec import Scalar
 from millrace.protocol.envs.kinds_of_copies import KINDS
 from millrace.protocol.envs.seats import STATE
 from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.specs import HEARTBEAT_S
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
-HEARTBEAT_S = 1.0
 SEAT_ID = "millrace.protocol.envs.seats:seat_id"
 WITH_STATE = "millrace.protocol.envs.seats:with_state"
 STALL_TIMEOUT_S = 600.0

@@ -2,6 +2,10 @@
 
 Rule: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only
 while it runs the environment's code; meanwhile the second thread acquires it now and then, for a moment.
+
+This file decides only how often the second thread looks. When a Heartbeat is due: `Session.heartbeat_if_due` (session.py).
+How many seconds lie between two: `RolloutConfig.heartbeat_s` (learner/config/rollout_config.py) for a run, and `HEARTBEAT_S`
+(protocol/specs.py) for a vector environment.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-INTERVAL_S = 0.25  # between two calls of the second thread: a Heartbeat is late by at most this time
+CHECK_EVERY_S = 0.25  # how often the second thread looks: a Heartbeat that is due is late by at most this time
 
 
 class HeartbeatThread:
@@ -55,7 +59,7 @@ class HeartbeatThread:
                 self._thread.join()
 
     def _run(self) -> None:
-        while not self._stopped.wait(INTERVAL_S):
+        while not self._stopped.wait(CHECK_EVERY_S):
             with self._lock:
                 if not self._stopped.is_set():
                     self._heartbeat()

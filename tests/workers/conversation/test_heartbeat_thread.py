@@ -14,7 +14,7 @@ SOON_S = 10.0
 
 @pytest.fixture(autouse=True)
 def short_interval(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(heartbeat_thread, "INTERVAL_S", 0.001)
+    monkeypatch.setattr(heartbeat_thread, "CHECK_EVERY_S", 0.001)
 
 
 def test_it_sends_heartbeats_while_the_first_thread_has_released_the_lock() -> None:
