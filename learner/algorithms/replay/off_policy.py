@@ -1,4 +1,7 @@
-"""The base of algorithms that learn from a replay buffer: what an update does besides its gradient steps.
+"""An update from a replay buffer, but for its gradient steps: continuous.py and ../dqn.py say how many are due.
+
+It is the base of DQN, and with continuous.py of SAC, TD3 and the like. These write `steps_due`, and `step`, which makes one
+gradient step and adds 1 to `gradient_steps`.
 
 No sockets, no files, no clock; seeded. The buffer holds raw observations and rewards. They are normalized when they are
 drawn, with the current statistics. A subclass moves its target networks itself, in `step`. With one torch thread on a CPU
