@@ -19,7 +19,7 @@ from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.open_hub import open_hub
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
-from millrace.learner.rollouts.hub import Hub
+from millrace.learner.rollouts.hub import GOODBYE_IF_CUT_SHORT_S, Hub
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
 from millrace.learner.run_folder.run_folder import RunFolder, StoredPolicy, Which
 from millrace.protocol.arrays import Floats
@@ -145,7 +145,7 @@ class PolicyPlayer:
     def leave(self, reason: str) -> None:
         """Ask the workers to leave."""
         if self._hub is not None:
-            self._hub.drain(reason, timeout_s=2.0)
+            self._hub.drain(reason, timeout_s=GOODBYE_IF_CUT_SHORT_S)
 
     def _published(self) -> Hub:
         policy = self.policy

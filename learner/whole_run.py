@@ -11,6 +11,7 @@ from collections.abc import Callable
 from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.extras import started_by
+from millrace.learner.rollouts.hub import GOODBYE_IF_CUT_SHORT_S
 from millrace.learner.run import OpenRun
 from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.learner.torch_setup import torch_device
@@ -19,8 +20,6 @@ from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import MillraceError, RunTakenOver, first_line
 
 log = logging.getLogger("millrace.learner")
-
-DRAIN_S = 2.0  # for the workers to leave, when a run is cut short
 
 
 def train_to_the_end(run: OpenRun, workers: int) -> None:
@@ -37,14 +36,14 @@ def train_to_the_end(run: OpenRun, workers: int) -> None:
         train(run, workers, _watched_cores(run))
     except RunTakenOver as error:
         reason = str(error)
-        hub.drain(reason, timeout_s=DRAIN_S)
+        hub.drain(reason, timeout_s=GOODBYE_IF_CUT_SHORT_S)
         _tell_of_error(lambda: run.audience.leave(reason))
         raise
     except BaseException as error:
         if line := run.files.saved(elsewhere=setup.elsewhere):
             error.add_note(line)
         reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
-        hub.drain(reason, timeout_s=setup.interrupts.at_most(DRAIN_S))
+        hub.drain(reason, timeout_s=setup.interrupts.at_most(GOODBYE_IF_CUT_SHORT_S))
         _tell_of_error(lambda: run.audience.finish(reason, cut_short=True))
         raise
     finally:

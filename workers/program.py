@@ -37,7 +37,7 @@ from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_g
 
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
 LOOK_FOR_PARENT_S = 0.5
-LEAVE_WITHIN_S = 2.0  # after the supervisor's death
+LEAVE_ORPHANED_WITHIN_S = 2.0  # after the supervisor's death
 CLOSED_WITHIN_S = 1.0  # the sockets of a killed process
 AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
 
@@ -93,7 +93,7 @@ def _end_after_supervisor(parent: int, address: str) -> None:
     """End this process if the supervisor is dead and the environment does not return, so that the worker cannot leave."""
     while not parent_is_gone(parent):
         time.sleep(LOOK_FOR_PARENT_S)
-    time.sleep(LEAVE_WITHIN_S)
+    time.sleep(LEAVE_ORPHANED_WITHIN_S)
     _remove_socket_of_killed_parent(address)
     _kill_own_session()
 

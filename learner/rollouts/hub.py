@@ -45,6 +45,8 @@ log = logging.getLogger("millrace.learner")
 
 T = TypeVar("T")
 POLL_S = 0.1
+GOODBYE_WITHIN_S = 5.0  # at the end of a run: late rollouts are still counted
+GOODBYE_IF_CUT_SHORT_S = 2.0  # of what is cut short, or of episodes of which none is missing
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
 
@@ -279,7 +281,7 @@ class Hub:
         if self._clock() - self._server.listened_s >= PULSE_S:
             self._listen(0.0, short=True)
 
-    def drain(self, reason: str, timeout_s: float = 5.0) -> None:
+    def drain(self, reason: str, timeout_s: float = GOODBYE_WITHIN_S) -> None:
         """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`. Late rollouts are counted."""
         self._server.send(self.coordinator.drain(reason))
         self._server.wait_until_all_left(self._clock() + timeout_s, POLL_S)

@@ -15,7 +15,7 @@ from time import monotonic
 
 from millrace.launch.crew import Crew
 from millrace.launch.vector import VectorEnvPool, open_vector_env_pool
-from millrace.launch.worker_pool import AT_ONCE_S, ActingPool, open_worker_pool
+from millrace.launch.worker_pool import STOP_BEFORE_RUN_S, ActingPool, open_worker_pool
 from millrace.learner.config.config import Config
 from millrace.learner.members.bound import Bound
 from millrace.learner.members.events import Failed
@@ -121,7 +121,7 @@ class SteppingPool:
             try:
                 yield lobby
             finally:
-                self.stop(AT_ONCE_S)
+                self.stop(STOP_BEFORE_RUN_S)
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
         """The lobby in which the thread joins."""

@@ -20,8 +20,7 @@ from millrace.learner.open_hub import lobby_settings
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy
 from millrace.learner.torch_setup import one_thread
 from millrace.learner.vector_env.settings import VectorEnvSettings
-
-STOP_WITHIN_S = 2.0
+from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 
 @dataclass(frozen=True)

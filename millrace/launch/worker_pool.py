@@ -34,7 +34,7 @@ from millrace.workers.supervise.supervisor import Running, Supervisor
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from millrace.workers.worker_thread import WorkerThread
 
-AT_ONCE_S = 0.5  # a worker in the constructor of its environment hears nothing
+STOP_BEFORE_RUN_S = 0.5  # if no run has begun: a worker in the constructor of its environment hears nothing
 
 
 class WorkerPool(Protocol):
@@ -93,7 +93,7 @@ class ActingPool:
         try:
             yield self.lobby
         finally:
-            self.stop(AT_ONCE_S)
+            self.stop(STOP_BEFORE_RUN_S)
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
         """The same lobby: these workers collect."""

@@ -1,4 +1,4 @@
-"""How a worker ended. Plain data. How long a worker that is to leave may take: workers/supervise/supervisor.py."""
+"""How a worker ended. Plain data. How long a worker may take to leave: supervisor.py."""
 
 from __future__ import annotations
 

@@ -10,6 +10,8 @@ One that has never joined a run, and has ended soon after its start `MOST_FAILED
 again: what keeps it from starting, such as a broken installation, does not go away by itself.
 
 With `stay`, only a refusal is final: each worker that has left a run is followed by a new one, which waits for the next.
+
+All time limits of leaving, also those of the learner: docs/explanation/faults.md, "How long a worker may take to leave".
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ MOST_FAILED_STARTS = 4
 GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
-STOP_WITHIN_S = 3.0  # at the end of a local run, after the workers were asked to leave
-LEAVE_WITHIN_S = 30.0  # after the request to leave, as long as calls of the environment return: a rollout may take long
+STOP_WITHIN_S = 3.0  # at the end of whatever local workers did, after SIGTERM: then they are killed
+FINISH_ROLLOUT_WITHIN_S = 30.0  # after the request to leave, as long as calls of the environment return
 HANGS_AFTER_S = 8.0  # after the request to leave, or the end of the run: how long one call of the environment may take
 
 
@@ -280,7 +282,7 @@ class Supervisor:
             now = self._clock()
             if handled < stop_requests():
                 handled += 1
-                leave_by_s = min(leave_by_s, now + LEAVE_WITHIN_S)
+                leave_by_s = min(leave_by_s, now + FINISH_ROLLOUT_WITHIN_S)
                 kill_hanging_from_s = min(kill_hanging_from_s, now + HANGS_AFTER_S)
                 self.ask_to_leave()
             if over and not self._stopping:

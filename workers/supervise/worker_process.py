@@ -38,7 +38,7 @@ popen = subprocess.Popen  # a name of its own: a test may start workers in anoth
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
-CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments and ended within this time
+CLOSE_ENVS_WITHIN_S = 5.0  # from a worker's word that it leaves until it has closed its environments and ended
 KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # bytes of a log that are read for what it ends with
@@ -153,7 +153,7 @@ class WorkerProcess:
         elif not self._because:
             page = self._page.read(now)
             if page.exit_code is not None:
-                if page.leaves_for_s > CLOSE_WITHIN_S:
+                if page.leaves_for_s > CLOSE_ENVS_WITHIN_S:
                     self.kill()
             elif page.for_s > page.timeouts.limit_s(page.doing):
                 self._because = page.timeouts.reason(page.doing)

@@ -46,7 +46,7 @@ ADDRESS_VARIABLE = "MILLRACE_ADDRESS"
 ADDRESS_WORD = "{address}"
 TOKEN_WORD = "{token}"
 POLL_S = 0.05
-STOP_WITHIN_S = 4.0  # after SIGTERM, before SIGKILL
+STOP_CLIENT_WITHIN_S = 4.0  # after SIGTERM: then the client is killed
 LISTEN_WITHIN_S = 3.0  # the port of a socket that was closed may be taken for a moment
 KEPT_LINES = 40  # of the client's output
 MOST_PACKED_BYTES = 1 << 26  # of one message
@@ -229,7 +229,7 @@ class _Process:
         if self._running is None:
             return
         self.ask_to_stop()
-        until_s = time.monotonic() + STOP_WITHIN_S
+        until_s = time.monotonic() + STOP_CLIENT_WITHIN_S
         while not self._has_ended() and time.monotonic() < until_s:
             time.sleep(POLL_S)
         self._close()
@@ -245,8 +245,8 @@ class _Process:
         assert self._reader is not None
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._running.pid, signal.SIGKILL)
-        code = self._running.wait(STOP_WITHIN_S)
-        self._reader.join(STOP_WITHIN_S)
+        code = self._running.wait(STOP_CLIENT_WITHIN_S)
+        self._reader.join(STOP_CLIENT_WITHIN_S)
         assert self._running.stdout is not None
         if not self._reader.is_alive():
             self._running.stdout.close()

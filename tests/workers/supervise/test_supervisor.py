@@ -16,10 +16,10 @@ from millrace.workers.supervise.supervisor import (
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
     ENFORCE_EVERY_S,
+    FINISH_ROLLOUT_WITHIN_S,
     GIVEN_UP,
     HANGS_AFTER_S,
     HEALTHY_S,
-    LEAVE_WITHIN_S,
     MOST_FAILED_STARTS,
     POLL_S,
     Supervisor,
@@ -329,7 +329,7 @@ def test_every_request_to_stop_is_passed_on_and_a_worker_that_does_not_leave_is_
     monkeypatch.setattr("millrace.workers.supervise.supervisor.time.sleep", sleeps)
     assert machine.host.run(lambda: requests, lambda line: None) == 1
     assert worker.requests == ["stop", "stop", "stop", "wait"]
-    assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)
+    assert machine.now == pytest.approx(1 + FINISH_ROLLOUT_WITHIN_S, abs=5 * POLL_S)
     assert len(machine.started) == 1
 
 
