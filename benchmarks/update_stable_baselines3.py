@@ -71,7 +71,7 @@ def some_batch(steps: int, seed: int) -> Batch:
         state=np.zeros((COPIES, 0), np.float32),
         lane=np.repeat(np.arange(4), 2),
         fresh=np.zeros(COPIES, bool),
-        copies=2,
+        columns_per_rollout=2,
         episodes=(),
     )
 

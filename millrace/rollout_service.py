@@ -73,10 +73,11 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
     Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
     [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
-    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` (columns of a
-    lane), `mask` [T+1, N, choices] bool of the actions that were allowed (None without action masks), and `episodes`, which
-    have `reward` (the return, of all agents together), `length`, `seconds` and `facts`. With several agents, `resets`
-    [T+1, env copies] bool says which steps only reset a copy; the last row is of the next batch's first step.
+    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `columns_per_rollout`
+    (those of a lane are adjacent), `mask` [T+1, N, choices] bool of the actions that were allowed (None without action
+    masks), and `episodes`, which have `reward` (the return, of all agents together), `length`, `seconds` and `facts`. With
+    several agents, `resets` [T+1, env copies] bool says which steps only reset a copy; the last row is of the next batch's
+    first step.
     """
 
     obs: Any
@@ -440,7 +441,7 @@ class RolloutService:
                 "obs": stacked.obs[0] if not leaves[0].path else named,
                 "log_prob": stacked.log_prob if own is None or own.has_log_prob else None,
                 "extras": {extra.name: array for extra, array in extras},
-                "version": np.repeat(np.array([one.rollout.version for one in arrived]), stacked.copies),
+                "version": np.repeat(np.array([one.rollout.version for one in arrived]), stacked.columns_per_rollout),
             }
         )
 

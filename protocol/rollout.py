@@ -153,7 +153,7 @@ class Batch(msgspec.Struct, frozen=True):
     fresh: Bools
     """[ΣN] True where no state carries over from an earlier rollout: the column's lane has just been started, or a rollout
     between the two was not used"""
-    copies: int
+    columns_per_rollout: int
     """N, with seats N · A: each lane has so many adjacent columns, or a multiple if the batch has several of its rollouts"""
     episodes: tuple[Episode, ...]
     extras: tuple[Array, ...] = ()
@@ -192,7 +192,7 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | 
         """All rollouts of a run have the array, or none has."""
         return None if arrays[0] is None else side_by_side([array for array in arrays if array is not None])
 
-    copies = ordered[0].reward.shape[1]
+    columns_per_rollout = ordered[0].reward.shape[1]
     return Batch(
         obs=tuple(side_by_side(leaves) for leaves in zip(*(one.obs for one in ordered), strict=True)),
         action=side_by_side([one.action for one in ordered]),
@@ -202,9 +202,9 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | 
         truncated=side_by_side([one.truncated for one in ordered]),
         valid=side_by_side([one.valid for one in ordered]),
         state=np.concatenate([one.state for one in ordered]),
-        lane=np.repeat([one.lane for one in ordered], copies),
-        fresh=np.concatenate([_by_column(fresh[index], copies) for index in order]),
-        copies=copies,
+        lane=np.repeat([one.lane for one in ordered], columns_per_rollout),
+        fresh=np.concatenate([_by_column(fresh[index], columns_per_rollout) for index in order]),
+        columns_per_rollout=columns_per_rollout,
         episodes=tuple(episode for one in ordered for episode in one.episodes),
         extras=tuple(side_by_side(arrays) for arrays in zip(*(one.extras for one in ordered), strict=True)),
         mask=side_by_side_if_any([one.mask for one in ordered]),

@@ -170,6 +170,6 @@ def _batch(acting: ToyActor, generator: np.random.Generator, obs: Array, rows: _
         state=first,
         lane=np.repeat(np.arange(LANES), COPIES),
         fresh=np.full(columns, fresh),
-        copies=COPIES,
+        columns_per_rollout=COPIES,
         episodes=(),
     )

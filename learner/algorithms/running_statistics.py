@@ -184,7 +184,7 @@ class RewardScaler:
         self._gamma = gamma
         self._moments = RunningMoments()
         self._largest = 0.0  # size of a discounted return so far
-        self._returns: dict[int, Doubles] = {}  # lane -> [copies]
+        self._returns: dict[int, Doubles] = {}  # lane -> [columns]
 
     def count_and_scale(self, batch: Batch) -> Floats:
         """Count the batch, then return its scaled rewards [T, ΣN], clipped to ±10."""
@@ -209,11 +209,11 @@ class RewardScaler:
     def count(self, batch: Batch) -> None:
         """Count the rewards of a batch."""
         ends = EpisodeEnds.of(batch)
-        for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
-            columns = slice(at, at + batch.copies)
+        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
+            columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
             start = self._returns.get(lane)
-            start = np.zeros(batch.copies) if start is None else np.where(batch.fresh[columns], 0.0, start)
+            start = np.zeros(batch.columns_per_rollout) if start is None else np.where(batch.fresh[columns], 0.0, start)
             found, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )

@@ -398,7 +398,7 @@ def test_agents_have_columns_whose_rows_are_those_of_the_collector(env: str, pol
                 assert np.array_equal(getattr(batch, name), getattr(wanted, name)), name
             assert np.array_equal(batch.obs, wanted.obs[0])
             assert all(map(np.array_equal, batch.extras.values(), wanted.extras))
-            assert (batch.obs.shape, batch.version.tolist(), batch.copies) == ((9, N, 1), [0] * N, N // 2)
+            assert (batch.obs.shape, batch.version.tolist(), batch.columns_per_rollout) == ((9, N, 1), [0] * N, N // 2)
             assert batch.resets is not None
             assert batch.resets.shape == (9, 4)
             assert batch.env_steps == wanted.env_steps == np.count_nonzero(~batch.resets[:-1])

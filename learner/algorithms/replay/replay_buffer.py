@@ -168,7 +168,7 @@ class ReplayBuffer:
         self._rows = 0
         self._remembered: Remembered | None = None
         self._overwritten: list[Overwritten] = []  # since `remember`, oldest first
-        self._newest: dict[int, Ints] = {}  # lane -> [copies] value of `_written` when the last observation was written
+        self._newest: dict[int, Ints] = {}  # lane -> [columns] value of `_written` when the last observation was written
 
     def __len__(self) -> int:
         """The number of transitions that can be drawn."""
@@ -180,8 +180,8 @@ class ReplayBuffer:
         """Store the valid rows. Raises `UsageError` when a single rollout does not fit, or the first masks do not."""
         if batch.mask is not None:
             self._make_mask(batch.mask.shape[-1])
-        for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
-            self._add(batch, slice(at, at + batch.copies), int(batch.lane[at]))
+        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
+            self._add(batch, slice(at, at + batch.columns_per_rollout), int(batch.lane[at]))
 
     def _add(self, batch: Batch, columns: slice, lane: int) -> None:
         obs = [leaf[:, columns] for leaf in batch.obs]  # [T+1, N, *leaf] each

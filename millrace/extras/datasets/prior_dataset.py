@@ -88,7 +88,7 @@ class PriorDataset(PriorData):
             state=np.zeros((1, self._policy.state_size), np.float32),
             lane=np.array([NO_LANE]),
             fresh=np.array([True]),
-            copies=1,
+            columns_per_rollout=1,
             episodes=(),
         )
 

@@ -73,7 +73,7 @@ def episode(seed: int, T: int, action: ActionSpec, *, image: bool = False, termi
         state=np.zeros((1, 0), np.float32),
         lane=np.array([-1]),
         fresh=np.array([True]),
-        copies=1,
+        columns_per_rollout=1,
         episodes=(),
     )
 

@@ -66,7 +66,7 @@ def batch(seed: int, steps: int = 8, copies: int = 3, fresh: bool = False) -> Ba
         state=np.zeros((copies, 0), np.float32),
         lane=np.zeros(copies, np.int64),
         fresh=np.full(copies, fresh),
-        copies=copies,
+        columns_per_rollout=copies,
         episodes=(),
     )
 

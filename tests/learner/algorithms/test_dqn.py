@@ -102,7 +102,7 @@ def walk(terminated: bool, truncated: bool = False) -> Batch:
         state=np.zeros((1, 0), np.float32),
         lane=np.zeros(1, np.int64),
         fresh=np.ones(1, bool),
-        copies=1,
+        columns_per_rollout=1,
         episodes=(),
     )
 
@@ -383,7 +383,7 @@ def corridor(made: DQN, generator: np.random.Generator, ends: str) -> Batch:
         state=np.zeros((N, 0), np.float32),
         lane=np.zeros(N, np.int64),
         fresh=np.ones(N, bool),
-        copies=N,
+        columns_per_rollout=N,
         episodes=(),
     )
 

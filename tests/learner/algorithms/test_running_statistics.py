@@ -192,7 +192,7 @@ def batch(
         state=np.zeros((len(lane), 0), np.float32),
         lane=np.array(lane),
         fresh=np.array(fresh),
-        copies=copies,
+        columns_per_rollout=copies,
         episodes=(),
     )
 

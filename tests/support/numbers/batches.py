@@ -88,7 +88,7 @@ def batch(algorithm: Acting, seed: int, fresh: bool = False, steps: int = T) -> 
         state=state,
         lane=np.repeat(np.arange(LANES), COPIES),
         fresh=np.full(N, fresh),
-        copies=COPIES,
+        columns_per_rollout=COPIES,
         episodes=(),
     )
 

@@ -107,7 +107,7 @@ class Lanes:
             state=np.zeros((N, 0), np.float32),
             lane=np.full(N, lane),
             fresh=np.full(N, fresh),
-            copies=N,
+            columns_per_rollout=N,
             episodes=(),
             resets=resets,
         )
