@@ -16,6 +16,7 @@ The warm-up number is 1 until `learning_starts`, then 0. While it is 1, both kin
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,54 @@ from millrace.protocol.arrays import Array, Floats
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 TINY = np.float32(1e-30)
 """the smallest number of which a logarithm is taken"""
+
+
+class ActionValues(NamedTuple):
+    """The parameters of `EpsilonGreedy`."""
+
+    values: Floats
+    """[..., n] of the actions; `FORBIDDEN` where a mask forbids one"""
+    epsilon: Floats
+    """[...] ε"""
+
+    @staticmethod
+    def of(params: Floats) -> ActionValues:
+        """Views of `params` [..., n + 1]."""
+        return ActionValues(params[..., :-1], params[..., -1])
+
+
+class GreedyNoise(NamedTuple):
+    """The noise of `EpsilonGreedy`: uniform numbers in [0, 1)."""
+
+    whether: Floats
+    """[...] explores where it is less than ε"""
+    which: Floats
+    """[...] says which action is drawn"""
+
+    @staticmethod
+    def of(noise: Floats) -> GreedyNoise:
+        """Views of `noise` [..., 2]."""
+        return GreedyNoise(noise[..., 0], noise[..., 1])
+
+
+class BoundedParams(NamedTuple):
+    """The parameters of a kind of actions in [-1, 1]."""
+
+    center: Floats
+    """[..., D] the action without noise, before tanh"""
+    spread: Floats
+    """[..., D] log standard deviation of `SquashedGaussian`, or [..., 1] noise scale of `NoisyDeterministic`"""
+    warm_up: Floats
+    """[..., 1] above 0 while it lasts"""
+
+
+class BoundedNoise(NamedTuple):
+    """The noise of a kind of actions in [-1, 1]."""
+
+    normal: Floats
+    """[..., D]"""
+    uniform: Floats
+    """[..., D] in [-1, 1]: the actions of the warm-up"""
 
 
 class EpsilonGreedy:
@@ -39,16 +88,17 @@ class EpsilonGreedy:
 
     def sample(self, params: Floats, noise: Floats) -> Array:
         """A sample, int64 from 0."""
-        uniform = (noise[..., 1] * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
-        return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
+        whether, which = GreedyNoise.of(noise)
+        uniform = (which * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
+        return np.where(whether < ActionValues.of(params).epsilon, uniform, self.mode(params))
 
     def mode(self, params: Floats) -> Array:
         """The action with the highest value."""
-        return np.asarray(params[..., :-1].argmax(-1))
+        return np.asarray(ActionValues.of(params).values.argmax(-1))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """log(ε / n + (1 − ε) [action is the best]) [...], at least log 1e-30 ≈ −69.1."""
-        epsilon = params[..., -1]
+        epsilon = ActionValues.of(params).epsilon
         chance = epsilon / np.float32(self._actions) + (1 - epsilon) * (action == self.mode(params))
         return np.asarray(np.log(np.maximum(chance, TINY)), np.float32)
 
@@ -69,12 +119,20 @@ class _Bounded:
 
     def mode(self, params: Floats) -> Array:
         """The action without noise: the hyperbolic tangent of the first D numbers."""
-        return np.tanh(params[..., : self._size]).reshape(*params.shape[:-1], *self._shape)
+        return np.tanh(self._params(params).center).reshape(*params.shape[:-1], *self._shape)
 
-    def _uniform_in_warm_up(self, params: Floats, noise: Floats, action: Floats) -> Array:
-        """The action [..., D] in its shape; a uniform one where the warm-up lasts."""
-        chosen = np.where(params[..., -1:] > 0, noise[..., self._size :], action)
-        return chosen.reshape(*params.shape[:-1], *self._shape)
+    def _params(self, params: Floats) -> BoundedParams:
+        """Views of `params` [..., P]."""
+        return BoundedParams(params[..., : self._size], params[..., self._size : -1], params[..., -1:])
+
+    def _noise(self, noise: Floats) -> BoundedNoise:
+        """Views of `noise` [..., 2 D]."""
+        return BoundedNoise(noise[..., : self._size], noise[..., self._size :])
+
+    def _uniform_in_warm_up(self, warm_up: Floats, uniform: Floats, action: Floats) -> Array:
+        """The action [..., D] in its shape; the uniform one [..., D] where the warm-up [..., 1] lasts."""
+        chosen = np.where(warm_up > 0, uniform, action)
+        return chosen.reshape(*action.shape[:-1], *self._shape)
 
 
 class SquashedGaussian(_Bounded):
@@ -84,15 +142,11 @@ class SquashedGaussian(_Bounded):
         super().__init__(shape)
         self.params_size = 2 * self._size + 1
 
-    def _latent(self, params: Floats, noise: Floats) -> Floats:
-        """[..., D] the action before tanh."""
-        mean = params[..., : self._size]
-        log_std = params[..., self._size : -1]
-        return np.asarray(mean + np.exp(log_std) * noise[..., : self._size])
-
     def sample(self, params: Floats, noise: Floats) -> Array:
         """A sample, float32."""
-        return self._uniform_in_warm_up(params, noise, np.tanh(self._latent(params, noise)))
+        mean, log_std, warm_up = self._params(params)
+        normal, uniform = self._noise(noise)
+        return self._uniform_in_warm_up(warm_up, uniform, np.tanh(mean + np.exp(log_std) * normal))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """Log-density [...] in [-1, 1]^D: of the normal distribution, less log(1 − tanh²), summed; −D log 2 in the warm-up.
@@ -102,11 +156,12 @@ class SquashedGaussian(_Bounded):
         """
         if noise is None:
             raise ValueError("log_prob of a squashed action: expected the noise that it was sampled with, got none")
-        z = noise[..., : self._size]
-        log_std = params[..., self._size : -1]
+        mean, log_std, warm_up = self._params(params)
+        z = self._noise(noise).normal
         normal = np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)
-        found = (normal - log_tanh_derivative(self._latent(params, noise))).sum(-1)
-        return np.where(params[..., -1] > 0, np.float32(-self._size * math.log(2)), found)
+        before_tanh: Floats = np.asarray(mean + np.exp(log_std) * z)
+        squashed = (normal - log_tanh_derivative(before_tanh)).sum(-1)
+        return np.where(warm_up[..., 0] > 0, np.float32(-self._size * math.log(2)), squashed)
 
 
 class NoisyDeterministic(_Bounded):
@@ -118,8 +173,9 @@ class NoisyDeterministic(_Bounded):
 
     def sample(self, params: Floats, noise: Floats) -> Array:
         """The action with noise, clipped to ±1, float32."""
-        action = np.tanh(params[..., : self._size]) + params[..., -2:-1] * noise[..., : self._size]
-        return self._uniform_in_warm_up(params, noise, np.clip(action, -1, 1))
+        output, scale, warm_up = self._params(params)
+        normal, uniform = self._noise(noise)
+        return self._uniform_in_warm_up(warm_up, uniform, np.clip(np.tanh(output) + scale * normal, -1, 1))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """Zeros [...]: clipped noise has no density."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.policy.distributions import Distribution, distribution
-from millrace.protocol.policy.exploration import EpsilonGreedy
+from millrace.protocol.policy.exploration import ActionValues, EpsilonGreedy, GreedyNoise
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 
 MASK = "action_mask"  # the key in `info`, or in a Dict observation
@@ -52,20 +52,21 @@ class MaskedEpsilonGreedy(EpsilonGreedy):
     def sample(self, params: Floats, noise: Floats) -> Array:
         """A sample, int64 from 0."""
         allowed = _allowed(params)
-        number = (noise[..., 1] * allowed.sum(-1)).astype(np.int64)  # among those that are allowed
+        whether, which = GreedyNoise.of(noise)
+        number = (which * allowed.sum(-1)).astype(np.int64)  # among those that are allowed
         uniform = (allowed.cumsum(-1) > number[..., None]).argmax(-1)
-        return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
+        return np.where(whether < ActionValues.of(params).epsilon, uniform, self.mode(params))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """log(ε / m + (1 − ε) [action is the best]) [...] with m allowed actions, at least −69."""
-        epsilon = params[..., -1]
+        epsilon = ActionValues.of(params).epsilon
         count = _allowed(params).sum(-1).astype(np.float32)
         chance = epsilon / count + (1 - epsilon) * (action == self.mode(params))
         return np.asarray(np.log(np.maximum(chance, _TINY)), np.float32)
 
 
 def _allowed(params: Floats) -> Bools:
-    return np.asarray(params[..., :-1] != np.float32(FORBIDDEN))
+    return np.asarray(ActionValues.of(params).values != np.float32(FORBIDDEN))
 
 
 def no_choice(mask: Bools, action: ActionSpec) -> Bools:
