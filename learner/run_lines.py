@@ -92,14 +92,14 @@ class RunLine(NamedTuple):
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
     """The run folders among these and directly in them, the newest first. Raises `UsageError` if one is no folder."""
-    found: dict[Path, None] = {}
+    runs: dict[Path, None] = {}
     for folder in folders:
         try:
             inside = [] if is_run_folder(folder) else sorted(folder.iterdir())
         except OSError as error:
             raise UsageError(f"runs {folder}: {reason(error)}; expected a run folder, or a folder of runs") from error
-        found |= dict.fromkeys([path for path in inside if is_run_folder(path)] or [folder] * is_run_folder(folder))
-    return sorted(found, key=lambda path: (_started(path), path.name), reverse=True)[:MOST_RUNS]
+        runs |= dict.fromkeys([path for path in inside if is_run_folder(path)] or [folder] * is_run_folder(folder))
+    return sorted(runs, key=lambda path: (_started(path), path.name), reverse=True)[:MOST_RUNS]
 
 
 def read_line(path: Path, now: float) -> RunLine:
@@ -173,9 +173,9 @@ def algorithm_label(algo: str) -> str:
 
 def _started(path: Path) -> str:
     """When it began: as its folder's name says, or else as old as its run.json."""
-    found = STARTED.search(path.name)
+    stamp = STARTED.search(path.name)
     try:
-        began = time.strptime(found[1], "%Y%m%d-%H%M%S") if found else time.localtime((path / RUN_FILE).lstat().st_mtime)
+        began = time.strptime(stamp[1], "%Y%m%d-%H%M%S") if stamp else time.localtime((path / RUN_FILE).lstat().st_mtime)
     except (OSError, ValueError, OverflowError):
         return ""
     return time.strftime("%Y-%m-%d %H:%M", began)

@@ -97,21 +97,21 @@ class RunState(msgspec.Struct, kw_only=True):
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
     """Load the newest whole checkpoint into the algorithm. Raises `CheckpointError` if there is none or it does not fit."""
-    found = _newest(folder.path)
+    newest = _newest(folder.path)
     try:
-        state = msgspec.convert(found.state["past"], RunState)
+        state = msgspec.convert(newest.state["past"], RunState)
         EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for what no run has
         for name in POLICIES:
-            if (policy := found.state.get(name)) is not None:
+            if (policy := newest.state.get(name)) is not None:
                 setattr(state, name, tuple(array.numpy() for array in policy))
         for name, kind in RECORDS.items():
-            setattr(state, name, unpacked(kind, found.state[name].numpy()))
-        algorithm.load_state_dict(found.state["algorithm"])
+            setattr(state, name, unpacked(kind, newest.state[name].numpy()))
+        algorithm.load_state_dict(newest.state["algorithm"])
         _check_policies(state, algorithm.weights())
         state.ledger.end_outstanding()
     except MISFITS as error:
         raise CheckpointError(
-            f"checkpoint {found.path}: expected the state of this configuration, got another ({one_line(str(error))}); "
+            f"checkpoint {newest.path}: expected the state of this configuration, got another ({one_line(str(error))}); "
             "resume it with the settings it was made with"
         ) from error
     return state
@@ -142,8 +142,8 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
     where = f"start_from {config.start_from}"
     for name in dict.fromkeys(("observation", "action", "head", *PolicySpec.__struct_fields__)):
         both = getattr(policy, name), getattr(card.policy, name)
-        if found := first_difference(*(both if name == "observation" else ((one,) for one in both))):
-            wrong = f"{name} of its policy: expected {found[0]} as in this run, got {found[1]}"
+        if difference := first_difference(*(both if name == "observation" else ((one,) for one in both))):
+            wrong = f"{name} of its policy: expected {difference[0]} as in this run, got {difference[1]}"
             raise UsageError(f"{where}: {wrong}; take the algorithm and the settings of that policy, or another one")
     whole = parts != "best" and checkpoint.has_any(run)
     if parts == "auto":
@@ -173,15 +173,15 @@ def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buf
 
     state: dict[str, Any] = {"parameters": torch.from_numpy(parameters)}
     if policy.normalize_observations:
-        found = {name: torch.from_numpy(each).double() for name, each in named_views(buffers, buffer_layout(policy)).items()}
-        squares = config.steps * found["observation_std"] ** 2
-        state["observations"] = {"count": config.steps, "mean": found["observation_mean"], "squares": squares}
+        named = {name: torch.from_numpy(each).double() for name, each in named_views(buffers, buffer_layout(policy)).items()}
+        squares = config.steps * named["observation_std"] ** 2
+        state["observations"] = {"count": config.steps, "mean": named["observation_mean"], "squares": squares}
     return state
 
 
 def _newest(run: Path) -> checkpoint.Checkpoint:
     """The newest whole checkpoint. Raises `CheckpointError`."""
-    found, warnings = checkpoint.newest(run)
+    newest, warnings = checkpoint.newest(run)
     for line in warnings:
         log.warning("%s", line)
-    return found
+    return newest

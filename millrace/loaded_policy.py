@@ -174,14 +174,14 @@ class LoadedPolicy:
         """The arrays [1, n, *leaf] of an observation or a batch, and whether it was one observation."""
         leaves = self.spec.observation
         if len(leaves) == 1 and not leaves[0].path:
-            found = {"": observation}
+            by_path = {"": observation}
         else:
-            found = dict(_by_path(observation, ""))
-            missing = [leaf.path for leaf in leaves if leaf.path not in found]
+            by_path = dict(_by_path(observation, ""))
+            missing = [leaf.path for leaf in leaves if leaf.path not in by_path]
             if missing:
-                got = "one array" if "" in found else ", ".join(sorted(found)) or "nothing"
+                got = "one array" if "" in by_path else ", ".join(sorted(by_path)) or "nothing"
                 raise UsageError(f"observation: expected {missing[0]}, got {got}")
-        arrays = [_checked(found[leaf.path], leaf) for leaf in leaves]
+        arrays = [_checked(by_path[leaf.path], leaf) for leaf in leaves]
         numbers = {None if array.shape == leaf.shape else len(array) for array, leaf in zip(arrays, leaves, strict=True)}
         if len(numbers) > 1:
             raise UsageError("observation: expected all its arrays for the same number of env copies, got different ones")

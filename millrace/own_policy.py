@@ -106,13 +106,13 @@ class OwnPolicy:
         return PolicySpec(observation, action, own=own)
 
     def _shape(self, name: str, shape: Any) -> tuple[int, ...]:
-        found = tuple(shape) if isinstance(shape, (tuple, list)) else (None,)
-        if not (all(type(side) is int and side > 0 for side in found) and math.prod(found)):
+        sides = tuple(shape) if isinstance(shape, (tuple, list)) else (None,)
+        if not (all(type(side) is int and side > 0 for side in sides) and math.prod(sides)):
             raise UsageError(f"policy {self.name}: array {name}: expected a shape, as (64, 4), got {safe_repr(shape)}")
-        return found
+        return sides
 
     def _declared(self) -> tuple[ExtraArray, ...]:
-        found = []
+        arrays = []
         for name, dtype in self.extras.items():
             try:
                 kind = np.dtype(dtype)
@@ -126,8 +126,8 @@ class OwnPolicy:
                     "float32 for each action" if name == LOG_PROB.name else "another name; a batch has an array of this one"
                 )
                 raise UsageError(f"policy {self.name}: extra {name}: expected {expected}")
-            found.append(extra)
-        return tuple(found)
+            arrays.append(extra)
+        return tuple(arrays)
 
 
 _EXPECTED = 'expected a dtype of numbers as numpy.dtype takes it, "float32" or ("float32", (2,))'

@@ -64,10 +64,10 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
         first, *_ = parts = module.split(".")
         for entry in entries if colon and first else ():
             if entry.is_relative_to(inside):
-                found = entry.is_dir() and any(path.name.partition(".")[0] == first for path in entry.iterdir())
+                is_inside = entry.is_dir() and any(path.name.partition(".")[0] == first for path in entry.iterdir())
             else:
-                found = entry.joinpath(*parts).is_relative_to(inside)
-            if found:
+                is_inside = entry.joinpath(*parts).is_relative_to(inside)
+            if is_inside:
                 raise UsageError(
                     f"run {folder}: {one_line(name, 200)} would be imported from the run folder, and nothing is; if you "
                     "trust that module, put it into a folder of your own"
@@ -76,14 +76,14 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
 
 def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:
     """The function or class that a module has under this name. `what`: as of `own_callable`. Raises `UsageError`."""
-    found = attribute(module, qualname)
-    if found is None:
+    named = attribute(module, qualname)
+    if named is None:
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
         hint = did_you_mean(qualname, known, f"{module.__name__}:")
         raise UsageError(f"{what}: module {module.__name__} has no {qualname}{hint}")
-    if not callable(found):
-        raise UsageError(f"{what}: expected a function or class to call, got {type(found).__name__}")
-    return found
+    if not callable(named):
+        raise UsageError(f"{what}: expected a function or class to call, got {type(named).__name__}")
+    return named
 
 
 def own_code_failed(what: str, error: BaseException) -> UsageError:

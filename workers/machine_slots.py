@@ -89,10 +89,10 @@ class Slots:
 
     def have_room(self, copies: int) -> bool:
         """Whether so many slots are free now."""
-        found = [slot for _ in range(copies) if (slot := self._take_now()) is not None]
-        for slot in found:
+        taken = [slot for _ in range(copies) if (slot := self._take_now()) is not None]
+        for slot in taken:
             self.give_back(slot)
-        return len(found) == copies
+        return len(taken) == copies
 
     def _take_now(self) -> int | None:
         with self._lock:
@@ -157,10 +157,10 @@ def open_slots() -> int:
             os.fchmod(fd, mode)  # whatever the umask
             return fd
         fd = os.open(path, FLAGS)
-        found = os.fstat(fd)
-        if stat.S_ISREG(found.st_mode) and (shared or found.st_uid == os.geteuid()):
+        status = os.fstat(fd)
+        if stat.S_ISREG(status.st_mode) and (shared or status.st_uid == os.geteuid()):
             return fd
-        why = f"a file of {_owner(fd)}" if stat.S_ISREG(found.st_mode) else "not a regular file"
+        why = f"a file of {_owner(fd)}" if stat.S_ISREG(status.st_mode) else "not a regular file"
         os.close(fd)
     except OSError as error:
         why = os.strerror(error.errno or 0)

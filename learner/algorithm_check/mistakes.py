@@ -85,20 +85,20 @@ def mistakes(algorithm: type, settings: dict[str, Any], *, learns: bool) -> Iter
     with _undisturbed():
         try:
             subject = _subject(algorithm, settings)
-            found = [*weights_have_the_policy_s_shape(subject)]
+            made = [*weights_have_the_policy_s_shape(subject)]
         except Exception as error:
             yield _raised("it cannot be made", error)
             return
-        if found:  # then no policy can act
-            yield from found
+        if made:  # then no policy can act
+            yield from made
             return
         try:
-            subject = _with_batches(subject, found)
+            subject = _with_batches(subject, made)
         except Exception as error:
-            yield from found
+            yield from made
             yield _raised("update", error)
             return
-        yield from found
+        yield from made
         for rule in (*RULES, *([learns_the_identity_environment] if learns else [])):
             try:
                 yield from rule(subject)
@@ -130,8 +130,8 @@ def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
     return Subject(made, config, policy, min(config.rollout_steps, MOST_STEPS), ())
 
 
-def _with_batches(subject: Subject, found: list[str]) -> Subject:
-    """The subject with batches that its own policy collected. Adds mistakes about gradient steps to `found`."""
+def _with_batches(subject: Subject, made: list[str]) -> Subject:
+    """The subject with batches that its own policy collected. Adds mistakes about gradient steps to `made`."""
     algorithm = subject.new()
     generator = np.random.default_rng(1)
     batches: list[Batch] = []
@@ -149,9 +149,9 @@ def _with_batches(subject: Subject, found: list[str]) -> Subject:
         algorithm.update(batch, pulse)
         goes_on = min(goes_on - 1, MORE_UPDATES) if pulses[0] else goes_on - 1
     if not pulses[0]:
-        found.append(f"update: expected calls of pulse between gradient steps, got none in {len(batches)} updates")
+        made.append(f"update: expected calls of pulse between gradient steps, got none in {len(batches)} updates")
     if first_difference(before, _weights(algorithm)) is None:
-        found.append(f"weights: expected others after {len(batches)} updates, got the same")
+        made.append(f"weights: expected others after {len(batches)} updates, got the same")
     return subject._replace(batches=tuple(batches))
 
 
@@ -237,9 +237,9 @@ def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> 
     if not issubclass(subject.algorithm, ActorCritic):
         return
     batch = subject.copies()[-1]
-    found, expected = (subject.new().update(each, _no_pulse) for each in (with_waiting_seats(batch), batch))
+    measured, expected = (subject.new().update(each, _no_pulse) for each in (with_waiting_seats(batch), batch))
     for name, number in expected.items():
-        if not math.isclose(got := found.get(name, math.nan), number, rel_tol=0.02, abs_tol=0.02):
+        if not math.isclose(got := measured.get(name, math.nan), number, rel_tol=0.02, abs_tol=0.02):
             yield (
                 f"update: rows of a seat that waits change the metric {name} from {number:.4g} to {got:.4g}; take the "
                 "functions of millrace.learner.algorithms.returns, with EpisodeEnds.of(batch)"
@@ -447,9 +447,9 @@ def _not_plain(state: object, where: str = "") -> str:
     """Where a state has something that a checkpoint does not take; empty if nowhere."""
     match state:
         case dict():
-            return next((found for key, value in state.items() if (found := _not_plain(value, f"{where}[{key!r}]"))), "")
+            return next((why for key, value in state.items() if (why := _not_plain(value, f"{where}[{key!r}]"))), "")
         case list() | tuple():
-            return next((found for i, value in enumerate(state) if (found := _not_plain(value, f"{where}[{i}]"))), "")
+            return next((why for i, value in enumerate(state) if (why := _not_plain(value, f"{where}[{i}]"))), "")
         case torch.Tensor():
             return ""
     return "" if type(state) in (bool, int, float, str, bytes, type(None)) else where or " "

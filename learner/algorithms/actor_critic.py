@@ -107,14 +107,14 @@ class ActorCritic(GradientDescent):
     @property
     def vf_coef(self) -> float:
         """The weight of the value loss."""
-        found: float = self.config.vf_coef
-        return found
+        coefficient: float = self.config.vf_coef
+        return coefficient
 
     @property
     def n_epochs(self) -> int:
         """How many times an update uses each row."""
-        found: int = self.config.n_epochs
-        return found
+        count: int = self.config.n_epochs
+        return count
 
     def minibatch_count(self, rows: int) -> int:
         """Number of minibatches, of nearly equal size, in an epoch of `rows` rows."""
@@ -127,8 +127,8 @@ class ActorCritic(GradientDescent):
         A policy that acts well from the start has advantages that are little more than small errors of the critic. With a
         standard deviation of 1, these would change the policy as much as advantages that tell good actions from bad ones.
         """
-        found: bool = self.config.normalize_advantage
-        return found and not self.pretraining_steps
+        normalize: bool = self.config.normalize_advantage
+        return normalize and not self.pretraining_steps
 
     def stops(self, metrics: UpdateMetrics) -> bool:
         """Whether a minibatch with these metrics ends the update, before its gradient step is taken."""
@@ -154,10 +154,10 @@ class ActorCritic(GradientDescent):
         ended = False
         while len(epochs) < self.n_epochs and not ended:
             if not estimates or self.estimates_each_epoch:
-                estimates.append(found := self.estimate(batch, observations, reward, pulse))
-                rows = Minibatch.of(batch, observations, found.advantage, found.target)
-                count = self.minibatch_count(int(np.count_nonzero(found.used)))
-                minibatches = rows.epochs(found.used, count, self.generator)
+                estimates.append(estimate := self.estimate(batch, observations, reward, pulse))
+                rows = Minibatch.of(batch, observations, estimate.advantage, estimate.target)
+                count = self.minibatch_count(int(np.count_nonzero(estimate.used)))
+                minibatches = rows.epochs(estimate.used, count, self.generator)
             epochs.append([])
             for minibatch in next(minibatches):
                 measured, ended = self.step(minibatch)
@@ -207,13 +207,13 @@ class ActorCritic(GradientDescent):
 
     def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
         """The metrics of an update: means over its gradient steps and estimates, and the state of the schedules."""
-        found = self.means(step for epoch in epochs for step in epoch)
-        found["train/learning_rate"] = self.learning_rate
-        found["train/n_updates"] = float(self.version)
+        metrics = self.means(step for epoch in epochs for step in epoch)
+        metrics["train/learning_rate"] = self.learning_rate
+        metrics["train/n_updates"] = float(self.version)
         log_std = self.net.parameters.get("actor.log_std")
         if log_std is not None:
-            found["train/std"] = log_std.detach().exp().mean().item()
-        return found | self.means({"explained_variance": _explained_variance(each), **each.metrics} for each in estimates)
+            metrics["train/std"] = log_std.detach().exp().mean().item()
+        return metrics | self.means({"explained_variance": _explained_variance(each), **each.metrics} for each in estimates)
 
     # ---------------------------------------------------------------- what the network says of a batch
 
@@ -258,9 +258,9 @@ def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> Recurre
     return RecurrentInput(tensor(batch.state), tensor(keep_state.astype(np.float32)), advances=advances)
 
 
-def _checked(found: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor | float]]:
+def _checked(returned: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor | float]]:
     """What `loss` returned. Raises `UsageError` for anything but a loss and numbers."""
-    match found:
+    match returned:
         case (Tensor() as loss, Mapping() as numbers) if loss.dim() == 0 and loss.requires_grad:
             return loss, numbers
     raise UsageError(

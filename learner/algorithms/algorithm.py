@@ -50,13 +50,13 @@ class Start(NamedTuple):
             taken["rewards"] = state["rewards"] | {"returns": {}}
         for name in weights if self.critic else {"parameters", "target"}.intersection(weights):
             own = taken[name] = fresh[name].clone()
-            found = state[name if self.critic else "parameters"]
+            saved = state[name if self.critic else "parameters"]
             if not self.critic:
                 own = own[: self.acting]
-                found = found[: self.acting]
-            if (found.shape, found.dtype) != (own.shape, own.dtype):
-                raise ValueError(f"{name}: expected {own.dtype} {list(own.shape)}, got {found.dtype} {list(found.shape)}")
-            own.copy_(found)
+                saved = saved[: self.acting]
+            if (saved.shape, saved.dtype) != (own.shape, own.dtype):
+                raise ValueError(f"{name}: expected {own.dtype} {list(own.shape)}, got {saved.dtype} {list(saved.shape)}")
+            own.copy_(saved)
         for name in optimizers if self.optimizer else ():
             taken[name] = fresh[name] | {"state": state[name]["state"]}
         return fresh | taken
@@ -158,14 +158,14 @@ def numbers(metrics: Any, who: str) -> dict[str, float]:
     """
     if not isinstance(metrics, Mapping):
         raise UsageError(f"{who}.update: expected a dict of metrics, got {type(metrics).__name__}; return {{}} for none")
-    found = {}
+    numbers = {}
     for name, number in metrics.items():
         try:
-            found[name] = float("text" if isinstance(number, str | bytes) or not isinstance(name, str) else number)
+            numbers[name] = float("text" if isinstance(number, str | bytes) or not isinstance(name, str) else number)
         except (TypeError, ValueError, OverflowError, RuntimeError):  # torch raises RuntimeError
             got = f"{type(number).__name__} for {safe_repr(name)}"
             raise UsageError(f"{who}.update: metrics: expected a name and a number, got {got}") from None
-    return found
+    return numbers
 
 
 def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:

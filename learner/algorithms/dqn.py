@@ -89,14 +89,14 @@ class DQN(OffPolicy):
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
         """One gradient step on a minibatch; then the target network is updated."""
-        found = self.loss(rows)
+        critic = self.loss(rows)
         optimizer = self.optimizers["optimizer"]
-        metrics = self.differentiate(found.loss, optimizer, {**found.numbers, "loss": found.loss})
+        metrics = self.differentiate(critic.loss, optimizer, {**critic.numbers, "loss": critic.loss})
         self._clip_gradient(metrics["grad_norm"])
         take_step(optimizer)
         self.gradient_steps += 1
         self._update_target()
-        return metrics, found.error
+        return metrics, critic.error
 
     def _clip_gradient(self, norm: float) -> None:
         config = self.config

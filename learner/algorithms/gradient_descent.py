@@ -78,8 +78,8 @@ class GradientDescent(Algorithm):
     @property
     def learning_rate(self) -> float:
         """That of this update, which all optimizers have."""
-        found: float = next(iter(self.optimizers.values())).param_groups[0]["lr"]
-        return found
+        rate: float = next(iter(self.optimizers.values())).param_groups[0]["lr"]
+        return rate
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Features [B, D] as the networks take them, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
@@ -120,8 +120,8 @@ class GradientDescent(Algorithm):
         gradient.zero_()
         loss.backward()  # type: ignore[no-untyped-call]
         read = [self._logged(name, number, loss) for name, number in numbers.items()]
-        found = torch.stack((*read, gradient.norm())).tolist()  # one transfer from a GPU
-        metrics = dict(zip((*numbers, "grad_norm"), found, strict=True))
+        values = torch.stack((*read, gradient.norm())).tolist()  # one transfer from a GPU
+        metrics = dict(zip((*numbers, "grad_norm"), values, strict=True))
         check_finite(metrics, self.version, ADVICE)
         return metrics
 
@@ -131,10 +131,10 @@ class GradientDescent(Algorithm):
             return number.detach()
         got = type(number).__name__
         try:
-            found = torch.as_tensor(number, dtype=like.dtype, device=like.device)
-            if found.numel() == 1:
-                return found.detach().reshape(())
-            got = f"{got} {list(found.shape)}; log its mean"
+            tensor = torch.as_tensor(number, dtype=like.dtype, device=like.device)
+            if tensor.numel() == 1:
+                return tensor.detach().reshape(())
+            got = f"{got} {list(tensor.shape)}; log its mean"
         except (TypeError, ValueError, RuntimeError):
             pass
         raise UsageError(f"{type(self).__name__}.loss: {name}: expected one number to log, got {got}")
@@ -146,7 +146,7 @@ class GradientDescent(Algorithm):
         for each in measured:
             for name, number in each.items():
                 by_name.setdefault(name, []).append(number)
-        return {f"train/{name}": sum(found) / len(found) for name, found in by_name.items()}
+        return {f"train/{name}": sum(values) / len(values) for name, values in by_name.items()}
 
     # ---------------------------------------------------------------- the state
 

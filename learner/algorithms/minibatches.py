@@ -52,11 +52,11 @@ class Observations(NamedTuple):
 
         `function` returns one number for each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
         """
-        found = torch.empty(steps * self.shape[1], device=self.features.device)
+        values = torch.empty(steps * self.shape[1], device=self.features.device)
         for columns, rows in self._chunks(steps):
-            found[rows] = function(self.network_input(steps, columns, rows), rows)
+            values[rows] = function(self.network_input(steps, columns, rows), rows)
             pulse()
-        return np.asarray(found.cpu().numpy()).reshape(steps, -1)
+        return np.asarray(values.cpu().numpy()).reshape(steps, -1)
 
     def _chunks(self, steps: int) -> Iterator[tuple[Index, Index]]:
         """The columns and rows of each chunk, which has about CHUNK_ROWS rows.

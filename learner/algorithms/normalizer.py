@@ -119,13 +119,13 @@ def _plain(moments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tensors(moments: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    state: dict[str, Any] = {}
     for name, value in moments.items():
         if name == "count":
-            found[name] = value
+            state[name] = value
             continue
         array = np.asarray(value, np.float64)
         if not np.isfinite(array).all():
             raise ValueError(f"normalizer: {name}: expected finite numbers")
-        found[name] = torch.tensor(array)
-    return found
+        state[name] = torch.tensor(array)
+    return state

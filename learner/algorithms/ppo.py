@@ -80,13 +80,13 @@ class PPO(ActorCritic):
 
         A subclass with a loss of its own logs what it likes: what it does not log is not among them.
         """
-        found = super().metrics(epochs, estimates)
-        found |= {"train/n_updates": float(self.epochs), "train/clip_range": self.clip_range}
+        metrics = super().metrics(epochs, estimates)
+        metrics |= {"train/n_updates": float(self.epochs), "train/clip_range": self.clip_range}
         if epochs[-1]:  # `estimate` may use no row
-            found["train/loss"] = epochs[-1][-1]["loss"]
+            metrics["train/loss"] = epochs[-1][-1]["loss"]
         if divergences := [step["approx_kl"] for step in epochs[-1] if "approx_kl" in step]:
-            found["train/approx_kl"] = float(np.mean(divergences))
-        return found
+            metrics["train/approx_kl"] = float(np.mean(divergences))
+        return metrics
 
     def count_update(self, batch: Batch, epochs: int) -> None:
         """See `ActorCritic`."""

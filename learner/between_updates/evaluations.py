@@ -65,10 +65,10 @@ class Evaluations:
         times a second during an evaluation.
         """
         if not self._config.eval_workers:
-            found = self._evaluate_newest(evaluation_size(self._config), watch)
-            self._keep_if_best(found, self._state.env_steps, self._run.algorithm.weights)
+            evaluation = self._evaluate_newest(evaluation_size(self._config), watch)
+            self._keep_if_best(evaluation, self._state.env_steps, self._run.algorithm.weights)
             self._tally.evaluated()
-            return found.metrics()
+            return evaluation.metrics()
         metrics = self.end_pending(watch)
         self._tally.evaluated()
         if self._tally.stop_reason() is None:
@@ -84,11 +84,11 @@ class Evaluations:
         policy = state.pending_policy
         if pending is None:
             return None
-        found = self._end(watch)
+        evaluation = self._end(watch)
         state.pending = state.pending_policy = None
-        self._found(found, pending)
-        self._keep_if_best(found, pending.env_steps, lambda: policy)
-        return found.metrics() | {EVALUATED_AT_KEY: pending.env_steps}
+        self._record(evaluation, pending)
+        self._keep_if_best(evaluation, pending.env_steps, lambda: policy)
+        return evaluation.metrics() | {EVALUATED_AT_KEY: pending.env_steps}
 
     def conclude(self, watch: Callable[[], None]) -> bool:
         """Evaluate the final policy. If the run kept a best policy, evaluate that one too, on other episodes: `confirmed`.
@@ -101,18 +101,18 @@ class Evaluations:
         size = final_evaluation_size(self._config, state.env_steps, self._tally.window.length_mean, self._time_limit)
         if size != (usual := evaluation_size(self._config)):
             log_notice(log, _smaller(size, usual))
-        found = self._evaluate_newest(size, watch)
+        evaluation = self._evaluate_newest(size, watch)
         if self._config.eval_every or state.best is not None:  # best: of a run that was resumed with eval_every 0
-            self._keep_if_best(found, state.env_steps, self._run.algorithm.weights)
+            self._keep_if_best(evaluation, state.env_steps, self._run.algorithm.weights)
         if ended and before is not None:
             found_again = self._evaluate(Purpose.CONFIRMATION, size, watch)
             self._say(found_again, state.env_steps)
             self.final = found_again
             self.ended_by = before
         else:
-            self.final = found
+            self.final = evaluation
         self.confirmed = self._confirm(size, watch)
-        return found is not before
+        return evaluation is not before
 
     def write_best(self) -> None:
         """Write the best policy into the run folder, if it is known."""
@@ -148,20 +148,20 @@ class Evaluations:
     def _evaluate_newest(self, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
         """Evaluate the newest policy; the same version is not evaluated twice."""
         state = self._state
-        found = self.of_newest()
-        if found is None or found.episodes != size.episodes:
-            found = self._evaluate(Purpose.EVALUATION, size, watch)
-            self._found(found, EvaluatedPolicy(state.version, state.env_steps))
-        return found
+        evaluation = self.of_newest()
+        if evaluation is None or evaluation.episodes != size.episodes:
+            evaluation = self._evaluate(Purpose.EVALUATION, size, watch)
+            self._record(evaluation, EvaluatedPolicy(state.version, state.env_steps))
+        return evaluation
 
-    def _found(self, found: Evaluation, of: EvaluatedPolicy) -> None:
-        """The newest evaluation found this, of this policy."""
-        self._state.newest_evaluation = found
+    def _record(self, evaluation: Evaluation, of: EvaluatedPolicy) -> None:
+        """The newest evaluation is this, of this policy."""
+        self._state.newest_evaluation = evaluation
         self._state.evaluated = of
-        self._say(found, of.env_steps)
+        self._say(evaluation, of.env_steps)
 
-    def _say(self, found: Evaluation, env_steps: int) -> None:
-        self._tally.note = f"{env_steps:,} env steps: greedy {found}"
+    def _say(self, evaluation: Evaluation, env_steps: int) -> None:
+        self._tally.note = f"{env_steps:,} env steps: greedy {evaluation}"
 
     def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
         """Evaluate the weights that were published last, while training waits."""
@@ -182,15 +182,15 @@ class Evaluations:
         played = self._run.hub.end_evaluation(lambda played, env_steps: watch())
         return evaluation_of(played, self._run.spec.facts)
 
-    def _keep_if_best(self, found: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
-        """Keep the policy, of which this was found after so many env steps, if none was better.
+    def _keep_if_best(self, evaluation: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
+        """Keep the policy, of which this is the evaluation, after so many env steps, if none was better.
 
         A tie keeps the newer one: it has learned more, and where all returns are equal, as in a zero-sum game that the
         policy plays with itself, they say nothing else.
         """
         state = self._state
-        if state.best is None or found.return_mean >= state.best[0]:
-            state.best = (found.return_mean, env_steps)
+        if state.best is None or evaluation.return_mean >= state.best[0]:
+            state.best = (evaluation.return_mean, env_steps)
             state.best_policy = policy()
             self.write_best()
 

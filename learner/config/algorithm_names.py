@@ -113,31 +113,31 @@ def with_algorithm(table: dict[str, Any], algo: str | None) -> dict[str, Any]:
 def _found(name: str) -> object:
     module_name, _, qualname = name.partition(":")
     if module_name == "__main__" or "<locals>" in qualname:
-        found = attribute(sys.modules.get(module_name), qualname)
-        if found is None:
+        named = attribute(sys.modules.get(module_name), qualname)
+        if named is None:
             raise UsageError(
                 f"algo {name}: this class was made in a script, a notebook or a function; go on with it there: "
                 f"millrace.train(resume=…, algo={last_part(name)}), or put it into a module: --algo module:{last_part(name)}"
             )
-        return found
+        return named
     if not is_name(name):
         raise UsageError(f"algo {name}: expected module:Class, as in mine:ClippedPlus")
     module = import_own(module_name, f"algo {name}")
-    found = attribute(module, qualname)
-    if found is None:
+    named = attribute(module, qualname)
+    if named is None:
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         where = getattr(module, "__file__", None) or "built-in"
         raise UsageError(f"algo {name}: module {module_name} ({where}) has no {qualname}{did_you_mean(qualname, classes)}")
-    return found
+    return named
 
 
-def _checked(name: str, found: object) -> Any:
+def _checked(name: str, named: object) -> Any:
     """The class, if it has what the learner needs. Raises `UsageError` that names what is missing or wrong."""
-    if not isinstance(found, type):
-        raise UsageError(f"algo {name}: expected a class, got {type(found).__name__}")
-    if why := _what_is_wrong(found):
+    if not isinstance(named, type):
+        raise UsageError(f"algo {name}: expected a class, got {type(named).__name__}")
+    if why := _what_is_wrong(named):
         raise UsageError(f"algo {name}: {why}")
-    return found
+    return named
 
 
 @cache

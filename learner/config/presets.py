@@ -67,13 +67,13 @@ def origin(config: Config) -> str:
     defaults = _settings(type(config)(algorithm=type(config.algorithm)()))
     if preset is None:
         given = [name for name in config.algorithm.__struct_fields__ if mine[name] != defaults[name]]
-        found = f"settings: defaults, except {', '.join(given)}" if given else "settings: defaults"
-        return f"{found}, because {config.algo} has no preset for {config.env}"
+        which = f"settings: defaults, except {', '.join(given)}" if given else "settings: defaults"
+        return f"{which}, because {config.algo} has no preset for {config.env}"
     changed = [name for name, value in preset.items() if not _agrees(mine[name], value)]
     if all(defaults[name] == preset[name] for name in preset.keys() - changed):
         return f"settings: without the preset of {config.algo} for {config.env}"
-    found = f"settings: preset of {config.algo} for {config.env}"
-    return f"{found}, except {', '.join(changed)}" if changed else found
+    which = f"settings: preset of {config.algo} for {config.env}"
+    return f"{which}, except {', '.join(changed)}" if changed else which
 
 
 def _agrees(mine: Any, preset: Any) -> bool:
@@ -83,9 +83,9 @@ def _agrees(mine: Any, preset: Any) -> bool:
 
 def _settings(config: Config) -> dict[str, Any]:
     """The settings of the run and of the algorithm, in the types of TOML."""
-    found: dict[str, Any] = msgspec.to_builtins(config)
-    algorithm: dict[str, Any] = found.pop("algorithm")
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in (found | algorithm).items()}
+    settings: dict[str, Any] = msgspec.to_builtins(config)
+    algorithm: dict[str, Any] = settings.pop("algorithm")
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in (settings | algorithm).items()}
 
 
 @cache

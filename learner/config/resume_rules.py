@@ -72,16 +72,16 @@ def refusal(changed: list[Change]) -> str:
 
 
 def _declaration(record: type[msgspec.Struct], name: str, hint: Any, by_type: bool) -> OnResume:
-    found = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, OnResume)]
-    if by_type and not found:
+    marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, OnResume)]
+    if by_type and not marks:
         bases = [base for base in record.__mro__[1:] if issubclass(base, msgspec.Struct) and base is not msgspec.Struct]
         overridden = next((base for base in bases if name in base.__struct_fields__), None)
         if overridden is not None:
             return declared(overridden, by_type=True)[name]
         return OnResume.FREE if _is_float(hint) else OnResume.FIXED
-    if len(found) != 1:
-        raise TypeError(f"{record.__name__}.{name}: expected one of Free, Adaptable and Fixed, got {len(found)}")
-    return found[0]
+    if len(marks) != 1:
+        raise TypeError(f"{record.__name__}.{name}: expected one of Free, Adaptable and Fixed, got {len(marks)}")
+    return marks[0]
 
 
 def _is_float(hint: Any) -> bool:

@@ -290,11 +290,11 @@ class EvaluationDealer:
 
         With a limit of copies, the first of them, because a worker keeps its copies.
         """
-        found = sorted(members, key=lambda member: not member.hello.evaluates)
-        found = [member for member in found if member.session not in self._late] or found
+        players = sorted(members, key=lambda member: not member.hello.evaluates)
+        players = [member for member in players if member.session not in self._late] or players
         if self.most_copies is None:
-            return found
-        return found[: self._most_workers or max(1, self.most_copies // plan.copies)]
+            return players
+        return players[: self._most_workers or max(1, self.most_copies // plan.copies)]
 
     def _end(self, number: int) -> int:
         """The ticket is with nobody, and its rows are dropped. Returns its index."""

@@ -52,17 +52,17 @@ def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tupl
     """The seats of each team, by these patterns of their names; without any, each seat is a team. Raises `UsageError`."""
     if not patterns:
         return tuple((seat,) for seat in range(len(seats)))
-    found = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
-    for pattern, team in zip(patterns, found, strict=True):
+    teams = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
+    for pattern, team in zip(patterns, teams, strict=True):
         if not team:
             raise UsageError(f"teams: {pattern} matches no agent of {', '.join(seats)}{did_you_mean(f'{pattern}*', seats)}")
     for n, seat in enumerate(seats):
-        if (count := sum(n in team for team in found)) != 1:
+        if (count := sum(n in team for team in teams)) != 1:
             raise UsageError(f"teams: expected each agent in one team, got {seat} in {count}: {' '.join(patterns)}")
-    if len({len(team) for team in found}) > 1 or len(found) < 2:
-        sizes = ", ".join(f"{len(team)} in {pattern}" for pattern, team in zip(patterns, found, strict=True))
+    if len({len(team) for team in teams}) > 1 or len(teams) < 2:
+        sizes = ", ".join(f"{len(team)} in {pattern}" for pattern, team in zip(patterns, teams, strict=True))
         raise UsageError(f"teams: expected two teams or more, with as many agents in each; got {sizes}")
-    return tuple(found)
+    return tuple(teams)
 
 
 class PoolSettings(NamedTuple):

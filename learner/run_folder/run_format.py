@@ -65,22 +65,22 @@ class _Identity(msgspec.Struct):
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide results, by import name; without those not installed."""
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name, distribution in DISTRIBUTIONS.items():
         with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(distribution)
-    return found
+            versions[name] = metadata.version(distribution)
+    return versions
 
 
 def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from: str = "") -> None:
     """Write run.json with the current format. Raises `RunError`."""
-    found = RunFormat(
+    run_format = RunFormat(
         format=RUN_FORMAT,
         millrace=versions().get("millrace", ""),
         workers_elsewhere=workers_elsewhere,
         started_from=started_from,
     )
-    content = msgspec.json.encode(found)
+    content = msgspec.json.encode(run_format)
     write_file(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
 
 
@@ -146,16 +146,16 @@ def _texts(value: Any) -> Iterator[str]:
 def check_format(folder: Path) -> RunFormat:
     """The run.json of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
     try:
-        found = msgspec.json.decode(read(folder / RUN_FILE), type=RunFormat)
+        run_format = msgspec.json.decode(read(folder / RUN_FILE), type=RunFormat)
     except FileNotFoundError:
         raise UsageError(f"run {folder}: expected a run folder, got one without {RUN_FILE}") from None
     except (OSError, *INVALID) as error:
         raise UsageError(
             f"run {folder}: {RUN_FILE} cannot be read: {reason(error)}; restore it, or start a new run"
         ) from error
-    if found.format > RUN_FORMAT:
+    if run_format.format > RUN_FORMAT:
         raise UsageError(
-            f"run {folder}: its format is {found.format}, and this millrace reads formats up to {RUN_FORMAT}; "
-            f"install the millrace that wrote it ({found.millrace or 'unknown version'}) or a newer one"
+            f"run {folder}: its format is {run_format.format}, and this millrace reads formats up to {RUN_FORMAT}; "
+            f"install the millrace that wrote it ({run_format.millrace or 'unknown version'}) or a newer one"
         )
-    return found
+    return run_format

@@ -229,12 +229,12 @@ class RunLock:
             if self._other is not None:
                 return
             try:
-                found = decoded(read(self._path))
+                owner = decoded(read(self._path))
             except FileNotFoundError:
                 self._make_again()
                 return
-            if found is not None and found.token != self._owner.token:
-                self._other = found
+            if owner is not None and owner.token != self._owner.token:
+                self._other = owner
                 return
             self._owner = replace(self._owner, count=self._owner.count + 1)
             self._write()
@@ -258,8 +258,8 @@ class RunLock:
         return os.pread(self._file, 1 << 16, 0)
 
     def _is_ours(self) -> bool:
-        found = decoded(read(self._path))
-        return found is not None and found.token == self._owner.token
+        owner = decoded(read(self._path))
+        return owner is not None and owner.token == self._owner.token
 
     def _is_open_file(self) -> bool:
         """Whether the open file is the one of this name: its owner may have removed it."""

@@ -37,23 +37,23 @@ class InfoReader:
 
     def by_row(self, ready: Ready) -> dict[int, Infos]:
         """The infos that are not empty, in the order of the rows."""
-        found = dict(ready.losses)
+        infos = dict(ready.losses)
         for lane, packed in ready.results.items():
             if not isinstance(packed, bytes) or not packed:
                 continue
             try:
                 for n, info in unpack_infos(packed, self._layout.rows_of(self._layout.copies(lane))).items():
-                    found[n] = found.get(n, {}) | info
+                    infos[n] = infos.get(n, {}) | info
             except BadMessage as error:
                 self._refuse(lane, f"lane {lane}: infos cannot be read: {error}")
-        if not found:
-            return found
-        for n in sorted(found):
-            for key in repr_paths(found[n]):
+        if not infos:
+            return infos
+        for n in sorted(infos):
+            for key in repr_paths(infos[n]):
                 if key not in self._warned:
                     self._warned.add(key)
                     log.warning("info %s of row %d is no plain data: it arrives as its repr, a string", key, n)
-        return dict(sorted(found.items()))
+        return dict(sorted(infos.items()))
 
 
 def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: Sequence[int] | None = None) -> Infos:

@@ -70,25 +70,25 @@ def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def typed_flags(argv: Sequence[str]) -> list[Typed]:
     """The flags that were typed, in order, whatever flags there are. First come the words before the first flag."""
-    found = [Typed("", None, [])]
+    flags = [Typed("", None, [])]
     for word in argv:
         if word in EVERYWHERE:
             continue
         if is_flag(word):
             flag, sign, value = word.partition("=")
-            found.append(Typed(flag, value if sign else None, []))
+            flags.append(Typed(flag, value if sign else None, []))
         else:
-            found[-1].words.append(word)
-    return found
+            flags[-1].words.append(word)
+    return flags
 
 
 def first_words(flags: Sequence[Typed], *names: str) -> dict[str, str]:
     """The value, or the first word, of each of these flags that has one."""
-    found = {}
+    words = {}
     for typed in flags:
         if typed.name in names and (typed.value is not None or typed.words):
-            found[typed.name] = typed.words[0] if typed.value is None else typed.value
-    return found
+            words[typed.name] = typed.words[0] if typed.value is None else typed.value
+    return words
 
 
 def given_values(

@@ -108,12 +108,12 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         """What a seat sees, with its number if it is to know it, and the environment's state if its critic is to."""
         if not self._tells_seats and self._state_space is None:
             return observation
-        found = dict(observation) if isinstance(observation, dict) else {"observation": observation}
+        named = dict(observation) if isinstance(observation, dict) else {"observation": observation}
         if self._tells_seats:
-            found[SEAT] = np.int64(seat)
+            named[SEAT] = np.int64(seat)
         if self._state_space is not None:
-            found[STATE] = np.array(self.env.state() if state is None else state)
-        return found
+            named[STATE] = np.array(self.env.state() if state is None else state)
+        return named
 
     def _nothing(self) -> SeatStep:
         """A step in which nothing has happened yet."""
@@ -124,21 +124,21 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[SeatStep, dict[str, Any]]:
         """Begin an episode."""
-        found = self._nothing()
+        step = self._nothing()
         self._gone.clear()
-        self._begin(found, {"seed": seed} if options is None else {"seed": seed, "options": options})
-        if True not in found.acts:
+        self._begin(step, {"seed": seed} if options is None else {"seed": seed, "options": options})
+        if True not in step.acts:
             raise WrongAnswer("its reset: expected an agent that acts after it, got none")
         self._check_agents()
-        self._last = list(found.observations)
-        return found, {}
+        self._last = list(step.observations)
+        return step, {}
 
     def step(self, action: Sequence[Any]) -> tuple[SeatStep, float, bool, bool, dict[str, Any]]:
         """Step the copy with an action for each seat."""
-        found = self._nothing()._replace(observations=self._last)
-        over = self._advance(action, found)
-        self._last = list(found.observations)
-        return found, 0.0, over, False, {}
+        step = self._nothing()._replace(observations=self._last)
+        over = self._advance(action, step)
+        self._last = list(step.observations)
+        return step, 0.0, over, False, {}
 
     def _check_agents(self, rewards: Iterable[Any] = ()) -> None:
         for what, agents in (("agents", self.env.agents), ("rewards", rewards)):
@@ -150,12 +150,12 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         return [0.0] * len(self.seats)
 
     @abstractmethod
-    def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
-        """Reset the environment, and write into `found` what follows."""
+    def _begin(self, step: SeatStep, keywords: Mapping[str, Any]) -> None:
+        """Reset the environment, and write into `step` what follows."""
 
     @abstractmethod
-    def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
-        """Step the environment, and write into `found` what follows. Returns whether the episode is over."""
+    def _advance(self, actions: Sequence[Any], step: SeatStep) -> bool:
+        """Step the environment, and write into `step` what follows. Returns whether the episode is over."""
 
     def owner(self, name: str) -> Any:
         """The outermost of PettingZoo's wrappers that has this attribute itself; the environment if none has."""
@@ -193,17 +193,17 @@ class ParallelSeats(SeatedEnv):
 
     takes_turns = False
 
-    def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
+    def _begin(self, step: SeatStep, keywords: Mapping[str, Any]) -> None:
         observations, infos = reset_answer(self.env.reset(**keywords))
         self._present = [agent for agent in self.agents if agent in self.env.agents]
         try:
             for agent in self._present:
-                self._shows(found, agent, observations[agent], infos.get(agent))
+                self._shows(step, agent, observations[agent], infos.get(agent))
         except RETURNED_WRONGLY as error:
             self._explain(error, self._present, observations=observations)
             raise
 
-    def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
+    def _advance(self, actions: Sequence[Any], step: SeatStep) -> bool:
         given = {agent: actions[self.seat_of[agent]] for agent in self._present}
         answer = self.env.step(given)
         try:
@@ -212,7 +212,7 @@ class ParallelSeats(SeatedEnv):
             raise wrong_step(answer) from error
         infos = _NO_INFO if infos is None else infos
         try:
-            return self._takes(given, found, observations, rewards, terminated, truncated, infos)
+            return self._takes(given, step, observations, rewards, terminated, truncated, infos)
         except RETURNED_WRONGLY as error:
             self._explain(
                 error, given, rewards=rewards, terminated=terminated, truncated=truncated, observations=observations
@@ -224,9 +224,9 @@ class ParallelSeats(SeatedEnv):
                 _check_numbers(agent, reward=rewards[agent], **flags)
             raise
 
-    def _takes(self, given: Mapping[Any, Any], found: SeatStep, *returned: Mapping[Any, Any]) -> bool:
+    def _takes(self, given: Mapping[Any, Any], step: SeatStep, *returned: Mapping[Any, Any]) -> bool:
         observations, rewards, terminated, truncated, infos = returned
-        seen, told, reward, terminates, truncates, complete, acts, outside = found
+        seen, told, reward, terminates, truncates, complete, acts, outside = step
         here = set(self.env.agents)
         for agent in given:
             seat = self.seat_of[agent]
@@ -249,7 +249,7 @@ class ParallelSeats(SeatedEnv):
             outside[self.seat_of[agent]] = float(rewards[agent])
         here -= self._gone
         for agent in here - given.keys():
-            self._shows(found, agent, observations[agent], infos.get(agent))
+            self._shows(step, agent, observations[agent], infos.get(agent))
         self._present = [agent for agent in self.agents if agent in here]
         return not self._present
 
@@ -263,11 +263,11 @@ class ParallelSeats(SeatedEnv):
                 got = ", ".join(map(str, by_agent)) or "none"
                 raise WrongAnswer(f"{what}: expected agent {missing[0]} among them, got {got}") from error
 
-    def _shows(self, found: SeatStep, agent: Any, observation: Any, info: Any) -> None:
+    def _shows(self, step: SeatStep, agent: Any, observation: Any, info: Any) -> None:
         seat = self.seat_of[agent]
-        found.observations[seat] = self._seen(seat, observation)
-        found.acts[seat] = True
-        found.infos[seat] = _info(agent, info)
+        step.observations[seat] = self._seen(seat, observation)
+        step.acts[seat] = True
+        step.infos[seat] = _info(agent, info)
 
 
 class TurnSeats(SeatedEnv):
@@ -275,18 +275,18 @@ class TurnSeats(SeatedEnv):
 
     takes_turns = True
 
-    def _begin(self, found: SeatStep, keywords: Mapping[str, Any]) -> None:
+    def _begin(self, step: SeatStep, keywords: Mapping[str, Any]) -> None:
         self.env.reset(**keywords)
         self._waits = [False] * len(self.seats)
-        self._next(found)
+        self._next(step)
 
-    def _advance(self, actions: Sequence[Any], found: SeatStep) -> bool:
+    def _advance(self, actions: Sequence[Any], step: SeatStep) -> bool:
         seat = self.seat_of[self.env.agent_selection]
         self._waits[seat] = True
         self.env.step(actions[seat])
-        return self._next(found)
+        return self._next(step)
 
-    def _next(self, found: SeatStep) -> bool:
+    def _next(self, step: SeatStep) -> bool:
         """Let agents whose part has ended leave, and find who has the move. Returns whether nobody is left."""
         while (left := self.env.agents) and not (self._gone and self._gone.issuperset(left)):
             agent = self.env.agent_selection
@@ -300,23 +300,23 @@ class TurnSeats(SeatedEnv):
                 raise WrongAnswer(f"its last() returned {in_words(answer)}; {OF_STEP}") from error
             try:
                 if self._waits[seat]:
-                    found.complete[seat] = True
-                    found.reward[seat] = float(reward)
-                    found.terminated[seat] = bool(terminated)
-                    found.truncated[seat] = bool(truncated)
+                    step.complete[seat] = True
+                    step.reward[seat] = float(reward)
+                    step.terminated[seat] = bool(terminated)
+                    step.truncated[seat] = bool(truncated)
                 else:
-                    found.outside[seat] = float(reward)
+                    step.outside[seat] = float(reward)
             except RETURNED_WRONGLY:
                 _check_numbers(agent, reward=reward, terminated=terminated, truncated=truncated)
                 raise
             if observation is not None:  # a copy: the seat shows it until it has the move again
-                found.observations[seat] = self._seen(seat, deepcopy(observation))
+                step.observations[seat] = self._seen(seat, deepcopy(observation))
             elif not terminated and (self._waits[seat] or not truncated):  # it acts on it, or learns from its value
                 raise WrongAnswer(f"agent {agent}: expected an observation unless it is terminated, got None")
             self._waits[seat] = False
-            found.infos[seat] = info if type(info) is dict else _info(agent, info)
+            step.infos[seat] = info if type(info) is dict else _info(agent, info)
             if not (terminated or truncated):
-                found.acts[seat] = True
+                step.acts[seat] = True
                 return False
             self._gone.add(agent)
             self.env.step(None)
@@ -428,16 +428,16 @@ def _names(agents: Iterable[Any]) -> tuple[str, ...]:
 
 
 def _common(
-    found: Sequence[gymnasium.Space[Any]], seats: Sequence[str], what: str, name: str, padded: str
+    spaces: Sequence[gymnasium.Space[Any]], seats: Sequence[str], what: str, name: str, padded: str
 ) -> gymnasium.Space[Any]:
     """The space that all agents have. Raises `UsageError` if there is none."""
-    for space, seat in zip(found, seats, strict=True):
-        if space != found[0]:
+    for space, seat in zip(spaces, seats, strict=True):
+        if space != spaces[0]:
             raise UsageError(
-                f"environment {name}: expected one {what} space for all agents, got {found[0]} for {seats[0]} and {space} "
+                f"environment {name}: expected one {what} space for all agents, got {spaces[0]} for {seats[0]} and {space} "
                 f"for {seat}; if they differ in size, --wrappers supersuit:{padded} pads them"
             )
-    return found[0]
+    return spaces[0]
 
 
 def _parts(space: gymnasium.Space[Any]) -> dict[str, gymnasium.Space[Any]]:

@@ -36,9 +36,9 @@ def forbid(params: Floats, mask: Bools) -> Floats:
 
     ε, which follows the action values, stays as it is.
     """
-    found = params.copy()
-    np.copyto(found[..., : mask.shape[-1]], np.float32(FORBIDDEN), where=~mask)
-    return found
+    masked = params.copy()
+    np.copyto(masked[..., : mask.shape[-1]], np.float32(FORBIDDEN), where=~mask)
+    return masked
 
 
 def masked_distribution(spec: PolicySpec) -> Distribution:

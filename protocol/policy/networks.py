@@ -102,16 +102,16 @@ class MLPNode(torch.autograd.Function):
         half = len(ctx.saved_tensors) // 2
         inputs = ctx.saved_tensors[:half]
         weights = ctx.saved_tensors[half:]
-        found: list[Tensor | None] = []
+        gradients: list[Tensor | None] = []
         for i in range(half - 1, 0, -1):
-            found += [g.sum(0), g.t() @ inputs[i]]
+            gradients += [g.sum(0), g.t() @ inputs[i]]
             g = g @ weights[i]
             if ctx.relu:
                 g = torch.ops.aten.threshold_backward(g, inputs[i], 0)
             else:
                 g = torch.ops.aten.tanh_backward(g, inputs[i])
-        found += [g.sum(0), g.t() @ inputs[0], None, g @ weights[0] if ctx.needs_input_grad[0] else None]
-        return tuple(reversed(found))
+        gradients += [g.sum(0), g.t() @ inputs[0], None, g @ weights[0] if ctx.needs_input_grad[0] else None]
+        return tuple(reversed(gradients))
 
 
 class StackedMLP(torch.autograd.Function):
@@ -277,7 +277,7 @@ class FlatNetwork:
     def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
         """Inputs [T · C, D] -> the core's outputs [T · C, H] and its last state [C, S]; see `recurrent.py`."""
         weights = [self.parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
-        found = []
+        outputs = []
         state = recurrent.initial_state
         advances = recurrent.advances
         keeps = recurrent.keep_state.unsqueeze(-1)
@@ -290,8 +290,8 @@ class FlatNetwork:
                 h = state = torch.gru_cell(step, state, *weights)
             if advances is not None:
                 state = torch.where(advances[t, :, None], state, before)
-            found.append(h)
-        return torch.cat(found), state
+            outputs.append(h)
+        return torch.cat(outputs), state
 
 
 class ActorCriticNetwork(FlatNetwork):

@@ -120,20 +120,20 @@ class Evaluator:
         for sender in senders:
             self._observe(sender, of_lane, 0, copies)
         actions = _PlayedActions(run, self._runner.acting, rows, drawn, greedy=order.greedy)  # rule GREEDY
-        found: dict[int, EndedEpisode] = {}
+        ended_by_copy: dict[int, EndedEpisode] = {}
         while lane.playing.any():
             playing = np.flatnonzero(lane.playing).tolist()
             self._runner.run(rows, actions, pulse)
             self.steps += len(playing)
             check_rewards(None, of_lane.reward, run.row_axes, rows.first_step)
             self._check_observed(of_lane, 1, rows.first_step + 1)
-            found |= {each.copy: each for each in of_lane.ended}
+            ended_by_copy |= {each.copy: each for each in of_lane.ended}
             if senders:
                 for n in playing:
                     self._observe(senders[n], of_lane, 1, copies)
-                    self._send_row(senders[n], of_lane, actions.chosen, cut=n in found and found[n].cut)
+                    self._send_row(senders[n], of_lane, actions.chosen, cut=n in ended_by_copy and ended_by_copy[n].cut)
             rows.begin_again()
-        ended = [found[n] for n in range(k)]
+        ended = [ended_by_copy[n] for n in range(k)]
         return Evaluated(  # rule CUT
             order.session, order.ticket, tuple(each.episode for each in ended), tuple(each.cut for each in ended)
         )

@@ -118,14 +118,14 @@ class AliveSender:
 
     def _connected(self) -> zmq.Socket[bytes]:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
-        found = context.socket(zmq.DEALER)
-        set_options(found, self._address, self._token is not None)
-        found.sndhwm = 10  # only the newest word counts
+        dealer = context.socket(zmq.DEALER)
+        set_options(dealer, self._address, self._token is not None)
+        dealer.sndhwm = 10  # only the newest word counts
         name = f"supervisor-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"[-MAX_NAME:]
-        found.routing_id = routing_id(name, self._token)
-        found.reconnect_ivl = RECONNECT_MS
-        found.reconnect_ivl_max = RECONNECT_MOST_MS
+        dealer.routing_id = routing_id(name, self._token)
+        dealer.reconnect_ivl = RECONNECT_MS
+        dealer.reconnect_ivl_max = RECONNECT_MOST_MS
         if self._token is not None:
-            connect_with(found, self._token)
-        found.connect(self._address)
-        return found
+            connect_with(dealer, self._token)
+        dealer.connect(self._address)
+        return dealer

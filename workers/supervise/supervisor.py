@@ -204,13 +204,13 @@ class Supervisor:
     def activities(self) -> list[WorkerActivity]:
         """What each running worker does. A stopped process is left out."""
         now = self._clock()
-        found = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
-        return [activity for activity in found if activity is not None]
+        activities = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
+        return [activity for activity in activities if activity is not None]
 
     def said(self) -> dict[str, str]:
         """The last line of the log of each running worker that has written to one."""
-        found = {worker.name: worker.running.last_line() for worker in self._workers if worker.running is not None}
-        return {name: line for name, line in found.items() if line}
+        last_lines = {worker.name: worker.running.last_line() for worker in self._workers if worker.running is not None}
+        return {name: line for name, line in last_lines.items() if line}
 
     @property
     def names(self) -> list[str]:

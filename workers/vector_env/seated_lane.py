@@ -27,29 +27,29 @@ class SeatedLane(SteppedLane):
         return [list(map(self._nest, zip(*of_seats, strict=True))) for of_seats in zip(*of_copies, strict=True)]
 
     def _write(self, infos: CopyInfos) -> CopyInfos:
-        found, leaves = self._found(range(self.count), infos)
+        newest, leaves = self._newest(range(self.count), infos)
         self._writer.write(self._joined, 0, leaves)
         rows = self.rows
-        numbers = found.reward, found.terminated, found.truncated
+        numbers = newest.reward, newest.terminated, newest.truncated
         write_numbers((rows.reward, rows.terminated, rows.truncated), slice(None), numbers)
-        return [(row, dict(info)) for row, info in enumerate(found.infos) if info]
+        return [(row, dict(info)) for row, info in enumerate(newest.infos) if info]
 
     def _write_some(self, copies: Sequence[int], infos: CopyInfos) -> CopyInfos:
-        found, leaves = self._found(copies, infos)
+        newest, leaves = self._newest(copies, infos)
         numbers = list(columns_of(copies, len(self._seats)))
         self._writer.write_some(self.rows.obs, numbers, [dict(zip(numbers, values, strict=True)) for values in leaves])
         for array in (self.rows.reward, self.rows.terminated, self.rows.truncated):
             array[numbers] = 0
-        return [(row, dict(info)) for row, info in zip(numbers, found.infos, strict=True) if info]
+        return [(row, dict(info)) for row, info in zip(numbers, newest.infos, strict=True) if info]
 
-    def _found(self, copies: Iterable[int], infos: CopyInfos) -> tuple[SeatStep, Sequence[Any]]:
+    def _newest(self, copies: Iterable[int], infos: CopyInfos) -> tuple[SeatStep, Sequence[Any]]:
         """The newest step of these copies, and what to write of it as their observations."""
         last = {n: info["final_obs"] for n, info in infos}  # of the copies that SameStep has reset
         steps: list[SeatStep] = [self._observations[n] for n in copies]
-        found = side_by_side(_reset(last[n], step) if n in last else step for n, step in zip(copies, steps, strict=True))
-        seen = found.observations
+        newest = side_by_side(_reset(last[n], step) if n in last else step for n, step in zip(copies, steps, strict=True))
+        seen = newest.observations
         leaves = read_leaves(self._read, seen, self._seats) if self._nested_observations else (seen,)
-        return found, (*leaves, found.acts, found.complete, found.outside)
+        return newest, (*leaves, newest.acts, newest.complete, newest.outside)
 
 
 def _reset(last: SeatStep, first: SeatStep) -> SeatStep:

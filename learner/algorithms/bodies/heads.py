@@ -51,9 +51,9 @@ class Categories:
         position = (returns.clamp(-self.bound, self.bound) + self.bound) / self.step
         lower = position.floor().clamp(0, len(self.atoms) - 2)
         upper_share = position - lower
-        found = torch.zeros_like(probabilities)
-        found.scatter_add_(-1, lower.long(), probabilities * (1 - upper_share))
-        return found.scatter_add_(-1, lower.long() + 1, probabilities * upper_share)
+        projected = torch.zeros_like(probabilities)
+        projected.scatter_add_(-1, lower.long(), probabilities * (1 - upper_share))
+        return projected.scatter_add_(-1, lower.long() + 1, probabilities * upper_share)
 
     @staticmethod
     def cross_entropy(logits: Tensor, target: Tensor) -> Tensor:

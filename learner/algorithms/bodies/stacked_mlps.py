@@ -104,9 +104,9 @@ class StackedMLPs:
         self._folded_fields = shape.folded().fields()
         self._trained = parameters
         self._constant = parameters.detach()
-        found = named_views(statistics, shape.statistics())
-        norms = len(found) // 2
-        self._running = [RunningStatistics(found[f"{i}.mean"], found[f"{i}.variance"]) for i in range(norms)]
+        named = named_views(statistics, shape.statistics())
+        norms = len(named) // 2
+        self._running = [RunningStatistics(named[f"{i}.mean"], named[f"{i}.variance"]) for i in range(norms)]
         self._plan = Plan(self._layers, shape.relu, shape.normalized is Normalized.BEFORE)
         self._normalizes = norms > 0
         self._now = self._layers(self._constant) if self._normalizes else []

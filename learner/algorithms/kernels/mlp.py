@@ -135,12 +135,12 @@ class SmallMLP:
         """
         if torch.is_grad_enabled() and (x.requires_grad or not constant):
             parameters = self._constants if constant else self._parameters
-            found: tuple[Tensor, ...] = _Pass.apply(self, x, parameters, *given)  # type: ignore[no-untyped-call]
-            return found
+            outputs: tuple[Tensor, ...] = _Pass.apply(self, x, parameters, *given)  # type: ignore[no-untyped-call]
+            return outputs
         workspace = self.take()
-        found = workspace.forward(x, given)
+        outputs = workspace.forward(x, given)
         self.give_back(workspace)
-        return found
+        return outputs
 
     def take(self) -> _Workspace:
         """Arrays that no call uses."""
@@ -161,17 +161,17 @@ class _Pass(torch.autograd.Function):
         ctx.mlp = mlp
         ctx.kept = mlp.take()
         ctx.save_for_backward(parameters)  # so that torch raises if a step changes them before the backward pass
-        found: tuple[Tensor, ...] = ctx.kept.forward(x, given)
-        return found
+        outputs: tuple[Tensor, ...] = ctx.kept.forward(x, given)
+        return outputs
 
     @staticmethod
     def backward(ctx: Any, *by_results: Tensor) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
         workspace: _Workspace = taken_once(ctx)
         _, wants_x, wants_parameters, *given = ctx.needs_input_grad
-        found = workspace.backward(by_results, wants_x, wants_parameters)
+        gradients = workspace.backward(by_results, wants_x, wants_parameters)
         ctx.mlp.give_back(workspace)
-        return None, *found, *[None] * len(given)
+        return None, *gradients, *[None] * len(given)
 
 
 def taken_once(ctx: Any) -> Any:
@@ -224,8 +224,8 @@ class _Workspace:
             for call in chunk.forward:
                 call()
         outputs = [output[0] for output in plan.head_outputs]
-        found = self._top.forward(outputs, *(None if each is None else each.numpy() for each in given))
-        return tuple(map(torch.from_numpy, found))
+        results = self._top.forward(outputs, *(None if each is None else each.numpy() for each in given))
+        return tuple(map(torch.from_numpy, results))
 
     @np.errstate(all="ignore")
     def backward(
