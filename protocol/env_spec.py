@@ -118,8 +118,8 @@ class PickledCallable:
         """The callable. For a worker that allows `AllowedCode.CALLABLES`."""
         import cloudpickle
 
-        found: Callable[..., object] = cloudpickle.loads(self.data)
-        return found
+        factory: Callable[..., object] = cloudpickle.loads(self.data)
+        return factory
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PickledCallable) and other.data == self.data

@@ -88,10 +88,10 @@ _of_thread = threading.local()
 
 def activity() -> Activity:
     """The page of the worker that runs in this thread."""
-    found: Activity | None = getattr(_of_thread, "activity", None)
-    if found is None:
-        found = _of_thread.activity = Activity()
-    return found
+    activity_here: Activity | None = getattr(_of_thread, "activity", None)
+    if activity_here is None:
+        activity_here = _of_thread.activity = Activity()
+    return activity_here
 
 
 def share_activity(page: Activity) -> None:

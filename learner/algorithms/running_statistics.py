@@ -214,10 +214,10 @@ class RewardScaler:
             lane = int(batch.lane[at])
             start = self._returns.get(lane)
             start = np.zeros(batch.columns_per_rollout) if start is None else np.where(batch.fresh[columns], 0.0, start)
-            found, self._returns[lane] = discounted_return(
+            returns, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )
-            valid = found[ends.valid[:, columns]]
+            valid = returns[ends.valid[:, columns]]
             self._moments.update(valid)
             self._largest = max(self._largest, float(abs(valid).max(initial=0)))
 
@@ -226,11 +226,11 @@ class RewardScaler:
         return {
             "moments": self._moments.state_dict(),
             "largest": self._largest,
-            "returns": {lane: torch.tensor(found) for lane, found in self._returns.items()},
+            "returns": {lane: torch.tensor(returns) for lane, returns in self._returns.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state["moments"])
         self._largest = float(state.get("largest", 0))  # states of version 0.2.0 have none
-        self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}
+        self._returns = {int(lane): returns.numpy().copy() for lane, returns in state["returns"].items()}

@@ -83,7 +83,7 @@ class EnvAttributes:
 
 def _unpacked(packed: bytes) -> dict[str, Any]:
     """Raises `BadMessage` or `ValueError` for what was not packed here."""
-    found = unpack(packed) if packed else {}
-    if not isinstance(found, dict):
-        raise ValueError(f"attributes: expected a dict, got {type(found).__name__}")
-    return found
+    attributes = unpack(packed) if packed else {}
+    if not isinstance(attributes, dict):
+        raise ValueError(f"attributes: expected a dict, got {type(attributes).__name__}")
+    return attributes

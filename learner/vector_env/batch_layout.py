@@ -67,12 +67,12 @@ class BatchLayout:
         """Where each lane's rows are among those of `copies`, by lane. Raises `ValueError` unless all are whole lanes."""
         self.check(copies)
         at = {copy: position for position, copy in enumerate(copies)}
-        found = {lane: [at.get(copy, -1) for copy in self.copies(lane)] for lane in self.by_lane(sorted(copies))}
-        for lane, positions in found.items():
+        positions_of = {lane: [at.get(copy, -1) for copy in self.copies(lane)] for lane in self.by_lane(sorted(copies))}
+        for lane, positions in positions_of.items():
             if -1 in positions:
                 of_lane = self.copies(lane)
                 raise ValueError(
                     f"env_ids: expected all copies of lane {lane}, {of_lane[0]} to {of_lane[-1]}, got "
                     f"{[copy for copy in of_lane if copy in at]}; with lanes=num_envs every copy is a lane of its own"
                 )
-        return {lane: self.rows_of(positions) for lane, positions in found.items()}
+        return {lane: self.rows_of(positions) for lane, positions in positions_of.items()}

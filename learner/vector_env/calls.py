@@ -122,16 +122,16 @@ def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
     if answer.error:
         return [None] * count
     sent = unpack(answer.results.data)
-    found = dict[tuple[bytes, ...], DescribedEnv]()
+    described = dict[tuple[bytes, ...], DescribedEnv]()
     for frames in sent:
         if not isinstance(frames, list) or not all(type(frame) is bytes for frame in frames):
             raise BadMessage(f"expected the frames of a message, got {type(frames).__name__}")
-        if tuple(frames) not in found:
+        if tuple(frames) not in described:
             message = decode_to_learner(frames)
             if not isinstance(message, Described):
                 raise BadMessage(f"expected Described, got {type(message).__name__}")
-            found[tuple(frames)] = read_description(message.description)
-    return [found[tuple(frames)] for frames in sent]
+            described[tuple(frames)] = read_description(message.description)
+    return [described[tuple(frames)] for frames in sent]
 
 
 def _error(name: str, lane: int, answer: Returned) -> Exception:

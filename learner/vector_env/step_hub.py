@@ -120,14 +120,14 @@ class StepHub:
         went through shared memory. It is forgotten here. A lane is not in it if nothing has come yet, or the lane is lost.
         """
         newest = self._newest_tickets  # another answer is of an earlier order
-        found: dict[int, Answer | bytes] = {
+        answers: dict[int, Answer | bytes] = {
             lane: answer for lane, answer in self.coordinator.answers.items() if answer.ticket == newest.get(lane)
         }
         for lane, infos in () if self.shared is None else self.shared.done().items():
             if (packed := self._long_infos(lane) if infos is None else infos) is not None:
-                found[lane] = packed
-        self.forget(found)
-        return found
+                answers[lane] = packed
+        self.forget(answers)
+        return answers
 
     def _long_infos(self, lane: int) -> bytes | None:
         """The infos of a lane's step that are too long for the shared memory. None: they are still to come."""

@@ -53,13 +53,13 @@ def last_part(name: str) -> str:
 
 def attribute(module: object, qualname: str) -> object:
     """What a module, or an object, has under this dotted name; None if nothing."""
-    found = module
+    value = module
     for part in qualname.split("."):
         try:
-            found = getattr(found, part, None)
+            value = getattr(value, part, None)
         except Exception:  # of a module that imports its names when they are asked for, such as supersuit, or of a property
             return None
-    return found
+    return value
 
 
 def importable(module: str) -> bool:

@@ -50,10 +50,10 @@ def copies_kind(name: str) -> CopiesKind:
     """Import a kind. Raises `UsageError` if it is neither ours nor installed, or can't be imported."""
     what = f"vector {name}"
     module, _, qualname = _place(name).partition(":")
-    found = attribute(import_own(module, what), qualname)
-    if not isinstance(found, CopiesKind):
-        raise UsageError(f"{what}: expected {module}:{qualname} to be a CopiesKind, got {type(found).__name__}")
-    return found
+    kind = attribute(import_own(module, what), qualname)
+    if not isinstance(kind, CopiesKind):
+        raise UsageError(f"{what}: expected {module}:{qualname} to be a CopiesKind, got {type(kind).__name__}")
+    return kind
 
 
 def has_masks(name: str) -> bool:

@@ -81,8 +81,8 @@ def registered_by_plugins(env_id: str) -> bool:
 
 def _plugins() -> Iterator[Plugin]:
     """The plugins. The namespace is the name of the entry point, or stands in the name of its group."""
-    found = metadata.entry_points()
-    for entry_point in (one for group in found.groups for one in found.select(group=group)):
+    entry_points = metadata.entry_points()
+    for entry_point in (one for group in entry_points.groups for one in entry_points.select(group=group)):
         if (entry_point.group == GROUP or entry_point.group.startswith(f"{GROUP}.")) and _is_whole(entry_point):
             namespace = entry_point.name if entry_point.group == GROUP else entry_point.group[len(GROUP) + 1 :]
             yield Plugin(entry_point, "" if namespace == "__root__" else namespace)

@@ -95,14 +95,14 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
         return None
     if not isinstance(wrapper, str):
         return wrapper
-    found = in_main(name)
-    if not callable(found):
+    named = in_main(name)
+    if not callable(named):
         last = "my_wrapper" if "lambda" in name else last_part(name)
         raise UsageError(
             f"wrapper {name} was made in a script, a notebook or a function, and cannot be found here; pass it again: "
             f"wrappers=[{last}] there, or --wrappers my_module:{last} from a module"
         )
-    return found
+    return named
 
 
 def wrap(env: Any, wrapper: WrapperLike) -> Any:
@@ -139,5 +139,5 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
 def _found(text: str) -> Wrapper:
     """The wrapper of this name, imported, with its arguments. Raises `UsageError`."""
     read = read_wrapper(text)
-    found = own_callable(f"{read.module}:{read.qualname}", f"wrapper {text}", "gymnasium.wrappers:FlattenObservation")
-    return lambda env: found(env, *read.args, **read.kwargs)
+    wrapper = own_callable(f"{read.module}:{read.qualname}", f"wrapper {text}", "gymnasium.wrappers:FlattenObservation")
+    return lambda env: wrapper(env, *read.args, **read.kwargs)

@@ -166,9 +166,9 @@ class AuthenticatorThread(threading.Thread):
                 event, value = struct.unpack("=HI", self._events.recv_multipart(zmq.NOBLOCK)[0])
             except zmq.Again:
                 return
-            found = self._pending.handle_event(event, value)
-            if found is not None:
-                self._refuse(*found)
+            failure = self._pending.handle_event(event, value)
+            if failure is not None:
+                self._refuse(*failure)
 
     def _refuse(self, host: str, why: str) -> None:
         self.refused += 1

@@ -152,13 +152,13 @@ def total_size(fields: Sequence[Field]) -> int:
 
 def named_views(flat: FlatT, fields: Sequence[Field]) -> dict[str, FlatT]:
     """A view of each field of a flat array or tensor, by name."""
-    found = dict[str, FlatT]()
+    views = dict[str, FlatT]()
     at = 0
     for field in fields:
         count = math.prod(field.shape)
-        found[field.name] = flat[at : at + count].reshape(field.shape)
+        views[field.name] = flat[at : at + count].reshape(field.shape)
         at += count
-    return found
+    return views
 
 
 def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
@@ -184,8 +184,8 @@ EXPLORATION = ("epsilon", "noise_scale", "warm_up")
 
 def appended_params(spec: PolicySpec, buffers: Mapping[str, Array]) -> Array | None:
     """The numbers [K] that stand behind a network's output in the distribution params; None if there are none."""
-    found = [buffers[field.name] for field in buffer_layout(spec) if field.name in EXPLORATION]
-    return np.concatenate(found) if found else None
+    appended = [buffers[field.name] for field in buffer_layout(spec) if field.name in EXPLORATION]
+    return np.concatenate(appended) if appended else None
 
 
 def buffer_size(spec: PolicySpec) -> int:

@@ -123,10 +123,10 @@ class WorkerLink:
                 else:
                     self._report(connection_problem(event, value, self.address, self.token))
 
-    def _report(self, found: ConnectionProblem) -> None:
-        self.problem = found
-        if not found.final and (kept_back := self._log_limiter.due(found.line, time.monotonic())) is not None:
-            log.warning("%s%s", found.line, suppressed_note(kept_back))
+    def _report(self, problem: ConnectionProblem) -> None:
+        self.problem = problem
+        if not problem.final and (kept_back := self._log_limiter.due(problem.line, time.monotonic())) is not None:
+            log.warning("%s%s", problem.line, suppressed_note(kept_back))
 
     def receive(self) -> Iterator[ToWorker | BadMessage]:
         """All messages that have arrived. An unreadable message comes as its error."""

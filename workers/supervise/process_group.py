@@ -15,14 +15,14 @@ from pathlib import Path
 
 def live_members(leader: int) -> list[int]:
     """The processes of a leader's group and session that are not gone, itself included. Without /proc, none is found."""
-    found = []
+    pids = []
     with suppress(FileNotFoundError):
         for name in filter(str.isdecimal, os.listdir("/proc")):
             fields = process_stat(int(name))
             # With the state Z, its first thread has ended; others may hold its files yet.
             if str(leader) in fields[2:4] and (fields[0] not in "ZX" or int(fields[17]) > 1):
-                found.append(int(name))
-    return found
+                pids.append(int(name))
+    return pids
 
 
 def kill(pids: Iterable[int]) -> None:

@@ -121,8 +121,8 @@ class _MultiCategoricalKernel:
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         choices = np.split(action, action.shape[1], -1)
         logits = np.split(params, self._ends)
-        found = [part.forward(*each) for part, *each in zip(self._parts, logits, choices, strict=True)]
-        log_probs, entropies = zip(*found, strict=True)
+        of_parts = [part.forward(*each) for part, *each in zip(self._parts, logits, choices, strict=True)]
+        log_probs, entropies = zip(*of_parts, strict=True)
         return np.sum(log_probs, 0), np.sum(entropies, 0)
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
@@ -141,8 +141,8 @@ class _BernoulliKernel:
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
         spread = self._logits * self._on * (1 - self._on)
-        found: Array = by_log_prob * (self._bits - self._on) - by_entropy * spread
-        return found
+        by_logits: Array = by_log_prob * (self._bits - self._on) - by_entropy * spread
+        return by_logits
 
 
 class _GaussianKernel:
@@ -164,8 +164,8 @@ class _GaussianKernel:
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
         np.matmul(self._squared - 1, by_log_prob, out=self._by_log_std)
         self._by_log_std += by_entropy.sum()
-        found: Array = self._z * self._inverse * by_log_prob
-        return found
+        by_mean: Array = self._z * self._inverse * by_log_prob
+        return by_mean
 
 
 def distribution_kernel(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> DistributionKernel:

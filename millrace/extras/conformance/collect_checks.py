@@ -121,8 +121,8 @@ class Collecting:
     def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
         """The rollout of a permit that was dealt, or has come. If none comes, this rule or the likely one is broken."""
         rule = rule or self.learner.watch.rule_of_missing(permit.ticket, Rule.TICKETS)
-        if isinstance(found := self.learner.watch.answers.get(permit.ticket), Rollout):
-            return found
+        if isinstance(answer := self.learner.watch.answers.get(permit.ticket), Rollout):
+            return answer
         text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
         within_s = 2 * self.learner.settings.patience_s
         return (yield from self.learner.expect(Rollout, rule, text, within_s=within_s, ticket=permit.ticket))
@@ -136,8 +136,8 @@ class Collecting:
     def nothing_of(self, permit: Permit, rule: Rule, whose: str) -> Script[None]:
         """No rollout of this permit has arrived in this session, and none arrives."""
         expected = f"no rollout of ticket {permit.ticket}, {whose}"
-        if (found := self.learner.watch.answers.get(permit.ticket)) is not None:
-            raise Broken(rule, expected, brief(found))
+        if (answer := self.learner.watch.answers.get(permit.ticket)) is not None:
+            raise Broken(rule, expected, brief(answer))
         yield from self.learner.quiet(Rollout, rule, expected)
 
 
@@ -531,8 +531,8 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     session.give(session.weights(2))
     yield from session.rollout(kept)
     yield from session.nothing_of(lost, Rule.RELEASE, "whose lane was released")
-    found = yield from heartbeats(learner, 1)
-    if lost.ticket in found.tickets:
+    heartbeat = yield from heartbeats(learner, 1)
+    if lost.ticket in heartbeat.tickets:
         raise Broken(Rule.RELEASE, "no tickets of the released lane in a Heartbeat", f"ticket {lost.ticket}")
     yield from session.collect(session.permit(0, incarnation=1), version=2)
 
@@ -669,11 +669,11 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
     whole = answer.episodes[0].length
     for most in (whole - 1, whole):
         again = _evaluation(learner, version=2, send_rows=True, most_steps=max(1, most), seeds=order.seeds[:1])
-        found = yield from _evaluate(session, again)
+        rows = yield from _evaluate(session, again)
         is_cut = most < whole or answer.cut[0]
-        if (found.episodes[0].length, found.cut[0]) != (again.most_steps, is_cut):
+        if (rows.episodes[0].length, rows.cut[0]) != (again.most_steps, is_cut):
             expected = f"{again.most_steps} steps and cut {is_cut}: with more steps the same episode has {whole}"
-            raise Broken(Rule.CUT, expected, f"{found.episodes[0].length} steps and cut {found.cut[0]}")
+            raise Broken(Rule.CUT, expected, f"{rows.episodes[0].length} steps and cut {rows.cut[0]}")
 
 
 def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
@@ -695,8 +695,8 @@ def ends_evaluations(learner: Learner) -> Script[None]:
     order = _evaluation(learner, version=2)
     learner.send(over)
     yield from _evaluate(session, order)
-    found = yield from heartbeats(learner, 1)
-    if over.ticket in found.tickets:
+    heartbeat = yield from heartbeats(learner, 1)
+    if over.ticket in heartbeat.tickets:
         got = f"ticket {over.ticket}"
         raise Broken(Rule.EVALUATE_ENDS, "no ticket of version 3 in a Heartbeat, after an Evaluate of version 2", got)
     session.give(session.weights(3))
@@ -804,8 +804,8 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
     learner.may_leave = True  # so that a Hello is this check's
     before = learner.hello
     assert before is not None
-    found = yield Wait(within_s, lambda event: isinstance(event, Ended) or isinstance(event.message, Goodbye | Hello))
-    match found:
+    last_event = yield Wait(within_s, lambda event: isinstance(event, Ended) or isinstance(event.message, Goodbye | Hello))
+    match last_event:
         case Ended(code) if code in codes:
             return
         case Ended(code):
@@ -815,5 +815,5 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
         case Heard(_, Goodbye()):
             yield from learner.left(Rule.DRAINING_LEAVES, after, codes)
         case _:
-            got = "Hello" if found is not None else f"a client that still runs {within_s:g} s later"
+            got = "Hello" if last_event is not None else f"a client that still runs {within_s:g} s later"
             raise Broken(Rule.DRAINING_LEAVES, f"the client's end after {after}", got)

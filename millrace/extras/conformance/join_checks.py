@@ -64,11 +64,11 @@ def describes_on_order(learner: Learner) -> Script[Describe]:
     order = describe(learner)
     learner.send(order)
     text = f"Described of the environment {order.env.id}, with ticket {order.ticket} of the order"
-    found = yield from learner.expect((Described, Goodbye), Rule.DESCRIBE, text, within_s=learner.settings.start_s)
-    if not isinstance(found, Described):
-        raise Broken(Rule.DECLINED, text, brief(found))
+    answer = yield from learner.expect((Described, Goodbye), Rule.DESCRIBE, text, within_s=learner.settings.start_s)
+    if not isinstance(answer, Described):
+        raise Broken(Rule.DECLINED, text, brief(answer))
     try:
-        learner.env = read_description(found.description)
+        learner.env = read_description(answer.description)
     except (BadMessage, UsageError) as error:
         raise Broken(Rule.DESCRIBE, "a description of spaces that gymnasium has", str(error)) from None
     return order
@@ -109,13 +109,13 @@ def says_hello(learner: Learner) -> Script[None]:
     """The first message."""
     hello = yield from learner.newly_started()
     token = learner.settings.token
-    found = (
+    peer = (
         learner.peer.rpartition(b"\0")[0] if token else learner.peer
     )  # behind a routing id, the learner's socket puts the key
-    if found.partition(b"\0")[0] != hello.worker.encode():
-        raise Broken(Rule.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{found!r}")
-    if found != (expected := routing_id(hello.worker, token)):
-        raise Broken(Rule.ROUTING_ID, f"the routing id {expected!r}", f"{found!r}")
+    if peer.partition(b"\0")[0] != hello.worker.encode():
+        raise Broken(Rule.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{peer!r}")
+    if peer != (expected := routing_id(hello.worker, token)):
+        raise Broken(Rule.ROUTING_ID, f"the routing id {expected!r}", f"{peer!r}")
     if hello.attempt != hello.process_nonce + 1:
         raise Broken(Rule.HELLO, f"attempt {hello.process_nonce + 1} (process_nonce + 1)", f"attempt {hello.attempt}")
 
@@ -152,9 +152,9 @@ def accepts_only_its_welcome(learner: Learner) -> Script[None]:
     learner.send(Welcome(77, hello.attempt - 1, wait_spec(learner)))
     learner.send(Welcome(78, hello.attempt + 1, wait_spec(learner)))
     text = f"Hello until a Welcome for attempt {hello.attempt} comes"
-    found = yield from learner.expect((Hello, Heartbeat), Rule.WELCOME_ATTEMPT, text, within_s=6.0)
-    if not isinstance(found, Hello):
-        raise Broken(Rule.WELCOME_ATTEMPT, text, brief(found))
+    answer = yield from learner.expect((Hello, Heartbeat), Rule.WELCOME_ATTEMPT, text, within_s=6.0)
+    if not isinstance(answer, Hello):
+        raise Broken(Rule.WELCOME_ATTEMPT, text, brief(answer))
 
 
 def describes(learner: Learner) -> Script[None]:
@@ -194,10 +194,10 @@ def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
 
 def _replies(learner: Learner, number: int) -> Script[None]:
     for _ in range(4):  # one may have been on its way
-        found = yield from heartbeats(learner, 1)
-        if found.replies >= number:
+        heartbeat = yield from heartbeats(learner, 1)
+        if heartbeat.replies >= number:
             return
-    raise Broken(Rule.HEARTBEAT_REPLIES, f"replies {number} after HeartbeatReply {number}", f"{found.replies}")
+    raise Broken(Rule.HEARTBEAT_REPLIES, f"replies {number} after HeartbeatReply {number}", f"{heartbeat.replies}")
 
 
 def in_any_session(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> Script[None]:
@@ -238,8 +238,8 @@ def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
     for message in (waited, learner.watch.welcome):  # late copies
         learner.send(message)
     for _ in range(2):
-        found = yield from heartbeats(learner, 1, Rule.BEGINS)
-        if not found.replies:
+        heartbeat = yield from heartbeats(learner, 1, Rule.BEGINS)
+        if not heartbeat.replies:
             raise Broken(Rule.BEGINS, "a session that goes on (replies above 0)", "one that began again")
     yield from _begun(learner)
 
@@ -247,8 +247,8 @@ def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
 def _begun(learner: Learner) -> Script[None]:
     """Heartbeats say that the client waits no more."""
     for _ in range(4):  # one may have been on its way
-        found = yield from heartbeats(learner, 1, Rule.BEGINS)
-        if not found.waits:
+        heartbeat = yield from heartbeats(learner, 1, Rule.BEGINS)
+        if not heartbeat.waits:
             return
     raise Broken(Rule.BEGINS, "waits false in a Heartbeat after the second Welcome", "true")
 
@@ -259,8 +259,8 @@ def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
     yield from _replies(learner, 1)
     learner.send(learner.watch.welcome)
     for _ in range(2):
-        found = yield from heartbeats(learner, 1, Rule.REPEATED_WELCOME)
-        if not found.replies:
+        heartbeat = yield from heartbeats(learner, 1, Rule.REPEATED_WELCOME)
+        if not heartbeat.replies:
             raise Broken(Rule.REPEATED_WELCOME, "a session that goes on (replies above 0)", "one that began again")
 
 

@@ -241,35 +241,35 @@ class Learner:
             return isinstance(message, kinds) and all(getattr(message, name) == value for name, value in fields.items())
 
         within_s = within_s or self.settings.patience_s
-        found = yield Wait(within_s, is_it)
-        if not isinstance(found, Heard):
-            raise Broken(rule, expected, f"none within {within_s:g} s" if found is None else f"{found}, without Goodbye")
-        message: M = found.message  # type: ignore[assignment]
+        heard = yield Wait(within_s, is_it)
+        if not isinstance(heard, Heard):
+            raise Broken(rule, expected, f"none within {within_s:g} s" if heard is None else f"{heard}, without Goodbye")
+        message: M = heard.message  # type: ignore[assignment]
         return message
 
     def takes_part(self, kind: type[M], rule: Rule, expected: str, *, within_s: float = 0.0) -> Script[M]:
         """The next message of this kind. A client may decline instead: that skips the check."""
-        found = yield from self.expect((kind, Goodbye), rule, expected, within_s=within_s)
-        if isinstance(found, Goodbye):
+        message = yield from self.expect((kind, Goodbye), rule, expected, within_s=within_s)
+        if isinstance(message, Goodbye):
             yield from self.left(Rule.DECLINED, "Goodbye", (2,))
-            raise Skipped(f"it declines: {found.reason}")
-        assert isinstance(found, kind)
-        return found
+            raise Skipped(f"it declines: {message.reason}")
+        assert isinstance(message, kind)
+        return message
 
     def quiet(self, kind: type, rule: Rule, expected: str, *, for_s: float = QUIET_S) -> Script[None]:
         """Nothing of this kind arrives for so long. Or `Broken`."""
-        found = yield Wait(for_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kind))
-        if isinstance(found, Heard):
-            raise Broken(rule, expected, brief(found.message))
+        heard = yield Wait(for_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kind))
+        if isinstance(heard, Heard):
+            raise Broken(rule, expected, brief(heard.message))
 
     def left(self, rule: Rule, after: str, codes: tuple[int, ...] = (0,)) -> Script[None]:
         """The client's process ends with one of these exit codes. Or `Broken`."""
         within_s = self.settings.patience_s
-        found = yield Wait(within_s, lambda event: isinstance(event, Ended))
-        if not isinstance(found, Ended):
+        ended = yield Wait(within_s, lambda event: isinstance(event, Ended))
+        if not isinstance(ended, Ended):
             raise Broken(rule, f"the client's end after {after}", f"a client that still runs {within_s:g} s later")
-        if found.code not in codes:
-            raise Broken(rule, f"exit code {' or '.join(map(str, codes))} after {after}", f"exit code {found.code}")
+        if ended.code not in codes:
+            raise Broken(rule, f"exit code {' or '.join(map(str, codes))} after {after}", f"exit code {ended.code}")
 
     def joining(self) -> Script[Hello]:
         """A client that has said Hello and is not welcomed. It is started, or told to join again."""

@@ -103,8 +103,8 @@ class PlayedRows:
         action = rows.action[:, None]
         mode = policy.mode(params)
         best = policy.log_prob(params, mode)[:, 0]
-        found = policy.log_prob(params, action)[:, 0]
-        return best, best - found, np.isclose(action, mode).reshape(len(action), -1).min(-1)
+        log_prob = policy.log_prob(params, action)[:, 0]
+        return best, best - log_prob, np.isclose(action, mode).reshape(len(action), -1).min(-1)
 
     def first_observation(self, n: int) -> bytes:
         """The bits of the first observation of an episode whose rows have come."""

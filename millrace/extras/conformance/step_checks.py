@@ -233,12 +233,12 @@ def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
             raise Broken(rule, expected, "another observation" if leaves else f"{sorted(info)}")
         return
     learner.send(steps.step(actions=actions[-1]))
-    found = yield from learner.expect((Stepped, Failure), rule, "Stepped for a Step after the end of an episode")
-    if isinstance(found, Failure):
+    answer = yield from learner.expect((Stepped, Failure), rule, "Stepped for a Step after the end of an episode")
+    if isinstance(answer, Failure):
         yield from learner.left(Rule.STAYS, "Failure", (1,))
         raise Skipped("its environment cannot be stepped after an end")
-    assert isinstance(found, Stepped)
-    if _of_copy(found, n) == _of_copy(first, n) != _of_copy(last, n):
+    assert isinstance(answer, Stepped)
+    if _of_copy(answer, n) == _of_copy(first, n) != _of_copy(last, n):
         raise Broken(rule, f"copy {n}, whose episode has ended, to be stepped", "the first observation of another episode")
 
 
@@ -373,8 +373,8 @@ def executes_an_order_once(learner: Learner) -> Script[None]:
     yield from _again(learner, order)
     for each, expected in zip(actions, plain, strict=True):
         again = steps.step(actions=each)
-        found = yield from steps.do(again)
-        if not _same(found, expected):
+        stepped = yield from steps.do(again)
+        if not _same(stepped, expected):
             raise Broken(
                 Rule.ORDER_ONCE,
                 "the same observations, for the same seed and actions, as without repeated orders",
@@ -467,10 +467,12 @@ def answers_calls(learner: Learner) -> Script[None]:
         given = np.frombuffer(pack(((), {})), np.uint8)
         call = Call(learner.session, next(learner.tickets), 0, 0, (0,), name, False, given)
         learner.send(call)
-        found = yield from learner.expect(Returned, Rule.RETURNED, f"Returned for ticket {call.ticket}", ticket=call.ticket)
-        if found.error:
+        returned = yield from learner.expect(
+            Returned, Rule.RETURNED, f"Returned for ticket {call.ticket}", ticket=call.ticket
+        )
+        if returned.error:
             continue
-        results = unpack(found.results.tobytes())
+        results = unpack(returned.results.tobytes())
         if name != "render_mode" or not isinstance(results, list) or len(results) != 1:
             raise Broken(Rule.RETURNED, "one result for the one copy, or an error", f"{results!r}"[:100])
     yield from steps.do(steps.step())
@@ -487,9 +489,9 @@ def beats_while_it_steps(learner: Learner) -> Script[None]:
 def lists_its_tickets(learner: Learner) -> Script[None]:
     """Heartbeats after answers: nothing is held any more."""
     yield from stepping(learner, 0)
-    found = yield from heartbeats(learner, 3)
-    if found.tickets:
-        raise Broken(Rule.HEARTBEAT_TICKETS, "no tickets while no order is open", f"{list(found.tickets)}")
+    heartbeat = yield from heartbeats(learner, 3)
+    if heartbeat.tickets:
+        raise Broken(Rule.HEARTBEAT_TICKETS, "no tickets while no order is open", f"{list(heartbeat.tickets)}")
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
@@ -502,9 +504,9 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     learner.answers_heartbeats = True
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     yield Wait(0.3)
-    found = yield from heartbeats(learner, 3)
-    if found.tickets:
-        raise Broken(Rule.RELEASE, "no tickets of the released lane", f"{list(found.tickets)}")
+    heartbeat = yield from heartbeats(learner, 3)
+    if heartbeat.tickets:
+        raise Broken(Rule.RELEASE, "no tickets of the released lane", f"{list(heartbeat.tickets)}")
     yield from steps.do(steps.step(1))
     yield from steps.do(steps.reset(0, incarnation=1))
     yield from steps.do(steps.step(0, incarnation=1))
@@ -525,8 +527,8 @@ def _has_no_copies(steps: Stepping, rule: Rule) -> Script[None]:
     order = steps.reset(copies=(0,))
     steps.learner.send(order)
     yield Wait(0.5, lambda event: isinstance(event, Heard) and getattr(event.message, "ticket", 0) == order.ticket)
-    found = steps.learner.watch.answers.get(order.ticket)
-    if isinstance(found, Stepped) and any(leaf[1:].any() for leaf in found.obs):
+    answer = steps.learner.watch.answers.get(order.ticket)
+    if isinstance(answer, Stepped) and any(leaf[1:].any() for leaf in answer.obs):
         expected = "new copies in a lane that was closed: zeros in the rows of those without an episode"
         raise Broken(rule, expected, "observations of the copies before")
 
@@ -582,8 +584,8 @@ def takes_a_late_welcome(learner: Learner) -> Script[None]:
     yield from steps.do(steps.reset(seed=9))
     yield from steps.do(steps.step(actions=expected[0]))
     learner.send(learner.watch.welcome)
-    found = yield from steps.do(steps.step(actions=expected[1]))
-    if not _same(found, rows[1]):
+    stepped = yield from steps.do(steps.step(actions=expected[1]))
+    if not _same(stepped, rows[1]):
         raise Broken(Rule.REPEATED_WELCOME, "the episode to go on after a repeated Welcome", "another observation")
 
 

@@ -45,28 +45,30 @@ class SelfContainedHDF5:
         """The group of this name inside another."""
         import h5py
 
-        if not isinstance(found := self._member(parent, name), h5py.Group):
-            raise UnfitFile(f"{found.name}: expected a group, got {type(found).__name__}")
-        return found
+        if not isinstance(member := self._member(parent, name), h5py.Group):
+            raise UnfitFile(f"{member.name}: expected a group, got {type(member).__name__}")
+        return member
 
     def array(self, parent: Any, name: str) -> Any:
         """The array of this name inside a group, not read yet: h5py's `Dataset`."""
         import h5py
 
-        found = self._member(parent, name)
-        if not isinstance(found, h5py.Dataset) or found.shape is None:
-            raise UnfitFile(f"{found.name}: expected an array, got {type(found).__name__}")
-        if found.is_virtual or found.external:
-            raise UnfitFile(f"{found.name}: expected its data in this file, got an array that names other files")
-        creation = found.id.get_create_plist()
+        dataset = self._member(parent, name)
+        if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+            raise UnfitFile(f"{dataset.name}: expected an array, got {type(dataset).__name__}")
+        if dataset.is_virtual or dataset.external:
+            raise UnfitFile(f"{dataset.name}: expected its data in this file, got an array that names other files")
+        creation = dataset.id.get_create_plist()
         if unknown := {creation.get_filter(each)[0] for each in range(creation.get_nfilters())} - FILTERS:
-            raise UnfitFile(f"{found.name}: expected no compression, gzip or lzf, got filter {min(unknown)}")
-        elements = max(found.size, math.prod(found.chunks or ()))  # HDF5 decompresses whole chunks
-        if (most := elements * found.dtype.itemsize) > self.most_bytes:
-            raise UnfitFile(f"{found.name}: expected at most {self.most_bytes:,} bytes in a file of this size, got {most:,}")
-        if not _is_whole(found):
-            raise UnfitFile(f"{found.name}: expected all of its data in this file, got a part of them")
-        return found
+            raise UnfitFile(f"{dataset.name}: expected no compression, gzip or lzf, got filter {min(unknown)}")
+        elements = max(dataset.size, math.prod(dataset.chunks or ()))  # HDF5 decompresses whole chunks
+        if (most := elements * dataset.dtype.itemsize) > self.most_bytes:
+            raise UnfitFile(
+                f"{dataset.name}: expected at most {self.most_bytes:,} bytes in a file of this size, got {most:,}"
+            )
+        if not _is_whole(dataset):
+            raise UnfitFile(f"{dataset.name}: expected all of its data in this file, got a part of them")
+        return dataset
 
     def _member(self, parent: Any, name: str) -> Any:
         import h5py

@@ -104,7 +104,7 @@ def key_of(run: Path) -> str:
 def newest_logs(run: Path) -> list[tuple[str, str]]:
     """Name and last lines of the logs of local workers that were written last."""
     logs = regular_files(run, "workers/*.log")
-    found = []
+    ends_of_logs = []
     for path in sorted(logs, key=_written, reverse=True)[:MOST_LOGS]:
         try:
             with os.fdopen(open_regular(path), "rb") as file:
@@ -114,8 +114,8 @@ def newest_logs(run: Path) -> list[tuple[str, str]]:
             continue
         *_, lines = content.partition(b"\n") if len(content) == LOG_BYTES else (content,)
         if lines.strip():
-            found.append((path.name, escaped(lines.decode(errors="replace")).rstrip()))
-    return found
+            ends_of_logs.append((path.name, escaped(lines.decode(errors="replace")).rstrip()))
+    return ends_of_logs
 
 
 def _written(path: Path) -> int:
@@ -127,11 +127,11 @@ def _written(path: Path) -> int:
 
 def _changes(run: Path) -> tuple[object, ...]:
     """What is different whenever one of its files was written."""
-    found: list[object] = []
+    stamps: list[object] = []
     for name in CHANGES:
         try:
             stat = (run / name).lstat()
-            found.append((stat.st_ino, stat.st_size, stat.st_mtime_ns))
+            stamps.append((stat.st_ino, stat.st_size, stat.st_mtime_ns))
         except OSError:
-            found.append(None)
-    return tuple(found)
+            stamps.append(None)
+    return tuple(stamps)

@@ -252,7 +252,7 @@ def who_waits(seen: Seen) -> str:
 def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
     """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
     end_s = samples[-1].at_s + 1.0
-    found = list[Segment]()
+    segments = list[Segment]()
     span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)
     for i, (at_s, kind) in enumerate(zip((each.at_s for each in samples), kinds, strict=True)):
         until_s = min(samples[i + 1].at_s if i + 1 < len(samples) else end_s, at_s + 2.0)
@@ -260,11 +260,15 @@ def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segme
         share = (until_s - at_s) / span_s
         if kind not in COLORS:
             continue
-        if found and found[-1].tooltip == kind and math.isclose(found[-1].begin + found[-1].share, begin, abs_tol=1e-6):
-            found[-1] = found[-1]._replace(share=found[-1].share + share)
+        if (
+            segments
+            and segments[-1].tooltip == kind
+            and math.isclose(segments[-1].begin + segments[-1].share, begin, abs_tol=1e-6)
+        ):
+            segments[-1] = segments[-1]._replace(share=segments[-1].share + share)
         else:
-            found.append(Segment(begin, share, COLORS[kind], kind))
-    return found
+            segments.append(Segment(begin, share, COLORS[kind], kind))
+    return segments
 
 
 def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> str:

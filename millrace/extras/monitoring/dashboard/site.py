@@ -110,12 +110,12 @@ class Site:
         return "\n".join(filter(None, parts))
 
     def _compare(self, keys: Sequence[str], home: str) -> str:
-        found = self._runs.find()
+        known = self._runs.find()
         problems = list[str]()
         contents = []
         for key in list(dict.fromkeys(keys))[:MOST_COMPARED]:
             try:
-                contents += [self._runs.content(found[key])] if key in found else []
+                contents += [self._runs.content(known[key])] if key in known else []
             except UsageError as error:
                 problems.append(f'<p class="bad">{escape(str(error))}</p>')
         back = f'<p class="kicker"><a href="{home}">millrace: all runs</a></p>'
@@ -152,10 +152,10 @@ def _stored(path: Path) -> StoredBody:
             return os.pread(file.fileno(), end - begin, begin)
 
     with os.fdopen(open_regular(path), "rb") as file:
-        found = os.fstat(file.fileno())
-    if found.st_size > MOST_FILM_BYTES:
+        status = os.fstat(file.fileno())
+    if status.st_size > MOST_FILM_BYTES:
         raise OSError(errno.EFBIG, "too large for a page", str(path))
-    return StoredBody(f"{found.st_ino}-{found.st_size}-{found.st_mtime_ns}", found.st_size, read)
+    return StoredBody(f"{status.st_ino}-{status.st_size}-{status.st_mtime_ns}", status.st_size, read)
 
 
 def comparison(report: ReportData) -> list[str]:

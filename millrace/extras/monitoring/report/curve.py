@@ -45,8 +45,8 @@ class RunRecord(NamedTuple):
 
     def curve(self) -> Curve | None:
         """The learning curve, or None before the first episode has ended."""
-        found = points(self.rows, RETURN_KEY)
-        return Curve(self.seed, *found.T) if len(found) else None
+        curve_points = points(self.rows, RETURN_KEY)
+        return Curve(self.seed, *curve_points.T) if len(curve_points) else None
 
 
 def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:
@@ -60,8 +60,8 @@ def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = Fal
             return row.get(SECONDS_KEY)
         return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY]) if key.startswith("eval/") else row[ENV_STEPS_KEY]
 
-    found = [(at(row), row[key]) for row in rows if row.get(key) is not None]
-    return np.asarray([point for point in found if point[0] is not None], np.float64).reshape(-1, 2).clip(*DRAWN)
+    drawn = [(at(row), row[key]) for row in rows if row.get(key) is not None]
+    return np.asarray([point for point in drawn if point[0] is not None], np.float64).reshape(-1, 2).clip(*DRAWN)
 
 
 def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRecord:

@@ -47,13 +47,13 @@ class MetricsTail:
     def read(self) -> bool:
         """Read on. Returns whether there is anything new. Raises OSError."""
         with os.fdopen(open_regular(self._path), "rb") as file:
-            found = os.fstat(file.fileno())
-            seen = found.st_ino, found.st_size, found.st_mtime_ns
+            status = os.fstat(file.fileno())
+            seen = status.st_ino, status.st_size, status.st_mtime_ns
             if seen == self._seen:
                 return False
-            if found.st_size > MOST_BYTES:
-                raise OSError(errno.EFBIG, f"expected at most {MOST_BYTES:,} bytes, got {found.st_size:,}", str(self._path))
-            if self._seen[:1] != seen[:1] or found.st_size < self._offset:
+            if status.st_size > MOST_BYTES:
+                raise OSError(errno.EFBIG, f"expected at most {MOST_BYTES:,} bytes, got {status.st_size:,}", str(self._path))
+            if self._seen[:1] != seen[:1] or status.st_size < self._offset:
                 self._begin_anew()
             file.seek(self._offset)
             self._newest = None

@@ -32,15 +32,15 @@ class Panel(NamedTuple):
 
 def panels(report: ReportData) -> list[Panel]:
     """The panels, one for each environment."""
-    found = []
+    drawn = []
     for env in report.envs:
         groups = [group for group in report.groups if group.env == env]
         series = [series for group in groups for series in _series(group)]
         legend = [(key(group.color), group.legend()) for group in groups]
         if any(each.kind == "dots" for each in series):
             legend.append((DOT_KEY, "greedy evaluations"))
-        found.append(Panel(env, series, legend))
-    return found
+        drawn.append(Panel(env, series, legend))
+    return drawn
 
 
 def how_it_is_drawn(report: ReportData) -> str:

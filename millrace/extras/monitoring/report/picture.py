@@ -85,23 +85,23 @@ def draw(runs: Sequence[Path]) -> Drawing:
 
     Raises `UsageError` for a folder that cannot be read, and if there is nothing to draw.
     """
-    found = [read_run(run) for run in dict.fromkeys(runs)]
-    empty = [f"run {run.path}: nothing to plot, no episode has ended" for run in found if run.curve is None]
-    if len(empty) == len(found):
+    reported = [read_run(run) for run in dict.fromkeys(runs)]
+    empty = [f"run {run.path}: nothing to plot, no episode has ended" for run in reported if run.curve is None]
+    if len(empty) == len(reported):
         raise UsageError(empty[0])
     for line in empty:
         log.warning("%s; it is left out", line)
-    return Drawing(_svg(group_runs([run for run in found if run.curve is not None])))
+    return Drawing(_svg(group_runs([run for run in reported if run.curve is not None])))
 
 
 def _svg(report: ReportData) -> str:
-    found = panels(report)
-    columns = math.ceil(math.sqrt(len(found)))
+    drawn = panels(report)
+    columns = math.ceil(math.sqrt(len(drawn)))
     width = MARGIN + columns * (WIDTH + MARGIN)
     bottom = MARGIN
     parts = list[str]()
-    for begin in range(0, len(found), columns):
-        row = [_panel(panel) for panel in found[begin : begin + columns]]
+    for begin in range(0, len(drawn), columns):
+        row = [_panel(panel) for panel in drawn[begin : begin + columns]]
         parts += [_at(MARGIN + i * (WIDTH + MARGIN), bottom, inner) for i, (inner, _) in enumerate(row)]
         bottom += max(height for _, height in row) + MARGIN
     for line in wrap(how_it_is_drawn(report), columns * LETTERS):
