@@ -49,6 +49,15 @@ class SeatColumns(NamedTuple):
     over: Bools
     """[N] whether the copy's episode is over: its next step only resets it"""
 
+    def first(self, copies: int, columns: int) -> SeatColumns:
+        """Those of the first copies."""
+        return SeatColumns(
+            complete=self.complete[:columns],
+            acts=self.acts[:columns],
+            outside=self.outside[:columns],
+            over=self.over[:copies],
+        )
+
 
 class StepResult(NamedTuple):
     """Result of one step of N copies; `workers/copies/row_writers.py` writes each part into an array [N, …]."""
@@ -64,6 +73,17 @@ class StepResult(NamedTuple):
     """of the episodes that ended in this step, if the run asks for facts"""
     columns: SeatColumns | None = None
     """of copies with seats; the arrays above have N · A entries then"""
+
+    def first(self, copies: int, columns: int) -> StepResult:
+        """The result of the first copies alone, which have the first columns."""
+        return self._replace(
+            leaves=[leaf[:columns] for leaf in self.leaves],
+            reward=self.reward[:columns],
+            terminated=self.terminated[:columns],
+            truncated=self.truncated[:columns],
+            lost=None if self.lost is None else self.lost[:copies],
+            columns=None if self.columns is None else self.columns.first(copies, columns),
+        )
 
 
 class EnvCopies(Protocol):
@@ -99,7 +119,10 @@ class EvaluationCopies(EnvCopies, Protocol):
     count: int
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """Step these copies, with an action for each of them. The result has a row for every copy."""
+        """Step these copies, with an action for each of them. The result has a row for every copy.
+
+        That of a copy which is not stepped is its last one.
+        """
         ...
 
     def render(self, copy: int) -> Any:

@@ -1,9 +1,9 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
 Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where
-A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are checked
-and sent one by one. The copies are apart from the lanes of training. They are opened once, and reset with a seed before
-each episode.
+A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. A few rows are
+played at once and then checked; rows that are sent are played one by one. The copies are apart from the lanes of training.
+They are opened once, and reset with a seed before each episode.
 """
 
 from __future__ import annotations
@@ -21,16 +21,15 @@ from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.errors import UsageError
 from millrace.protocol.messages import Evaluate, Evaluated, Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
-from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.policy.policy import Policy
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.specs import RunSpec
-from millrace.workers.acting import Acting
+from millrace.workers.acting import Acting, StepActions
 from millrace.workers.copies.env_copies import EvaluationCopies, check_spaces
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.looped_kind import loop_over
-from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
+from millrace.workers.copies.value_checks import check_acted
 from millrace.workers.copy_slots import EnvMaker
 from millrace.workers.evaluate.episode_rows import RowSender, SendRows, as_frame
 from millrace.workers.lanes.lane import Lane
@@ -38,6 +37,9 @@ from millrace.workers.lanes.rows import EpisodesLost, Rows, RowsOfLane
 from millrace.workers.lanes.runner import LaneRunner
 from millrace.workers.lanes.running_episodes import EndedEpisode
 from millrace.workers.opponents import KnownOpponents, Match, OtherTeams
+
+ROWS_AT_ONCE = 16
+"""Enough that what is done once for all of them costs little, and few enough that wrong values are found soon."""
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
 """Makes this number of copies, with this render mode."""
@@ -64,16 +66,20 @@ class Evaluator:
         self, run: RunSpec, policy: Policy | CalledPolicy, open_copies: OpenEvaluationCopies = open_looped_copies
     ) -> None:
         """`policy` must hold the weights to evaluate when `play` is called."""
-        self.steps = 0
-        """number of env steps made"""
         self.seconds = 0.0
         """seconds spent in `play`"""
         self._run = run
-        self._stored = stored_leaves(run)
         self._runner = LaneRunner(run, policy)
         self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
+        self._ended_steps = 0  # of rows that are whole or were dropped
+        self._under_way: Rows | None = None
+
+    @property
+    def steps(self) -> int:
+        """Number of env steps made, also of rows that are under way."""
+        return self._ended_steps + (0 if self._under_way is None else self._under_way.env_steps())
 
     def play(  # rule EVALUATE
         self, order: Evaluate, send: SendRows, pulse: Pulse, held: Mapping[int, Weights] = MappingProxyType({})
@@ -111,32 +117,38 @@ class Evaluator:
         lane = Lane(run, copies, k, number=None, most_steps=order.most_steps)
         lane.others = others
         lane.reset(order.seeds, pulse)
-        rows = Rows(run, [lane], 1)
-        (of_lane,) = rows.of_lanes
-        self._check_observed(of_lane, 0, 0)
         senders = []
         if order.send_rows or order.send_frames:
             senders = [RowSender(order, n, run.policy, send) for n in range(k)]
+        rows = Rows(run, [lane], 1 if senders else ROWS_AT_ONCE)
+        (of_lane,) = rows.of_lanes
         for sender in senders:
             self._observe(sender, of_lane, 0, copies)
         actions = _PlayedActions(run, self._runner.acting, rows, drawn, greedy=order.greedy)  # rule GREEDY
         ended_by_copy: dict[int, EndedEpisode] = {}
-        while lane.playing.any():
-            playing = np.flatnonzero(lane.playing).tolist()
-            self._runner.run(rows, actions, pulse)
-            self.steps += len(playing)
-            check_rewards(None, of_lane.reward, run.row_axes, rows.first_step)
-            self._check_observed(of_lane, 1, rows.first_step + 1)
-            ended_by_copy |= {each.copy: each for each in of_lane.ended}
-            if senders:
-                for n in playing:
-                    self._observe(senders[n], of_lane, 1, copies)
-                    self._send_row(senders[n], of_lane, actions.chosen, cut=n in ended_by_copy and ended_by_copy[n].cut)
+        while len(ended_by_copy) < k:
+            playing = lane.playing.nonzero()[0].tolist()
+            self._fill(rows, actions, pulse)
+            for each in of_lane.ended:
+                ended_by_copy[each.copy] = each
+            for n in playing if senders else ():
+                self._observe(senders[n], of_lane, 1, copies)
+                self._send_row(senders[n], of_lane, actions.chosen, cut=n in ended_by_copy and ended_by_copy[n].cut)
             rows.begin_again()
         ended = [ended_by_copy[n] for n in range(k)]
         return Evaluated(  # rule CUT
             order.session, order.ticket, tuple(each.episode for each in ended), tuple(each.cut for each in ended)
         )
+
+    def _fill(self, rows: Rows, actions: StepActions, pulse: Pulse) -> None:
+        """Fill these rows, and check them."""
+        self._under_way = rows
+        try:
+            self._runner.run(rows, actions, pulse)
+        finally:
+            self._ended_steps += rows.env_steps()
+            self._under_way = None
+        self._runner.check(rows)
 
     def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
         """The other teams, if the order says who plays them."""
@@ -158,11 +170,6 @@ class Evaluator:
         copies = self._copies[render_mode] = self._open_copies(self._run, count, render_mode, pulse)
         check_spaces(self._run, copies)
         return copies
-
-    def _check_observed(self, rows: RowsOfLane, row: int, step: int) -> None:
-        """Check the observations of this row, which are number `step` of their episodes."""
-        newest = [leaf[row : row + 1] for leaf in rows.obs]
-        check_observed(None, self._stored, newest, self._run.row_axes, step)
 
     def _observe(self, sender: RowSender, rows: RowsOfLane, row: int, copies: EvaluationCopies) -> None:
         """Add an observation of the sender's episode to what it sends."""
@@ -212,7 +219,7 @@ class _PlayedActions:
         self.chosen = self._acting.choose(obs, state, self._drawn, greedy=self._greedy)
         if self.chosen.dtype.kind == "f":
             acted = np.zeros_like(self.chosen)
-            playing = np.repeat(self._lane.playing, self._run.seats_of_copy)
+            playing = self._lane.playing.repeat(self._run.seats_of_copy)
             acted[playing] = self.chosen[playing]
             check_acted(None, "action", acted[None], obs, self._run.row_axes, self._rows.first_step + t)
         return self.chosen[None].copy()

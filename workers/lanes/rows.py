@@ -1,8 +1,9 @@
 """The rows of lanes that are stepped together, while they are written.
 
 Rule: a step fills one row of every lane. When all rows are filled, they keep the row format (`protocol/rollout.py`), and the
-running episodes of each lane have come as far as its rows. The part of a row that belongs to a copy which was not stepped
-shows what the copy showed before, and nothing that happened.
+running episodes of each lane have come as far as its rows. Rows stay empty only where an evaluation ends: all its episodes
+are over. The part of a row that belongs to a copy which was not stepped shows what the copy showed before, and nothing that
+happened.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.envs.seats import columns_of
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.specs import RunSpec
 from millrace.workers.activity import ENV_CALLS, activity
@@ -44,7 +44,7 @@ class Rows:
         """the number of the first row's step, as errors name it"""
         self.obs = tuple(np.empty((L, T + 1, columns, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))
         """[L, T+1, N · A, *leaf] each; in a masked run the last one is the mask"""
-        self.state: Floats = np.stack([lane.state for lane in lanes])
+        self.state: Floats = np.array([lane.state for lane in lanes])
         """[L, N · A, S] recurrent state of the policy, updated at each step"""
         self.reward = np.empty(shape)
         """[L, T, N · A] float64, so that returns are summed before they are rounded"""
@@ -56,8 +56,20 @@ class Rows:
         self.step_end_s: list[float] = []
         """[T] by perf_counter"""
         self.of_lanes = [RowsOfLane(run, self, i, lane) for i, lane in enumerate(lanes)]
+        self.numbers = [lane.number for lane in lanes if lane.number is not None]
+        """of the lanes"""
         self._calls = activity().numbers
         self._calls_before_row = 0
+
+    @property
+    def filled(self) -> int:
+        """How many rows are whole."""
+        return len(self.step_end_s)
+
+    @property
+    def are_over(self) -> bool:
+        """Whether no further step will be made: these rows are of an evaluation, and all its episodes have ended."""
+        return not any(each.lane.autoresets or np.count_nonzero(each.lane.playing) for each in self.of_lanes)
 
     def begin_row(self) -> None:
         """The row before is whole, and the next one begins."""
@@ -77,11 +89,10 @@ class Rows:
 
         The count never falls, and only calls of the environment that have returned are in it.
         """
-        whole = len(self.step_end_s)
-        if whole == self.steps:
-            return self._of_rows(whole)
-        before = self._of_rows(whole)
-        after = self._of_rows(whole + 1)
+        before = self._of_rows(self.filled)
+        if self.filled == self.steps:
+            return before
+        after = self._of_rows(self.filled + 1)
         # Calls in this row that have returned. At worst the copies that it resets were called first.
         calls = self._calls[ENV_CALLS] - self._calls_before_row
         resets = sum(each.lane.count for each in self.of_lanes) - (after - before)
@@ -133,7 +144,7 @@ class RowsOfLane:
 
     def resets_in(self, rows: int) -> int:
         """How many of the steps of the copies, in so many rows, belong to no episode."""
-        if self.lane.seats is not None:
+        if self.lane.seats is not None or not self.lane.autoresets:
             return int(np.count_nonzero(self.resets[:rows]))
         if not rows:
             return 0
@@ -155,13 +166,11 @@ class RowsOfLane:
         """Step the copies with actions [N · A, *action], and write what they return."""
         lane = self.lane
         try:
-            if lane.autoresets:  # rules ROWS, LAST_OBSERVATION
-                result = lane.copies.step(actions, pulse)
-                write_numbers(self._numbers, t, (result.reward, result.terminated, result.truncated))
-                lane.writer.write(self._joined, t + 1, result.leaves)
-                self.columns = result.columns
-            else:
-                result = self._step_playing(t, actions, pulse)
+            result = lane.copies.step(actions, pulse) if lane.autoresets else self._step_playing(actions, pulse)
+            # rules ROWS, LAST_OBSERVATION
+            write_numbers(self._numbers, t, (result.reward, result.terminated, result.truncated))
+            lane.writer.write(self._joined, t + 1, result.leaves)
+            self.columns = result.columns
         except CopyFailed as error:
             raise environment_failed(lane.number, error, f"step {self._rows.first_step + t}") from error
         if result.facts:
@@ -169,47 +178,34 @@ class RowsOfLane:
                 self._facts[t, n] = of_copy
         if result.lost is not None:
             self._lose(t, result.lost)
+        if not lane.autoresets:
+            self._show_playing(t)
 
-    def _step_playing(self, t: int, actions: Array, pulse: Pulse) -> StepResult:
-        """Step the copies whose episodes go on, and write their part of the row. There may be more copies than the lane's.
+    def _step_playing(self, actions: Array, pulse: Pulse) -> StepResult:
+        """Step the copies whose episodes go on. Returns what it means for those of the lane: there may be more."""
+        lane = self.lane
+        copies: EvaluationCopies = lane.copies  # type: ignore[assignment]
+        playing = lane.playing.nonzero()[0].tolist()
+        if len(playing) == copies.count:
+            return copies.step(actions, pulse, playing)
+        result = copies.step(actions[lane.playing.repeat(self._seats)], pulse, playing)
+        return result if lane.count == copies.count else result.first(lane.count, lane.columns)
+
+    def _show_playing(self, t: int) -> None:
+        """Nothing has happened in row t to copies that were not stepped: what the row has of them is their last step.
 
         Nobody learns from these rows, so rewards that are outside of any row of a seat are in them too.
         """
-        lane = self.lane
-        copies: EvaluationCopies = lane.copies  # type: ignore[assignment]
-        playing = np.flatnonzero(lane.playing).tolist()
-        columns = columns_of(playing, self._seats)
-        result = copies.step(actions[columns], pulse, playing)
-        of_lane = slice(lane.columns)
-        write_numbers(self._numbers, t, (result.reward[of_lane], result.terminated[of_lane], result.truncated[of_lane]))
-        if (seats := result.columns) is not None:
-            self.reward[t] += seats.outside[of_lane]
-            self.columns = SeatColumns(
-                complete=seats.complete[of_lane],
-                acts=seats.acts[of_lane],
-                outside=self._nothing_outside,
-                over=seats.over[: lane.count],
-            )
-        if len(playing) == copies.count:
-            lane.writer.write(self._joined, t + 1, result.leaves)  # it is faster
-            return result
-        for array in self.obs:
-            array[t + 1] = array[t]
-        lane.writer.write_some([array[t + 1] for array in self.obs], columns, result.leaves)
-        if len(playing) < lane.count:
-            self._clear_still(t)
-        return result
-
-    def _clear_still(self, t: int) -> None:
-        """Nothing has happened in row t to copies that are not playing: what it shows of them is their last step."""
-        lane = self.lane
-        still = ~lane.playing
+        playing = self.lane.playing
         if self.columns is not None:
-            self.columns = self.columns._replace(over=self.columns.over & lane.playing)
-            still = np.repeat(still, self._seats)
-            self.columns.complete[still] = False
-        for array in self._numbers:
-            array[t, still] = 0
+            self.reward[t] += self.columns.outside
+            self.columns = self.columns._replace(outside=self._nothing_outside, over=self.columns.over & playing)
+        if np.count_nonzero(playing) < len(playing):
+            still = (~playing).repeat(self._seats)
+            for array in self._numbers:
+                array[t][still] = 0  # half the time of `array[t, still] = 0`
+            if self.columns is not None:
+                self.columns.complete[still] = False
 
     def _lose(self, t: int, lost: Bools) -> None:
         """These copies [N] were lost in step `t`: their episodes are truncated at the last step that was made.
@@ -218,7 +214,7 @@ class RowsOfLane:
         episodes must be whole.
         """
         if not self.lane.autoresets:
-            if (lost[: self.lane.count] & self.lane.playing).any():
+            if (lost & self.lane.playing).any():
                 raise EpisodesLost
             return
         self.truncated[t] |= lost
@@ -237,11 +233,11 @@ class RowsOfLane:
             over = self._count_seats(t, lane.seats)
         lane.episodes.add(self.reward[t].reshape(-1, self._seats), lane.playing)
         lane.playing = ~over if lane.autoresets else lane.playing & ~over
-        self.resets[t + 1] = ~lane.playing
-        for n in np.flatnonzero(over).tolist():
+        for n in over.nonzero()[0].tolist():
             self.ended.append(lane.episodes.ended(n, now_s, self._facts.get((t, n)), lane.others))
-        if not lane.autoresets:
+        if self._rows.first_step + t + 1 >= lane.episodes.most_steps:
             self._cut(t, now_s)
+        self.resets[t + 1] = ~lane.playing
 
     def _count_seats(self, t: int, seats: Seats) -> Bools:  # rule SEATS
         """What row t means for seats: whether the episode of each copy [N] is over.

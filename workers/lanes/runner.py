@@ -47,7 +47,7 @@ class LaneRunner:
         self._to_env_action = action_converter_of(run.policy)
 
     def run(self, rows: Rows, actions: StepActions, pulse: Pulse) -> None:
-        """Fill these rows. `pulse` is called at every step and may raise.
+        """Fill these rows; in an evaluation, until all its episodes are over. `pulse` is called at every step and may raise.
 
         Raises `EnvironmentFailed` and `PolicyFailed`, and `EpisodesLost` in an evaluation. The values of the rows are not
         checked, unless something raised.
@@ -56,20 +56,23 @@ class LaneRunner:
             self._fill(rows, actions, pulse)
         except (EnvironmentFailed, PolicyFailed, IndexError):
             # An invalid observation or reward may have caused the error. Then these checks raise the clearer one.
-            whole = len(rows.step_end_s)
-            axes = self._run.row_axes
-            for each in rows.of_lanes:
-                number = each.lane.number
-                check_observed(number, self._stored, [leaf[: whole + 1] for leaf in each.obs], axes, rows.first_step)
-                check_rewards(number, each.reward[:whole], axes, rows.first_step)
+            self.check(rows)
             raise
+
+    def check(self, rows: Rows) -> None:
+        """Check what the environments returned in the rows that are filled. Raises `EnvironmentFailed`."""
+        filled = rows.filled
+        axes = self._run.row_axes
+        for each in rows.of_lanes:
+            number = each.lane.number
+            check_observed(number, self._stored, [leaf[: filled + 1] for leaf in each.obs], axes, rows.first_step)
+            check_rewards(number, each.reward[:filled], axes, rows.first_step)
 
     def _fill(self, rows: Rows, actions: StepActions, pulse: Pulse) -> None:
         lanes = rows.of_lanes
         stages = self.stages
         step_all = self._step_all
         to_env_action = self._to_env_action
-        numbers = [each.lane.number for each in lanes if each.lane.number is not None]
         with_seats = bool(self._run.seats)
         counts_rows = with_seats or not lanes[0].lane.autoresets
         forgets = rows.state.size > 0 and not counts_rows
@@ -86,19 +89,21 @@ class LaneRunner:
                     for i, each in enumerate(lanes):
                         each.acted(t, actions.written(i), before[i], taken[i])
             acted = perf_counter()
-            step_all(numbers, taken, pulse)
+            step_all(rows.numbers, taken, pulse)
             for i, each in enumerate(lanes):
                 each.step(t, taken[i], pulse)
             ended = perf_counter()
             rows.step_end_s.append(ended)
+            stages["act"] += acted - began
+            stages["step"] += ended - acted
             if counts_rows:
                 for each in lanes:
                     each.count(t, ended)
+                if rows.are_over:
+                    break
             elif forgets:
                 rows.state[resets] = 0.0
                 resets = rows.terminated[:, t] | rows.truncated[:, t]
-            stages["act"] += acted - began
-            stages["step"] += ended - acted
         if not counts_rows:
             for each in lanes:
                 each.count_all()

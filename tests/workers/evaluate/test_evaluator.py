@@ -21,7 +21,7 @@ from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate import episode_rows
-from millrace.workers.evaluate.evaluator import Evaluator
+from millrace.workers.evaluate.evaluator import ROWS_AT_ONCE, Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import no_pulse, random_policy, run_of
 
@@ -33,12 +33,12 @@ class Echo(gymnasium.Env[Any, Any]):
 
     made: list[Echo] = []
 
-    def __init__(self, fails_at: int = 0, endless: bool = False, bad: str = "") -> None:
+    def __init__(self, fails_at: int = 0, endless: bool = False, bad: str = "", bad_from: int = 0) -> None:
         self.observation_space = spaces.Discrete(5)
         self.action_space = spaces.Discrete(5)
         self.seeds: list[int | None] = []
         self.closed, self.steps, self.stepped, self.number = False, 0, 0, 0
-        self.fails_at, self.endless, self.bad = fails_at, endless, bad
+        self.fails_at, self.endless, self.bad, self.bad_from = fails_at, endless, bad, bad_from
         Echo.made.append(self)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -53,8 +53,9 @@ class Echo(gymnasium.Env[Any, Any]):
         if self.steps == self.fails_at:
             raise RuntimeError("the spring broke\nin two")
         right: Any = float(action == self.number)
-        right = {"reward": float("nan"), "text": "one"}.get(self.bad, right)
-        observation = {"shape": np.zeros(2, np.int64), "outside": 7}.get(self.bad, self._next())
+        bad = self.bad if self.steps > self.bad_from else ""
+        right = {"reward": float("nan"), "text": "one"}.get(bad, right)
+        observation = {"shape": np.zeros(2, np.int64), "outside": 7}.get(bad, self._next())
         return observation, right, not self.endless and self.steps == self.longest, False, {}
 
     def _next(self) -> int:
@@ -234,6 +235,26 @@ def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]
 def test_an_unusable_value_is_named(bad: str, says: str) -> None:
     with pytest.raises(EnvironmentFailed, match=says):
         play(Evaluator(echo_run(bad=bad), Repeats()), order(1))
+
+
+@pytest.mark.parametrize(("bad", "step"), [("reward", 18), ("outside", 19)])
+def test_an_unusable_value_is_named_by_its_step_in_a_long_episode(bad: str, step: int) -> None:
+    assert step > ROWS_AT_ONCE
+    with pytest.raises(EnvironmentFailed, match=f"at step {step}, copy 0"):
+        play(Evaluator(echo_run(bad=bad, bad_from=18, endless=True), Repeats()), order(1, 2))
+
+
+def test_steps_are_counted_as_they_are_made(made: list[Echo]) -> None:
+    evaluator = Evaluator(echo_run(endless=True), Repeats())
+    seen: list[tuple[int, int]] = []
+
+    def pulse() -> None:
+        seen.append((evaluator.steps, sum(env.stepped for env in made)))
+
+    for asked in (order(1, 2, most_steps=2 * ROWS_AT_ONCE + 1), order(5, most_steps=3)):
+        evaluator.play(asked, lambda rows: None, pulse)
+    assert [counted for counted, _ in seen] == [stepped for _, stepped in seen]
+    assert evaluator.steps == 2 * (2 * ROWS_AT_ONCE + 1) + 3
 
 
 class Shows(Smooth):
