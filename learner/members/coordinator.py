@@ -2,9 +2,9 @@
 
 Rule: who waits for the run when it begins is a member from then on, in the same session. If it describes an environment at
 that time, it is given work once it says that it has begun the run. What is not sent in a member's session is answered by the
-membership (`Membership.hear`); the rest goes to the part that knows what it means. A membership ends by Goodbye, by Failure,
-by the end of the process, by silence, by a refusal, or with its key. Then what the member held is taken back, and `_deal`
-gives it to others. What a Heartbeat shows to be lost on the way is sent again, before the reply.
+membership (`Membership.hear`), and so is a Failure; the rest goes to the part that knows what it means. A membership ends by
+Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with its key. Then what the member held is taken
+back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the way is sent again, before the reply.
 
 A subclass says what differs: what messages mean, what is dealt, what a loss means, and what becomes of a wrong answer.
 """

@@ -22,7 +22,7 @@ from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, UsageError
-from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Failure, Goodbye, Heartbeat, Status, ToLearner
+from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodbye, Heartbeat, Status, ToLearner
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 
@@ -125,8 +125,6 @@ class DescribeCoordinator(Coordinator[Member]):
                 return self._take_description(member, message)
             case Goodbye(_, reason):
                 return self._goodbye(member, reason)
-            case Failure():
-                self.membership.fail(member, message)
         return []
 
     def _take_description(self, member: Member, message: Described) -> list[Outgoing]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from millrace.protocol.bounds import MAX_LINE, indented, one_line
+from millrace.protocol.errors import EnvironmentFailed, PolicyFailed, joined
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class Failed:
     """A worker failed in the user's code. It may come back. Each event is one of the three classes below."""
 
     json_name: ClassVar[str]
+    raised_as: ClassVar[type[EnvironmentFailed | PolicyFailed]] = EnvironmentFailed
+    """The class of `exception`."""
     worker: str
     host: str
     error: str
@@ -72,6 +75,15 @@ class Failed:
     """Seconds from its first env step to the failure; None if its process is not known to have made one."""
     spare: bool = False
     """Whether the run did not need it: every lane had another worker. Such a failure does not count against the run."""
+
+    @property
+    def line(self) -> str:
+        """Who failed, and how."""
+        return f"worker {self.worker} ({self.host}): {self.error}"
+
+    def exception(self, why: str = "") -> EnvironmentFailed | PolicyFailed:
+        """The error to raise for it. `why`: why the run ends with this failure."""
+        return self.raised_as(joined(self.line, why), self.traceback)
 
 
 @dataclass(frozen=True)
@@ -88,6 +100,7 @@ class PolicyRaised(Failed):
     """
 
     json_name: ClassVar[str] = "policy_raised"
+    raised_as: ClassVar[type[EnvironmentFailed | PolicyFailed]] = PolicyFailed
 
 
 @dataclass(frozen=True)
@@ -207,9 +220,10 @@ def _line(event: LoggedEvent) -> str:
                 f"worker {worker} said Hello over a connection that has no routing id: nothing is wrong if it has connected "
                 f"again; a client that sets none is refused: {why}"
             )
-        case Failed(worker, host, error, spare=spare):
-            died = isinstance(event, WorkerProcessFailed) and not spare
-            return f"worker {worker} ({host}): {error}" + ("; this counts as a failure of the environment" if died else "")
+        case WorkerProcessFailed(spare=False):
+            return joined(event.line, "this counts as a failure of the environment")
+        case Failed():
+            return event.line
         case WorkerStartFailed(worker, why):
             return f"worker {worker} {why}"
         case WorkerToldToRejoin(worker, _, late):

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from millrace.learner.members.events import Event, Failed, PolicyRaised
+from millrace.learner.members.events import Event, Failed
 from millrace.protocol.errors import EnvironmentFailed, PolicyFailed
 
 MOST_IN_A_ROW = 10
@@ -74,8 +74,7 @@ class FailureCount:
         if not isinstance(event, Failed) or event.spare or self._error is not None:
             return ""
         if why := self.failed(event.lanes or (event.worker,), event.worked_s, now):
-            line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
-            self._error = (PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed)(line, event.traceback)
+            self._error = event.exception(why)
             return ""
         return self._how_often(now)
 

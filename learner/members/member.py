@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from millrace.learner.members.events import Failed
 from millrace.learner.members.member_states import MemberState
-from millrace.protocol.bounds import Stages, escaped
+from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
 
@@ -99,6 +98,8 @@ class Member:
     """What the worker does, as its supervisor said last."""
     activity_s: float = 0.0
     """Time when the supervisor said that."""
+    failed_lane: int | None = None
+    """The lane whose environment failed, by which the worker has left."""
     hung: bool = False
     """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
@@ -129,13 +130,10 @@ class Member:
         """Time at which the worker was last known to be alive and well."""
         return max(self.heard_s, self.in_env_code_s)
 
-    def failed(
-        self, kind: type[Failed], error: str, traceback: str = "", *, lane: int | None = None, spare: bool = False
-    ) -> Failed:
-        """The event that says that the worker failed, in this lane if it is known."""
-        lanes = (lane,) if lane in self.lanes else tuple(sorted(self.lanes))
-        worked_s = None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
-        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, worked_s, spare)
+    @property
+    def worked_s(self) -> float | None:
+        """Seconds for which it is known to have made env steps; None if its process is not known to have made one."""
+        return None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
 
     def has_stepped(self) -> None:
         """Its process is known to have made an env step."""

@@ -34,7 +34,7 @@ from millrace.learner.members.events import (
 from millrace.learner.members.member import Member, SharingSupervisor
 from millrace.learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from millrace.protocol.address import key_of_peer, name_for_people, worker_name
-from millrace.protocol.bounds import Stage, Stages, one_line
+from millrace.protocol.bounds import Stage, Stages, escaped, one_line
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
@@ -67,7 +67,7 @@ Outgoing = tuple[bytes, ToWorker]
 
 @dataclass(frozen=True)
 class Answered:
-    """What became of a message that no member sent in its session: the membership has answered it."""
+    """What became of a message that no member sent in its session, or by which a member failed: it is answered."""
 
     out: list[Outgoing]
     """The answer."""
@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member that sent this message in its session. To any other message, the answer."""
+        """The member that sent this message in its session and stays. To any other message, the answer."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)
@@ -151,7 +151,13 @@ class Membership(Generic[M]):
             case Alive():
                 out, exits = self.hear_supervisor(peer, message, now)
                 return Answered(out, bool(exits))
-        return self.member_of_session(peer, message, now) or Answered(self.answer_ended_session(peer, message))
+        member = self.member_of_session(peer, message, now)
+        if member is None:
+            return Answered(self.answer_ended_session(peer, message))
+        if isinstance(message, Failure):
+            self._fail(member, message)
+            return Answered([], changed=True)
+        return member
 
     def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
         """The member that sent this message in its current session, or None. Also records when the member was heard."""
@@ -243,15 +249,6 @@ class Membership(Generic[M]):
         """A member says Goodbye: remove it."""
         self.remove(member, Goodbye, f"left: {reason}")
 
-    def fail(self, member: M, failure: Failure) -> Failed:
-        """A member says that code of the user has failed: remove it. Returns the event."""
-        kind = PolicyRaised if failure.of_policy and self.has_policy_code else EnvironmentRaised
-        spare = self.is_spare(member)
-        failed = member.failed(kind, failure.error, failure.traceback, lane=failure.lane, spare=spare)
-        self.events.append(failed)
-        self.remove(member, Failure, "failed")
-        return failed
-
     def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
         """Remove a member; its process must not come back."""
         self._remember_refusal(member, why)
@@ -305,9 +302,9 @@ class Membership(Generic[M]):
         if member is not None and (key is None or key == key_of_peer(member.peer)):
             member.hung = worker_exit.hung
             if worker_exit.failed:
-                spare = self.is_spare(member)
-                kind = PolicyRaised if worker_exit.of_policy and self.has_policy_code else WorkerProcessFailed
-                self.events.append(member.failed(kind, f"its process {reason}", spare=spare))
+                by_policy = worker_exit.of_policy and self.has_policy_code
+                kind = PolicyRaised if by_policy else WorkerProcessFailed
+                self.events.append(self._failed(kind, member, f"its process {reason}"))
             self.remove(member, TimedOut, reason)
             return True
         if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # now it is known why it was silent
@@ -348,6 +345,25 @@ class Membership(Generic[M]):
             member.state = TABLE[member.state][Drain]
             out.append((member.peer, Drain(one_line(reason))))
         return out
+
+    def _fail(self, member: M, failure: Failure) -> None:
+        """A member says that code of the user has failed: remove it."""
+        by_policy = failure.of_policy and self.has_policy_code
+        kind = PolicyRaised if by_policy else EnvironmentRaised
+        self.events.append(self._failed(kind, member, failure.error, failure.traceback, failure.lane))
+        self.remove(member, Failure, "failed")
+
+    def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:
+        """The event that says that a member failed, in this lane if it is known to be its lane."""
+        return kind(
+            worker=member.hello.worker,
+            host=member.hello.host,
+            error=error,
+            traceback=escaped(traceback),
+            lanes=(lane,) if lane in member.lanes else tuple(sorted(member.lanes)),
+            worked_s=member.worked_s,
+            spare=self.is_spare(member),
+        )
 
     def _welcome(self, member: M) -> Outgoing:
         member.welcomed = member.replies

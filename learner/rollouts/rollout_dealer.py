@@ -200,18 +200,14 @@ class RolloutDealer:
         ticket = self.held.get(number)
         return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
 
-    def failed(self, member: Member, lane: int) -> None:
-        """The environment of a lane of this member has failed: what led there is not repeated."""
-        if lane in member.lanes:
-            self.lanes[lane].failures += 1
-
-    def worker_lost(self, member: Member, *, hung: bool) -> None:
-        """A member is gone with its tickets. `hung`: because of a call of the environment that took too long."""
+    def worker_lost(self, member: Member) -> None:
+        """A member is gone with its tickets. What led to a failure of the environment is not repeated."""
         for number in member.lanes:
             lane = self.lanes[number]
             if lane.outstanding:
                 lane.losses += 1
-                lane.failures += hung
+                lane.failures += member.hung
+            lane.failures += number == member.failed_lane
 
     def late(self, rollout: Rollout) -> None:
         """Count a rollout of a session that has ended. Nobody has checked it."""

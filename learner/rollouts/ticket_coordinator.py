@@ -32,7 +32,6 @@ from millrace.protocol.messages import (
     Collect,
     EpisodeRows,
     Evaluated,
-    Failure,
     Goodbye,
     Heartbeat,
     Hello,
@@ -221,10 +220,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 return self._unusable(member, why) if why else []
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
-            case Failure():
-                if message.lane is not None:
-                    self.rollouts.failed(member, message.lane)
-                self.membership.fail(member, message)
         return []  # also to answers to orders that a run does not give
 
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
@@ -280,7 +275,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _removed(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
-        self.rollouts.worker_lost(member, hung=member.hung)
+        self.rollouts.worker_lost(member)
         for number in list(member.tickets):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation
             dealer.lose(member, number)

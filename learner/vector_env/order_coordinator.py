@@ -13,17 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.events import Failed
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import TimedOut
 from millrace.learner.members.membership import Answered, Membership, Outgoing
-from millrace.protocol.errors import BadMessage, EnvironmentFailed
+from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
     Answer,
     Call,
     Described,
-    Failure,
     Goodbye,
     Heartbeat,
     LaneIncarnation,
@@ -73,8 +71,6 @@ class OrderCoordinator(Coordinator[Member]):
         """Packed infos of such an order, by lane, if they came as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
-        self.failures: list[Failed] = []
-        """Errors of environments that raised."""
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
 
@@ -95,13 +91,6 @@ class OrderCoordinator(Coordinator[Member]):
         lost = self.lost
         self.lost = {}
         return lost
-
-    def raise_failures(self) -> None:
-        """Raise `EnvironmentFailed` if an environment raised."""
-        if self.failures:
-            failure = self.failures[0]
-            self.failures = []
-            raise EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
 
     def forget(self, lane: int) -> None:
         """Forget the answer to the last order of one lane; the caller has taken it."""
@@ -152,11 +141,6 @@ class OrderCoordinator(Coordinator[Member]):
                 return []  # it was asked before the vector environment began
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
-                return []
-            case Failure():
-                failed = self.membership.fail(member, message)
-                if not failed.spare:
-                    self.failures.append(failed)
                 return []
         return self._unusable(member, f"it sent {type(message).__name__}, which a vector environment does not ask for")
 

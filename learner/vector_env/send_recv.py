@@ -202,7 +202,7 @@ class SendRecv:
     def look(self, timeout_s: float) -> None:
         """Note what has come of the lanes that are under way. Never waits. Raises `EnvironmentFailed` and `NoWorkers`."""
         self._take_results()
-        self._parts.hub.coordinator.raise_failures()
+        self._parts.hub.raise_failure()
         if not self._sent.all_ready:
             self._give_up_late(timeout_s)
             self._handle_losses()

@@ -72,6 +72,7 @@ class StepHub:
         self._infos_to_come: set[int] = set()  # lanes whose step is done, and whose infos come as a message
         self._patience_s = PATIENCE_S
         self._listen_due_s = 0.0
+        self._failure: Failed | None = None  # the first since `raise_failure`
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
@@ -211,6 +212,13 @@ class StepHub:
         """The error when no worker has been there for this long."""
         return self._server.no_workers(1, timeout_s)
 
+    def raise_failure(self) -> None:
+        """Raise `EnvironmentFailed` if an environment has raised since the last call."""
+        failure = self._failure
+        self._failure = None
+        if failure is not None:
+            raise failure.exception()
+
     def close(self, timeout_s: float) -> None:
         """Ask every worker to leave, wait a moment for their Goodbye, and end those that are ours."""
         busy = bool(self.coordinator.orders or (self.shared is not None and self.shared.memory.unanswered_orders()))
@@ -229,13 +237,18 @@ class StepHub:
         return status(self.coordinator, now, self.status_of_run)
 
     def happened(self, event: Event) -> None:
-        """A worker may have left: its lanes have no worker."""
-        if isinstance(event, WorkerProcessFailed) and not event.spare:
-            self.on_death(event)
-        if isinstance(event, WorkerLeft | WorkerRefused) and self.shared is not None:
-            for lane in self.coordinator.lanes:
-                if lane.owner is None:
-                    self.shared.worker_left(lane.number)
+        """A worker may have failed, or left: its lanes have no worker."""
+        match event:
+            case WorkerProcessFailed(spare=False):
+                self.on_death(event)
+            case Failed(spare=False):
+                self._failure = self._failure or event
+            case WorkerLeft() | WorkerRefused() if self.shared is not None:
+                for lane in self.coordinator.lanes:
+                    if lane.owner is None:
+                        self.shared.worker_left(lane.number)
+            case _:
+                pass
 
     def sent(self, peer: bytes) -> None:
         """A worker that waits for steps through shared memory must be woken to read a message."""

@@ -64,6 +64,7 @@ NOT_SAVED: dict[type, set[str]] = {
     CollectingMember: {
         "joined_s",
         "hung",
+        "failed_lane",
         "state",
         "heartbeat",
         "stages_before",

@@ -26,7 +26,7 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import ActedRows
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import EnvCopies, check_spaces
-from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.open_lanes import OpenLanes
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
@@ -138,10 +138,8 @@ class Collector:
         run = self._run
 
         def made() -> Lane:
-            try:
+            with environment_failures(number, "made"):
                 copies = self._open_copies(run, number, pulse)
-            except CopyFailed as error:
-                raise environment_failed(number, error, "made") from error
             return Lane(run, copies, run.copies, number=number, incarnation=incarnation)
 
         began = perf_counter()

@@ -6,6 +6,8 @@ Rule: the line of an error names the lane, or the evaluation, once, at its begin
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from traceback import extract_tb, format_exception
 
 from millrace.protocol.envs.answers import OF_RESET, OF_STEP, WrongAnswer
@@ -41,6 +43,15 @@ def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = ""
         line = _what_it_did(cause)
         detail = "" if isinstance(cause, WrongAnswer) else "".join(format_exception(cause))
     return EnvironmentFailed(f"{whose}{copy}{doing or what.doing}: {line}", detail, lane)
+
+
+@contextmanager
+def environment_failures(lane: int | None, doing: str = "") -> Iterator[None]:
+    """Within it, what an env copy of this lane, or of an evaluation, raises becomes its `environment_failed`."""
+    try:
+        yield
+    except CopyFailed as error:
+        raise environment_failed(lane, error, doing) from error
 
 
 def _what_it_did(cause: BaseException) -> str:

@@ -26,7 +26,7 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import Acting, StepActions
 from millrace.workers.copies.env_copies import EvaluationCopies, check_spaces
-from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_errors import environment_failed, environment_failures
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.looped_kind import loop_over
 from millrace.workers.copies.value_checks import check_acted
@@ -92,11 +92,8 @@ class Evaluator:
         began_s = perf_counter()
         try:
             while True:
-                with suppress(EpisodesLost):  # they are played again from their seeds
+                with suppress(EpisodesLost), environment_failures(None):  # what is lost is played again from its seeds
                     return self._play(order, send, pulse, self._other_teams(order, held))
-        except CopyFailed as error:
-            self.close()
-            raise environment_failed(None, error) from error
         except BaseException:
             self.close()
             raise

@@ -23,7 +23,7 @@ from millrace.protocol.rows.rollout_checks import LARGEST_REWARD
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import pack, unpack
 from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, copy_seed
-from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.row_writers import ObservationWriter
 from millrace.workers.copies.seated_copies import SeatedCopies
@@ -90,10 +90,8 @@ class Lane:
         for name, value in now.items():
             if name in before and pack(before[name]) == pack(value):
                 continue
-            try:
+            with environment_failures(self.number, f"set_env_attr {name}"):
                 self.copies.assign(name, pack(value), pulse)
-            except CopyFailed as error:
-                raise environment_failed(self.number, error, f"set_env_attr {name}") from error
         self._attributes = packed
 
     def start(self, starts: list[int], pulse: Pulse) -> None:
@@ -106,11 +104,9 @@ class Lane:
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> None:
         """Begin the first episodes, with a seed for each copy. Raises `EnvironmentFailed`."""
         self.episodes.begin(perf_counter())
-        try:
+        with environment_failures(self.number, "first reset" if self.autoresets else "reset"):
             leaves = self.copies.reset(seeds, pulse)
             self.writer.write_some(self.obs, range(self.columns), leaves)
-        except CopyFailed as error:
-            raise environment_failed(self.number, error, "first reset" if self.autoresets else "reset") from error
         if self.seats is not None:
             assert isinstance(self.copies, SeatedCopies)
             first = self.copies.columns

@@ -24,7 +24,7 @@ from millrace.protocol.wire.plain_values import pack, unpack
 from millrace.protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
 from millrace.protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
 from millrace.workers.activity import STEPPING, activity
-from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_errors import CopyFailed, environment_failed, environment_failures
 from millrace.workers.copies.env_loop import CopyInfos, Pulse
 from millrace.workers.copies.open_lanes import OpenLanes
 from millrace.workers.vector_env.seated_lane import SeatedLane
@@ -59,7 +59,7 @@ class Stepper:
     def execute(self, order: Order, pulse: Pulse) -> Answer:  # rules ORDER_ANSWERED, ORDER_ONLY
         """The answer to the order. Raises `EnvironmentFailed`, and what `pulse` raises; the lane is then closed."""
         try:
-            with self.lanes.in_use():
+            with environment_failures(order.lane), self.lanes.in_use():
                 lane = self._lane_for(order.lane, order.incarnation, pulse)
                 match order:
                     case Reset():
@@ -70,9 +70,6 @@ class Stepper:
                         infos = self._step(lane, order.actions, pulse)
                     case Call():
                         return _call(order, lane, self._allow_private_names)
-        except CopyFailed as error:
-            self.lanes.close([order.lane])
-            raise environment_failed(order.lane, error) from error
         except BaseException:
             self.lanes.close([order.lane])
             raise

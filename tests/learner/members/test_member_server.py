@@ -25,7 +25,7 @@ from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
-from millrace.protocol.errors import NoWorkers
+from millrace.protocol.errors import EnvironmentFailed, NoWorkers
 from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Status, ToLearner
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
@@ -150,8 +150,8 @@ def test_a_learner_that_was_stopped_while_it_waited_was_away_too() -> None:
     assert served.listens_for(TIMEOUT_S - 2 * POLL_S)
 
 
-def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> None:
-    link = FakeLink()
+def step_hub(link: FakeLink, *workers: str) -> StepHub:
+    """The hub of a vector environment, which these workers have joined."""
     hub = StepHub(
         cast(LearnerLink, link),
         SPEC,
@@ -160,8 +160,42 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
         worker_timeout_s=TIMEOUT_S,
         clock=lambda: link.now,
     )
-    link.inbox.append((b"w0", example(Hello)))
-    hub.wait_for(1, TIMEOUT_S)
+    link.inbox += [(worker.encode(), example(Hello, worker=worker)) for worker in workers]
+    hub.wait_for(len(workers), TIMEOUT_S)
+    return hub
+
+
+def test_a_vector_environment_raises_the_error_of_an_environment_once_with_its_traceback() -> None:
+    link = FakeLink()
+    hub = step_hub(link, "a")
+    session = hub.coordinator.members[b"a"].session
+    link.inbox.append((b"a", example(Failure, session=session, error="boom", traceback="its traceback", lane=0)))
+    hub.rebalance()
+    with pytest.raises(EnvironmentFailed, match=r"^worker a \(host\): boom$") as raised:
+        hub.raise_failure()
+    assert raised.value.detail == "its traceback"
+    hub.raise_failure()
+
+
+def test_a_vector_environment_raises_no_failure_of_a_spare_worker() -> None:
+    link = FakeLink()
+    hub = step_hub(link, "a", "b", "spare")
+    for lane in range(len(SPEC.lanes)):
+        assert hub.coordinator.place(lane, patient=True)
+    session = hub.coordinator.members[b"spare"].session
+    link.inbox.append((b"spare", example(Failure, session=session, error="boom", lane=0)))
+    hub.rebalance()
+    hub.raise_failure()
+    session = hub.coordinator.members[b"b"].session
+    link.inbox.append((b"b", example(Failure, session=session, error="boom", lane=0)))
+    hub.rebalance()
+    with pytest.raises(EnvironmentFailed, match=r"^worker b "):
+        hub.raise_failure()
+
+
+def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> None:
+    link = FakeLink()
+    hub = step_hub(link, "w0")
     link.now += 1000.0
     with pytest.raises(NoWorkers):
         hub.wait_for(2, TIMEOUT_S)

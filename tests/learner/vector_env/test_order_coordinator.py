@@ -14,11 +14,9 @@ from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordi
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import (
     Answer,
     Call,
-    Failure,
     Heartbeat,
     HeartbeatReply,
     Hello,
@@ -134,15 +132,6 @@ def test_a_loss_is_told_once_and_its_lane_starts_again_in_its_next_incarnation()
     ((peer, order),) = made.order(0, step)
     assert isinstance(order, Step)
     assert (peer, order.incarnation) == (B, 1)
-
-
-def test_an_error_of_an_environment_is_raised_once_with_its_traceback() -> None:
-    made = order_coordinator(A)
-    made.receive(A, example(Failure, session=made.members[A].session, error="boom", traceback="its traceback", lane=0), 0.0)
-    with pytest.raises(EnvironmentFailed, match=r"^worker a \(host\): boom$") as raised:
-        made.raise_failures()
-    assert raised.value.detail == "its traceback"
-    made.raise_failures()
 
 
 def test_a_lane_stays_where_it_is_until_all_begin_anew() -> None:
@@ -378,15 +367,6 @@ def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_
     assert told(call, returned(text)) == "results: expected a list of 1, got str"
     assert "not a plain value" in told(call, returned(WORDS))
     assert (told(call, returned(WORDS, "KeyError: 1")), told(call, returned(results)), told(step, stepped)) == ("", "", "")
-
-
-def test_failures_of_spare_workers_are_not_raised() -> None:
-    coordinator = order_coordinator(A, B)
-    coordinator.receive(b"spare", example(Hello, worker="spare"), 0.0)
-    coordinator.receive(b"spare", example(Failure, session=coordinator.members[b"spare"].session, error="boom", lane=0), 0.0)
-    assert coordinator.failures == []
-    coordinator.receive(B, example(Failure, session=coordinator.members[B].session, error="boom", lane=0), 0.0)
-    assert [failure.worker for failure in coordinator.failures] == ["b"]
 
 
 def test_whoever_is_waited_for_no_longer_takes_no_other_worker_of_its_name_along() -> None:

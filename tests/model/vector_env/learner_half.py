@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 SAVED = {"membership", "lanes", "orders", "answers", "lost", "_tickets"}
 """What of `OrderCoordinator` is saved."""
-NOT_SAVED = {"spec", "worker_timeout_s", "shared_orders", "infos", "failures", "_placement"}
-"""What is not: constants, steps through shared memory, environments that raise; and placement, which remembers nothing
-in the methods that are used."""
+NOT_SAVED = {"spec", "worker_timeout_s", "shared_orders", "infos", "_placement"}
+"""What is not: constants, steps through shared memory; and placement, which remembers nothing in the methods that are
+used."""
 
 
 class Learner:
