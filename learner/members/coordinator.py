@@ -18,7 +18,7 @@ from typing import Generic
 from millrace.learner.members.events import Event, WorkerStartFailed
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import MemberState, SentUnusable
-from millrace.learner.members.membership import M, Membership, Outgoing
+from millrace.learner.members.membership import Answered, M, Membership, Outgoing
 from millrace.protocol.alive import StartFailed
 from millrace.protocol.bounds import one_line
 from millrace.protocol.messages import (
@@ -51,9 +51,13 @@ class Coordinator(ABC, Generic[M]):
 
     # ---------------------------------------------------------------- in
 
-    @abstractmethod
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message. `Membership.hear` says whose it is."""
+        """Answer a message."""
+        heard = self.membership.hear(peer, message, now)
+        if not isinstance(heard, Answered):
+            return self._answer(heard, message) + self._deal()
+        self._not_of_member(message, heard)
+        return heard.out + (self._deal() if heard.changed else [])
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
         """The run begins for the workers that wait for it. Call it first."""
@@ -92,6 +96,13 @@ class Coordinator(ABC, Generic[M]):
         return self.membership.drain(reason)
 
     # ---------------------------------------------------------------- what differs
+
+    @abstractmethod
+    def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
+        """The answer to what a member sent in its session."""
+
+    def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
+        """Learn from a message that the membership has answered."""
 
     def _deal(self) -> list[Outgoing]:
         """Give out what no worker has. Called after each event that may have changed who can take it."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.member import Member
-from millrace.learner.members.membership import MAX_MEMBERS, Answered, Membership, Outgoing
+from millrace.learner.members.membership import MAX_MEMBERS, Membership, Outgoing
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description
@@ -62,13 +62,6 @@ class DescribeCoordinator(Coordinator[Member]):
         self._tickets = FIRST_TICKET
         self._decliners_to_end = decliners_to_end
         self._decliners: set[str] = set()
-
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message."""
-        heard = self.membership.hear(peer, message, now)
-        if isinstance(heard, Answered):
-            return heard.out + (self._deal() if heard.changed else [])
-        return self._answer(heard, message) + self._deal()
 
     def ask(self, unknown: Unknown) -> list[Outgoing]:
         """Have a worker describe this environment. `described` is what it says, until the next call."""
@@ -117,7 +110,6 @@ class DescribeCoordinator(Coordinator[Member]):
         return self._deal()
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
-        """The answer to what a member sent in its session."""
         match message:
             case Heartbeat():
                 return self._heartbeat(member, message)

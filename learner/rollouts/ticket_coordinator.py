@@ -78,18 +78,6 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     # ---------------------------------------------------------------- in
 
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message."""
-        heard = self.membership.hear(peer, message, now)
-        if not isinstance(heard, Answered):
-            return self._answer(heard, message) + self._deal()
-        match message:
-            case Hello() if heard.changed:
-                self._placement.joined()
-            case Rollout():
-                self.rollouts.late(message)
-        return heard.out + (self._deal() if heard.changed else [])
-
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """Count a message that could not be read, and answer it."""
         self.rollouts.ledger.messages_bad += 1
@@ -206,8 +194,14 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             needed.update(opponents.versions)
         return needed
 
+    def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
+        match message:
+            case Hello() if answered.changed:
+                self._placement.joined()
+            case Rollout():
+                self.rollouts.late(message)
+
     def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
-        """The answer to what a member sent in its session."""
         match message:
             case Heartbeat():
                 return self._heartbeat(member, message)

@@ -16,7 +16,7 @@ from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_states import TimedOut
-from millrace.learner.members.membership import Answered, Membership, Outgoing
+from millrace.learner.members.membership import Membership, Outgoing
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
     Answer,
@@ -74,11 +74,6 @@ class OrderCoordinator(Coordinator[Member]):
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
 
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message."""
-        heard = self.membership.hear(peer, message, now)
-        return heard.out if isinstance(heard, Answered) else self._answer(heard, message)
-
     def give_up(self, member: Member, why: str) -> list[Outgoing]:
         """Remove this worker, for which the learner waits no longer, and no other of its name: keys may share names."""
         self.membership.remove(member, TimedOut, why)
@@ -131,7 +126,6 @@ class OrderCoordinator(Coordinator[Member]):
     # ---------------------------------------------------------------- inside
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
-        """The answer to what a member sent in its session."""
         match message:
             case Heartbeat():
                 return self._heartbeat(member, message)
