@@ -83,11 +83,11 @@ FEATURES = {
         "test_local_run.py::test_the_curve_does_not_depend_on_the_number_of_workers[CartPole-v1-settings0-places0]"
     ),
     "lag": "test_local_run.py::test_with_a_lag_a_lost_worker_leads_to_the_same_run_whoever_is_fast",
-    "resume at lag 1": "test_preemption.py::test_at_a_lag_two_runs_that_are_resumed_from_one_checkpoint_are_equal[impala]",
-    "LSTM, resumed": "test_preemption.py::test_a_resumed_run_equals_one_whose_lanes_were_started_anew[ppo, lstm]",
+    "resume at lag 1": "test_preemption.py::test_at_a_lag_a_resumed_run_equals_one_that_went_on[impala]",
+    "LSTM, resumed": "test_preemption.py::test_a_resumed_run_equals_one_that_went_on[ppo, lstm]",
     "DQN": "test_dqn_run.py::test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers[settings1]",
     "SAC": "test_continuous_runs.py::test_bits_and_replay_ratio_do_not_depend_on_the_number_of_workers[sac]",
-    "XQC, resumed": "test_preemption.py::test_a_resumed_run_equals_one_whose_lanes_were_started_anew[xqc]",
+    "XQC, resumed": "test_preemption.py::test_a_resumed_run_equals_one_that_went_on[xqc]",
     "seats": "test_seats.py::test_the_weights_do_not_depend_on_the_number_of_workers[RandomCrowd-settings2]",
     "self-play": (
         "test_self_play.py::test_weights_pool_and_ratings_do_not_depend_on_the_number_of_workers[RandomGame-settings0]"

@@ -351,6 +351,7 @@ class Membership(Generic[M]):
         by_policy = failure.of_policy and self.has_policy_code
         kind = PolicyRaised if by_policy else EnvironmentRaised
         self.events.append(self._failed(kind, member, failure.error, failure.traceback, failure.lane))
+        member.failed_lane = failure.lane
         self.remove(member, Failure, "failed")
 
     def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:

@@ -20,7 +20,7 @@ from millrace.protocol.lane_past import LanePast
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
-from millrace.workers.copies.env_errors import CopyFailed, environment_failed
+from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.lanes.lane import Lane
 
@@ -44,13 +44,11 @@ def bring_back(run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, puls
         lane.start([last.start + 1 for last in past.copies], pulse)
         return ""
     repeated = _Repeated(run, lane, copies, past, continued, pulse)
-    try:
+    with environment_failures(lane.number, "while its episode was continued"):
         repeated.repeat()
         lane.set_attributes(attributes, pulse)
         repeated.compare()
         repeated.start_others()
-    except CopyFailed as error:
-        raise environment_failed(lane.number, error, f"{error.doing}, while its episode was continued") from error
     repeated.hand_over()
     return NOT_REPEATED.format(repeated.why) if repeated.why else ""
 
