@@ -332,7 +332,7 @@ class MemberServer:
     def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
         """Log an event. `told`: the worker of whose failure the log has just told. Returns who that is now."""
         line = describe(event)
-        expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello | LaneContinued)
+        expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello)
         match event:
             case WorkerRefused(_, why) | NamelessHello(_, why):
                 self._last_turned_away = f"was refused: {one_line(why)}"
@@ -347,6 +347,8 @@ class MemberServer:
                 expected = True
             case Failed(worker):
                 told = worker
+            case LaneContinued(new_episodes=0):
+                expected = True
             case _:
                 pass
         if self._settings.log_joins or not isinstance(event, WorkerJoined):
