@@ -26,6 +26,7 @@ LARGEST = 2**53  # every whole number up to here is exact as a float64 too
 MAX_TICKETS = 1 << 16  # in one message
 MAX_WORKERS = 1_024  # that one supervisor speaks for
 MAX_COPIES = 1 << 16  # in one lane
+MAX_SAVED_BYTES = 1 << 22  # state of one env copy that its environment has saved
 MAX_SEEDS = 1_024  # in one order to evaluate
 MAX_FACTS = 32  # of an episode
 MOST_FRAMES = 1_500  # that are sent of one episode: a minute of video at 25 frames a second

@@ -4,7 +4,8 @@ Law: an episode is how it began and its actions. A copy is seeded once, when it 
 reset without a seed, from the random numbers that the environment then has. So whoever seeds a new copy as the old one was,
 gives it the random numbers that it had before its last reset, resets it and repeats the actions, has the old copy again, if
 the environment repeats itself. A worker tells with each rollout which episodes began in it (`EpisodeBegin`). The learner
-adds up the rollouts, and hands what it has (`LanePast`) to the worker that is to continue the lane.
+adds up the rollouts, and hands what it has (`LanePast`) to the worker that is to continue the lane. An environment that can
+save its state is not repeated: the state after the last row is in `LanePast.memory`.
 
 The number of a start decides the seed, and rises when a copy starts anew: when it failed, or could not be continued.
 """
@@ -43,11 +44,23 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None: the episode cannot be repeated, so the copy is to start anew, under the next number"""
+    """None: the episode cannot be repeated, so the copy is to start anew, under the next number, unless it is `saved`"""
     first: Natural
     """its first row in `LanePast.action`"""
     over: bool
     """whether the episode before it is over, and the next step begins it"""
+    saved: bool = False
+    """whether the state of the copy after the last row is in `LanePast.memory`: nothing is repeated"""
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the copy can be continued."""
+        return self.saved or self.random is not None
+
+    @property
+    def is_repeated(self) -> bool:
+        """Whether it is continued by repeating the actions of a running episode."""
+        return self.random is not None and not (self.saved or self.over)
 
 
 class AttributesFrom(msgspec.Struct, frozen=True, array_like=True):
@@ -77,10 +90,9 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     @property
     def repeated_steps(self) -> int:
         """Number of env steps that are repeated."""
-        played = [last for last in self.copies if last.random is not None and not last.over]
-        return sum(len(self.action) - last.first for last in played)
+        return sum(len(self.action) - last.first for last in self.copies if last.is_repeated)
 
     @property
     def new_episodes(self) -> int:
         """Number of copies that start anew."""
-        return sum(last.random is None for last in self.copies)
+        return sum(not last.goes_on for last in self.copies)

@@ -91,6 +91,8 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     memory: tuple[Array, ...] = ()
     """what else the worker needs in order to continue the lane after these rows: it comes back as it is, in `LanePast`. None
     from a worker that cannot continue one (rule PAST)"""
+    saved: Annotated[tuple[Natural, ...], Meta(max_length=MAX_COPIES)] = ()
+    """the copies whose environment has saved its state, which is in `memory` (rule PAST)"""
 
     @property
     def env_steps(self) -> int:
@@ -120,10 +122,13 @@ def rollout_bytes(run: RunSpec) -> int:
 
 
 def memory_bytes(run: RunSpec) -> int:
-    """Number of bytes of `Rollout.memory`, at most; without seats, exactly that, if the worker can continue a lane."""
+    """Number of bytes of `Rollout.memory`, at most, without the states that environments have saved.
+
+    Without seats, it is exactly that, if the worker can continue a lane.
+    """
     if run.teams:
         return 0
-    of_copies = run.copies * (run.seats_of_copy + 1) * 8
+    of_copies = run.copies * (run.seats_of_copy + 2) * 8
     of_state = run.columns * run.policy.state_size * 4
     if not run.seats:
         return of_copies + of_state

@@ -70,6 +70,8 @@ class LaneHistory:
         mask = () if rollout.mask is None else (rollout.mask,)
         self.obs = tuple(np.array(leaf[-1]) for leaf in (*rollout.obs, *mask))
         self.memory = tuple(np.array(each) for each in rollout.memory)
+        for n in rollout.saved:
+            self._saved(n)
         self._forget_long_ones(known=bool(rollout.memory))
         return np.array([new.start != old.start for new, old in zip(self.copies, before, strict=True)])
 
@@ -80,13 +82,13 @@ class LaneHistory:
 
     def start_anew(self, attempts: int) -> None:
         """All copies are to start anew, although so many attempts to go on have failed: none uses a number again."""
-        tried = [last.start + (last.random is None) for last in self.copies]  # in the first attempt
+        tried = [last.start + (not last.goes_on) for last in self.copies]  # in the first attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
         self.rows.clear()
 
     def past(self, lane: int) -> LanePast:
         """What a worker needs to go on."""
-        first_row = min((_needed_from(last) for last in self.copies if last.random is not None), default=self.count)
+        first_row = min((_needed_from(last) for last in self.copies if last.goes_on), default=self.count)
         kept = [rows for rows in self.rows if rows.first + len(rows.action) > first_row]
         action = np.concatenate([self.no_rows, *(rows.action for rows in kept)])
         start = kept[0].first if kept else self.count
@@ -131,23 +133,28 @@ class LaneHistory:
             return LastEpisode(start, random, self.count + int(np.flatnonzero(resets)[-1]) + 1, False)
         return last if began is None else LastEpisode(start, random, self.count, False)
 
+    def _saved(self, n: int) -> None:
+        """The state of copy n after the last row is in the memory: no row is needed any more."""
+        last = self.copies[n]
+        self.copies[n] = LastEpisode(last.start, last.random, self.count, last.over, saved=True)
+
     def _forget_long_ones(self, *, known: bool) -> None:
         """Mark what is not repeated, and keep only the rows of the rest. `known`: whether the worker can go on at all."""
         for n, last in enumerate(self.copies):
-            if last.random is not None and (not known or self.count - last.first > self.most_steps):
+            if last.goes_on and (not known or self.count - last.first > self.most_steps):
                 self.copies[n] = LastEpisode(last.start, None, self.count, False)
-        first_row = min((_needed_from(last) for last in self.copies if last.random is not None), default=self.count)
+        first_row = min((_needed_from(last) for last in self.copies if last.goes_on), default=self.count)
         while self.rows and self.rows[0].first + len(self.rows[0].action) <= first_row:
             self.rows.popleft()
 
     def _shifted(self, last: LastEpisode, start: int) -> LastEpisode:
-        first = 0 if last.random is None else last.first - start
-        return LastEpisode(last.start, last.random, first, last.over)
+        first = last.first - start if last.goes_on else 0
+        return LastEpisode(last.start, last.random, first, last.over, last.saved)
 
 
 def _needed_from(last: LastEpisode) -> int:
     """The first row that is needed to repeat an episode: the one that reset the copy, whose attributes it began with."""
-    return last.first - 1 if last.random and not last.over else last.first
+    return last.first - 1 if last.random and last.is_repeated else last.first
 
 
 def _resets(rollout: Rollout) -> Bools:

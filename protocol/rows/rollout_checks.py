@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from millrace.protocol.arrays import Array
-from millrace.protocol.bounds import LARGEST
+from millrace.protocol.bounds import LARGEST, MAX_SAVED_BYTES
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.policy.masks import no_choice, not_allowed
 from millrace.protocol.rollout import Episode, Rollout, memory_bytes
@@ -21,6 +21,7 @@ from millrace.protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 """No larger number is finite as a float32: returns are sums of rewards before they are rounded."""
+OF_SAVED_BYTES = 1_000  # that a saved state takes besides itself
 
 
 def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
@@ -76,7 +77,10 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     begun = [each.copy for each in rollout.begun]
     if len(set(begun)) < len(begun) or max(begun, default=0) >= run.copies:
         raise BadRollout(f"begun: expected each of the copies 0 to {run.copies - 1} at most once, got {begun[:100]}")
-    if (size := sum(array.nbytes for array in rollout.memory)) > (most := memory_bytes(run)):
+    if len(set(rollout.saved)) < len(rollout.saved) or max(rollout.saved, default=0) >= run.copies:
+        raise BadRollout(f"saved: expected copies 0 to {run.copies - 1}, each at most once, got {rollout.saved[:100]}")
+    most = memory_bytes(run) + len(rollout.saved) * (MAX_SAVED_BYTES + OF_SAVED_BYTES)
+    if (size := sum(array.nbytes for array in rollout.memory)) > most:
         raise BadRollout(f"memory: expected at most {most} bytes, got {size}")
 
 

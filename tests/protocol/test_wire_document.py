@@ -164,6 +164,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MAX_TICKETS"): "tickets in one message; also versions in a Heartbeat",
     (bounds, "MAX_WORKERS"): "workers that one supervisor speaks for",
     (bounds, "MAX_COPIES"): "env copies of one lane",
+    (bounds, "MAX_SAVED_BYTES"): "bytes of the state of one env copy that its environment has saved",
     (lane_past, "MAX_RANDOM_BYTES"): "bytes of a `RandomState`",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
     (bounds, "MAX_FACTS"): "facts of an episode",

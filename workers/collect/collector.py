@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from types import MappingProxyType
 
+import numpy as np
+
 from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import Stages
 from millrace.protocol.envs.kinds_of_copies import copies_kind
@@ -29,6 +31,7 @@ from millrace.workers.copies.env_copies import EnvCopies, check_spaces
 from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.open_lanes import OpenLanes
+from millrace.workers.copies.saved_state import packed
 from millrace.workers.copies.value_checks import check_acted, check_observed, check_rewards
 from millrace.workers.lanes.bring_back import bring_back
 from millrace.workers.lanes.lane import Lane
@@ -177,6 +180,9 @@ class Collector:
         check_acted(lane.number, "action", acted.action, rows.obs, axes)
         check_acted(lane.number, "log_prob", acted.log_prob, rows.obs, axes)
         rows.pass_on()
+        states = lane.save()
+        self.note = self.note or lane.copies.note
+        of_states = (np.frombuffer(packed(states), np.uint8),) if states else ()
         sent = lane.sent
         return Rollout(  # rules TICKETS, LANES, SEQUENCE
             session=session,
@@ -197,5 +203,6 @@ class Collector:
             extras=tuple(extra[:, sent] for extra in acted.extras),
             resets=None if lane.seats is None else rows.resets,
             begun=lane.begun(),
-            memory=lane.memory(),
+            memory=(*lane.memory(), *of_states),
+            saved=tuple(range(len(states))),
         )

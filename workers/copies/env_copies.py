@@ -20,7 +20,7 @@ from millrace.protocol.envs.description import agents_in_words, agents_of
 from millrace.protocol.envs.seats import SeatedEnv
 from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
-from millrace.protocol.errors import UsageError
+from millrace.protocol.errors import UsageError, first_line
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import unpack
@@ -32,6 +32,7 @@ from millrace.workers.copies.mask_reader import MaskReader, unused_mask
 from millrace.workers.copies.random_state import pack as pack_random_state
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.row_writers import read_leaves
+from millrace.workers.copies.saved_state import CannotSave, SavedCopy, load, save, saver
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]
@@ -184,6 +185,8 @@ class LoopedCopies:
             self.action_space = self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
         self.note = ""
+        self.saves = all(saver(env) is not None for env in self.envs)
+        """whether the environment can save its state"""
         if masked:
             self.observation_space = without_mask(self.observation_space, self.action_space)
         self.observation_space = with_last(self.observation_space, critic_keys)
@@ -242,6 +245,28 @@ class LoopedCopies:
     def set_random_state(self, copy: int, packed: bytes) -> bool:
         """Set the state of a copy's random generator. False if it has none that this state fits."""
         return self._loop.set_random_state(copy, packed)
+
+    def save(self) -> list[SavedCopy]:
+        """The state of each copy. Raises `CopyFailed`; and `CannotSave` if it is not one that is kept."""
+        states = []
+        with self._activity.during(STEPPING):
+            for n, env in enumerate(self.envs):
+                try:
+                    states.append(save(env))
+                except CannotSave:
+                    raise
+                except BaseException as error:
+                    raise CopyFailed(n, "save_state") from error
+        return states
+
+    def load(self, copy: int, state: SavedCopy) -> str:
+        """Give this copy, which was reset, a state. Returns why that is not possible; empty if it is done."""
+        try:
+            with self._activity.during(STEPPING):
+                load(self.envs[copy], state)
+        except Exception as error:  # it may be of another version of the environment, and nothing is lost by it
+            return f"load_state raised {type(error).__name__}: {first_line(error, 'no message')}"
+        return ""
 
     def begun(self, over: Sequence[int]) -> dict[int, bytes | None]:
         """From which random numbers the newest episode began of each copy that a step has reset since this was last asked;

@@ -3,7 +3,7 @@
 Rule: each episode is begun as it was, and its actions are repeated without the policy, row by row, in all copies together.
 Then what the copies show and what they gave is compared with the past. A copy that shows something else does not repeat
 itself: it starts anew, under the next number. Repeated steps are work of the environment, with its timeouts, and count as
-nothing else.
+nothing else. An environment that has saved its state gets it back, and repeats nothing.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from time import perf_counter
 
+import msgspec
 import numpy as np
 
 from millrace.protocol.arrays import Array, Doubles
@@ -22,11 +23,12 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
 from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.saved_state import SavedCopy, unpacked
 from millrace.workers.lanes.lane import Lane
 
 NOT_REPEATED = (
-    "the environment does not repeat itself: after a lost episode was begun again with the same seed and its actions were "
-    "repeated, {}; so a new episode began in its place, and the run depends on which workers were lost"
+    "the environment does not repeat itself: when a lost episode was begun again with the same seed and its actions were "
+    "repeated, or its saved state was loaded, {}; so a new episode began in its place, and the run depends on who was lost"
 )
 
 
@@ -36,16 +38,21 @@ def bring_back(run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, puls
     Returns what whoever trains should know, in one line; empty if there is nothing. Raises `EnvironmentFailed`.
     """
     copies = lane.copies
-    continued = []
-    if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, lane, run):
-        continued = [n for n, last in enumerate(past.copies) if last.random is not None]
+    continued: list[int] = []
+    states: list[SavedCopy] = []
+    saved = any(last.saved for last in past.copies)
+    memory = past.memory[:-1] if saved else past.memory
+    if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, memory, lane, run):
+        continued = [n for n, last in enumerate(past.copies) if last.goes_on]
+        states = _states(past.memory[-1], lane) if saved else []
     if not isinstance(copies, LoopedCopies) or not continued:  # the learner knows why
         lane.set_attributes(attributes, pulse)
         lane.start([last.start + 1 for last in past.copies], pulse)
         return ""
-    repeated = _Repeated(run, lane, copies, past, continued, pulse)
+    repeated = _Repeated(run, lane, copies, msgspec.structs.replace(past, memory=memory), continued, pulse)
     with environment_failures(lane.number, "while its episode was continued"):
         repeated.repeat()
+        repeated.load(states)
         lane.set_attributes(attributes, pulse)
         repeated.compare()
         repeated.start_others()
@@ -84,25 +91,33 @@ class _Repeated:
         for row in range(len(past.action)):
             if row and row in attributes:
                 self._lane.set_attributes(attributes[row], self._pulse)
-            if late := [n for n in self.continued if self._first(n) == row > 0 and past.copies[n].random == b""]:
+            if late := [n for n in self.continued if self._first(n) == row > 0 and self._begins_with_start(n)]:
                 self._seed(late)
-            if playing := [n for n in self.continued if self._first(n) <= row and not past.copies[n].over]:
+            if playing := [n for n in self.continued if self._first(n) <= row and past.copies[n].is_repeated]:
                 result = self._step(taken[row], playing)
                 if row == len(past.action) - 1:
                     self._see(result, playing)
             if next_ones := [n for n in self.continued if self._first(n) == row + 1 and self._follows(n)]:
                 self._reset(next_ones)
         for n in list(self.continued):
-            if past.copies[n].over:
+            if past.copies[n].over and not past.copies[n].saved:
                 self._set_random(n)
-        self._copies.end([n for n in self.continued if past.copies[n].over])
+
+    def load(self, states: list[SavedCopy]) -> None:
+        """Load the states that were saved. A copy whose episode is over is reset by the next step."""
+        for n in list(self.continued):
+            if self._past.copies[n].saved:
+                why = self._copies.load(n, states[n]) if n < len(states) else "its state is damaged"
+                if why:
+                    self._differs(n, why)
+        self._copies.end([n for n in self.continued if self._past.copies[n].over])
 
     def compare(self) -> None:
         """A copy that is not as it was is continued no more."""
         past = self._past
-        returns = past.memory[0][:, :-1]
+        returns = past.memory[0][:, :-2]
         for n in list(self.continued):
-            if past.copies[n].over:
+            if not past.copies[n].is_repeated:
                 continue
             columns = columns_of([n], self._seats)
             most = self._sizes[n] * np.finfo(np.float64).eps * (len(past.action) - self._first(n) + 1)
@@ -127,15 +142,14 @@ class _Repeated:
         lane = self._lane
         past = self._past
         over = [n for n in self.continued if past.copies[n].over]
+        shown = columns_of([n for n in self.continued if not past.copies[n].is_repeated], self._seats)
         for new, old in zip(self._obs, past.obs, strict=True):
-            new[columns_of(over, self._seats)] = old[columns_of(over, self._seats)]
+            new[shown] = old[shown]
         lane.obs = tuple(self._obs)
         lane.playing[over] = False
         lane.episodes.begin(perf_counter())
         lane.episodes.returns += self._returns
         lane.recall(past.memory, self.continued)
-        for n in self.continued:
-            lane.episodes.lengths[n] = 0 if past.copies[n].over else len(past.action) - self._first(n)
         if lane.seats is not None:
             lane.seats.acts = self._acts
 
@@ -143,10 +157,15 @@ class _Repeated:
         """The row of the first action of the episode of copy n."""
         return self._past.copies[n].first
 
+    def _begins_with_start(self, n: int) -> bool:
+        """Whether the episode of copy n began with the seed of its start."""
+        last = self._past.copies[n]
+        return last.is_repeated and last.random == b""
+
     def _follows(self, n: int) -> bool:
         """Whether the episode of copy n began with a reset without a seed, which a step made."""
         last = self._past.copies[n]
-        return bool(last.random) and not last.over
+        return bool(last.random) and last.is_repeated
 
     def _seed(self, copies: list[int]) -> None:
         """Start these copies, each with the seed of its start."""
@@ -209,7 +228,16 @@ class _Repeated:
         self.why = self.why or why
 
 
-def _fits(past: LanePast, lane: Lane, run: RunSpec) -> bool:
+def _states(blob: Array, lane: Lane) -> list[SavedCopy]:
+    """The states of all copies; none if they are damaged."""
+    try:
+        states = unpacked(blob)
+    except (msgspec.MsgspecError, ValueError):
+        return []
+    return states if len(states) == lane.count else []
+
+
+def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec) -> bool:
     """Whether the arrays are those of this lane. They come from another worker, through the learner."""
     action = run.policy.action
     expected: Iterable[tuple[Array, tuple[int, ...], str]] = [
@@ -222,4 +250,4 @@ def _fits(past: LanePast, lane: Lane, run: RunSpec) -> bool:
     shapes = all(array.shape == shape and array.dtype == dtype for array, shape, dtype in expected)
     rows = all(last.first <= len(past.action) for last in past.copies)
     counts = len(past.copies) == lane.count and len(past.obs) == len(stored_leaves(run))
-    return shapes and rows and counts and lane.can_recall(past.memory)
+    return shapes and rows and counts and lane.can_recall(memory)

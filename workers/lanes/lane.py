@@ -26,6 +26,7 @@ from millrace.workers.copies.env_copies import EnvCopies, LoopedCopies, copy_see
 from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.row_writers import ObservationWriter
+from millrace.workers.copies.saved_state import CannotSave, SavedCopy
 from millrace.workers.copies.seated_copies import SeatedCopies
 from millrace.workers.copies.value_checks import check_rewards
 from millrace.workers.lanes.running_episodes import RunningEpisodes
@@ -138,6 +139,19 @@ class Lane:
             return ()
         state = (self.state,) if self.state.size else ()
         return (self.episodes.memory(perf_counter()), *state, *(() if self.seats is None else self.seats.memory()))
+
+    def save(self) -> list[SavedCopy]:
+        """The state of each copy, if the environment can save it. Raises `EnvironmentFailed`."""
+        copies = self.copies
+        if not (self.remembers and isinstance(copies, LoopedCopies) and copies.saves):
+            return []
+        try:
+            with environment_failures(self.number, "save_state"):
+                return copies.save()
+        except CannotSave as error:
+            copies.saves = False
+            copies.note = f"{error}, so its episodes are repeated if a worker is lost"
+            return []
 
     def can_recall(self, memory: Sequence[Array]) -> bool:
         """Whether this is the memory of such a lane."""

@@ -51,14 +51,15 @@ class RunningEpisodes:
         self._no_facts = (math.nan,) * len(run.info_keys)
 
     def memory(self, now_s: float) -> Doubles:
-        """[N, A + 1]: the returns so far, and the seconds."""
-        seconds = [[now_s - began_s] for began_s in self.began_s]
-        return np.concatenate([self.returns, seconds], axis=1)
+        """[N, A + 2]: the returns so far, the steps, and the seconds."""
+        steps_and_seconds = [[steps, now_s - began_s] for steps, began_s in zip(self.lengths, self.began_s, strict=True)]
+        return np.concatenate([self.returns, steps_and_seconds], axis=1)
 
     def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
         """Take over, for these copies, what `memory` said elsewhere."""
         for n in copies:
-            self.returns[n] = memory[n, :-1]
+            self.returns[n] = memory[n, :-2]
+            self.lengths[n] = memory[n, -2]
             self.began_s[n] = now_s - float(memory[n, -1])
 
     def begin(self, now_s: float) -> None:

@@ -1,0 +1,100 @@
+"""Environments that can save their state: `save_state() -> bytes` and `load_state(bytes)`, of the environment or a wrapper.
+
+Rule: what is outside of the object that saves must have no state of its own, or one that is known here: `TimeLimit` counts
+steps. With any other wrapper outside, the environment counts as one that cannot save. Beside what the environment saves, the
+state of `np_random` is kept. Nothing is unpickled here; what `load_state` does with its bytes is the environment's business.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import msgspec
+from gymnasium.wrappers import (
+    ClipAction,
+    FlattenObservation,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    RescaleAction,
+    TimeLimit,
+)
+
+from millrace.protocol.arrays import Bytes
+from millrace.protocol.bounds import MAX_SAVED_BYTES
+from millrace.workers.copies.random_state import pack, repeatable, set_state, state_of
+
+WITHOUT_STATE = (ClipAction, FlattenObservation, OrderEnforcing, PassiveEnvChecker, RescaleAction)
+"""Wrappers that remember nothing of an episode, by their exact types."""
+
+
+class SavedCopy(msgspec.Struct, frozen=True, array_like=True):
+    """The state of one env copy."""
+
+    state: bytes
+    """as its environment saved it"""
+    random: bytes | None
+    """state of its `np_random`; None if that cannot be read"""
+    elapsed: tuple[int, ...]
+    """steps that each `TimeLimit` outside has counted, the outermost first"""
+
+
+class CannotSave(Exception):
+    """The state is not one that is kept. Its text says why."""
+
+
+def saver(env: gymnasium.Env[Any, Any]) -> Any | None:
+    """The environment, or the wrapper of it, that can save its state; None if there is none."""
+    inner: Any = env
+    while True:
+        if callable(getattr(type(inner), "save_state", None)) and callable(getattr(type(inner), "load_state", None)):
+            return inner
+        if type(inner) not in (*WITHOUT_STATE, TimeLimit):
+            return None
+        inner = inner.env
+
+
+def save(env: gymnasium.Env[Any, Any]) -> SavedCopy:
+    """The state of an environment that can save it. Raises what its code raises, and `CannotSave`."""
+    state = _saver(env).save_state()
+    if not isinstance(state, bytes | bytearray | memoryview):
+        raise CannotSave(f"save_state returned {type(state).__name__}; expected bytes")
+    if len(state) > MAX_SAVED_BYTES:
+        raise CannotSave(f"save_state returned {len(state):,} bytes; at most {MAX_SAVED_BYTES:,} are kept")
+    return SavedCopy(bytes(state), pack(state_of(repeatable(env))), tuple(each._elapsed_steps or 0 for each in _limits(env)))
+
+
+def load(env: gymnasium.Env[Any, Any], saved: SavedCopy) -> None:
+    """Give an environment, which was reset, this state. Raises what its code raises."""
+    _saver(env).load_state(saved.state)
+    if saved.random is not None:
+        set_state(repeatable(env), saved.random)
+    for limit, steps in zip(_limits(env), saved.elapsed, strict=True):
+        limit._elapsed_steps = steps
+
+
+def packed(states: list[SavedCopy]) -> bytes:
+    """The states of several copies as bytes."""
+    return msgspec.msgpack.encode(states)
+
+
+def unpacked(data: Bytes) -> list[SavedCopy]:
+    """Those states. Raises `msgspec.ValidationError` or `msgspec.DecodeError`."""
+    return msgspec.msgpack.decode(data.tobytes(), type=list[SavedCopy])
+
+
+def _saver(env: gymnasium.Env[Any, Any]) -> Any:
+    found = saver(env)
+    assert found is not None
+    return found
+
+
+def _limits(env: gymnasium.Env[Any, Any]) -> list[Any]:
+    """The `TimeLimit` wrappers outside of what saves, the outermost first."""
+    limits = []
+    inner: Any = env
+    while inner is not _saver(env):
+        if isinstance(inner, TimeLimit):
+            limits.append(inner)
+        inner = inner.env
+    return limits
