@@ -30,7 +30,7 @@ class Purpose(IntEnum):
     COPIES = 7
     """reset seeds of env copies; lane, number of the start, copy"""
     ACTIONS = 8
-    """actions of rollouts, with their exploration; lane, round"""
+    """actions of rollouts, with their exploration; lane, with a stream for each round"""
     EVALUATION = 9
     """reset seeds of a run's evaluations; episode"""
     CONFIRMATION = 10
@@ -58,6 +58,24 @@ class Purpose(IntEnum):
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:
     """The stream, in numpy."""
     return np.random.default_rng(_sequence(seed, purpose, indices))
+
+
+class RoundStreams:
+    """One stream for each round: that of round r begins 2**64 · r draws after that of round 0, of 2**128.
+
+    It is several times faster than `generator`. The streams share one generator, so only the newest may be drawn from.
+    """
+
+    def __init__(self, seed: int, purpose: Purpose, *indices: int) -> None:
+        self._bits = np.random.PCG64(_sequence(seed, purpose, indices))
+        self._generator = np.random.Generator(self._bits)
+        self._first = self._bits.state
+
+    def of(self, number: int) -> np.random.Generator:
+        """The stream of this round."""
+        self._bits.state = self._first
+        self._bits.advance(number << 64)
+        return self._generator
 
 
 def env_seed(seed: int, purpose: Purpose, *indices: int) -> int:

@@ -24,7 +24,7 @@ from millrace.protocol.messages import Evaluate
 from millrace.protocol.policy.called_policy import Acted, CalledPolicy
 from millrace.protocol.policy.encoder import describe_encoder
 from millrace.protocol.policy.policy import make_policy
-from millrace.protocol.random_streams import Purpose, env_seed, generator, torch_seed
+from millrace.protocol.random_streams import Purpose, RoundStreams, env_seed, generator, torch_seed
 from millrace.protocol.specs import PolicySpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
@@ -180,3 +180,15 @@ def drawing_encoder(features: int, images: Any) -> nn.Module:
     """An encoder that keeps what it would draw."""
     ENCODER_DRAWS.append(torch_draws(torch.random.get_rng_state()))
     return nn.Linear(features, 4)
+
+
+def test_the_stream_of_a_round_does_not_depend_on_the_rounds_before_and_shares_no_number_with_another() -> None:
+    streams = RoundStreams(7, Purpose.ACTIONS, 3)
+    drawn = {number: streams.of(number).integers(2**63, size=100).tolist() for number in (5, 0, 1, 2**40)}
+    assert RoundStreams(7, Purpose.ACTIONS, 3).of(5).integers(2**63, size=100).tolist() == drawn[5]
+    assert len({draw for of_round in drawn.values() for draw in of_round}) == 400
+    half = streams.of(5)
+    half.integers(2**31, dtype=np.uint32)  # leaves half of a number, which the next stream must not give
+    assert streams.of(0).integers(2**31, dtype=np.uint32, size=3).tolist() == (
+        RoundStreams(7, Purpose.ACTIONS, 3).of(0).integers(2**31, dtype=np.uint32, size=3).tolist()
+    )

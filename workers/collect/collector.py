@@ -9,6 +9,7 @@ The arrays of a rollout are new each time and are never written again, so they c
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from time import perf_counter
 from types import MappingProxyType
 
@@ -22,7 +23,7 @@ from millrace.protocol.messages import Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.policy.policy import Policy
-from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.random_streams import Purpose, RoundStreams, generator
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import ActedRows
@@ -70,6 +71,7 @@ class Collector:
         self._runner = LaneRunner(run, policy, step_all)
         self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
+        self._action_streams = cache(lambda lane: RoundStreams(run.seed, Purpose.ACTIONS, lane))
         self._ended_steps = 0  # of rollouts that are whole or were dropped
         self._under_way: Rows | None = None
 
@@ -119,7 +121,7 @@ class Collector:
             self._meet(lane, assignment, opponents)
         states = [lane.state if lane.seats is None else lane.seats.state_before(lane.state) for lane in lanes]
         run = self._run
-        drawn = [generator(run.seed, Purpose.ACTIONS, each.lane, each.round) for each in assignments]
+        drawn = [self._action_streams(each.lane).of(each.round) for each in assignments]
         actions = self._runner.acting.begin(drawn)
         rows = self._under_way = Rows(run, lanes, run.rollout_steps)
         try:

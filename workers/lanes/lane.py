@@ -130,7 +130,9 @@ class Lane:
         random: dict[int, bytes | None] = dict.fromkeys(self.new_starts, b"" if self.remembers else None)
         self.new_starts = ()
         if self.remembers and isinstance(self.copies, LoopedCopies):
-            random |= self.copies.begun(np.flatnonzero(~self.playing).tolist())
+            random |= self.copies.begun([n for n, playing in enumerate(self.playing.tolist()) if not playing])
+        if not random:
+            return ()
         return tuple(EpisodeBegin(n, self.starts[n], state) for n, state in sorted(random.items()))
 
     def memory(self) -> tuple[Array, ...]:  # rule PAST

@@ -52,8 +52,11 @@ class RunningEpisodes:
 
     def memory(self, now_s: float) -> Doubles:
         """[N, A + 2]: the returns so far, the steps, and the seconds."""
-        steps_and_seconds = [[steps, now_s - began_s] for steps, began_s in zip(self.lengths, self.began_s, strict=True)]
-        return np.concatenate([self.returns, steps_and_seconds], axis=1)
+        memory = np.empty((len(self.lengths), self.returns.shape[1] + 2))
+        memory[:, :-2] = self.returns
+        memory[:, -2] = self.lengths
+        memory[:, -1] = [now_s - began_s for began_s in self.began_s]
+        return memory
 
     def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
         """Take over, for these copies, what `memory` said elsewhere."""

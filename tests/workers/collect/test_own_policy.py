@@ -167,7 +167,7 @@ class Sampling(Linear):
         ("factory raises", "policy Broken: cannot be made: it raised ValueError: no such thing"),
         ("action shape", "act: the action: expected int64[3], got int64[1, 3]"),
         ("action dtype", "act: the action: expected int64[3], got float64[3]"),
-        ("action range", "act: the action: expected 0 to 1, got 3 at copy 0"),
+        ("action range", "act: the action: expected 0 to 1, got 2 at copy 0"),
         ("state shape", "act: the state: expected float32[3, 1], got float32[3, 0]"),
         ("extra missing", "act: expected the extras log_prob, logits, side, got log_prob, logits"),
         ("extra unknown", "act: expected the extras log_prob, logits, side, got log_prob, logits, side, more"),

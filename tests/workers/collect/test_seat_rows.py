@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from pettingzoo.utils.wrappers import BaseWrapper
 
-import millrace.workers.collect.collector
 from millrace.learner.algorithms.minibatches import log_probs
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer
@@ -23,6 +22,7 @@ from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed, UsageError
 from millrace.protocol.messages import EpisodeRows, Evaluate
 from millrace.protocol.policy.policy import make_policy
+from millrace.protocol.random_streams import RoundStreams
 from millrace.protocol.rollout import Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
@@ -118,7 +118,7 @@ def test_episodes_count_every_reward_and_have_the_facts_of_their_last_step(form:
 def test_rows_do_not_depend_on_where_rollouts_are_cut(form: str, core: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One version acts in all of them, so the rows, and the states before them, are the same for the same random numbers."""
     drawn = dict[str, np.random.Generator]()
-    monkeypatch.setattr(millrace.workers.collect.collector, "generator", lambda *_: drawn["actions"])
+    monkeypatch.setattr(RoundStreams, "of", lambda *_: drawn["actions"])
     drawn["actions"] = np.random.default_rng(1)
     _, whole = collected(seated_run(form, T=24, N=5, core=core), 1)
     expected = joined(whole)
