@@ -11,11 +11,13 @@ from typing import Literal
 import msgspec
 
 Doing = Literal[
-    "starting", "waiting", "describing", "making", "preparing", "resetting", "stepping", "acting", "evaluating", "closing"
-]
+    "starting", "waiting", "describing", "making", "preparing", "resetting", "stepping", "repeating", "acting", "evaluating",
+    "closing",
+]  # fmt: skip
 """What a worker does, as its supervisor sees it. Code of the user runs in all of these except `starting` and `waiting`.
 
-`making`: an env copy. `preparing`: a policy, with all that it imports. `acting`: a call of a policy that is the user's code.
+`making`: an env copy. `repeating`: a step of an episode that another worker has lost. `preparing`: a policy, with all that it
+imports. `acting`: a call of a policy that is the user's code.
 """
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 OUR_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
@@ -26,6 +28,7 @@ CALLS: dict[Doing, str] = {
     "preparing": "the construction of the policy",
     "resetting": "a reset of its environment",
     "stepping": "a step of its environment",
+    "repeating": "a step of an episode that it repeats",
     "acting": "a call of the policy",
     "evaluating": "a step of an evaluation",
     "closing": "close() of its environment",
@@ -49,7 +52,7 @@ class CallTimeouts(msgspec.Struct, frozen=True):
         match doing:
             case "describing" | "making" | "preparing" | "resetting":
                 limit = self.start_s
-            case "stepping" | "acting" | "evaluating":
+            case "stepping" | "repeating" | "acting" | "evaluating":
                 limit = self.step_s
             case "closing":
                 limit = CLOSE_S
@@ -63,6 +66,6 @@ class CallTimeouts(msgspec.Struct, frozen=True):
 
     def reason(self, doing: Doing) -> str:
         """Why a worker is ended that exceeds its limit. The line names the flag."""
-        flag = "step" if doing in ("stepping", "acting", "evaluating") else "start"
+        flag = "step" if doing in ("stepping", "repeating", "acting", "evaluating") else "start"
         named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
         return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"

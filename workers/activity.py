@@ -29,7 +29,19 @@ PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000
 STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention: write the stack of each thread
 DOINGS: tuple[Doing, ...] = get_args(Doing)
-STARTING, WAITING, DESCRIBING, MAKING, PREPARING, RESETTING, STEPPING, ACTING, EVALUATING, CLOSING = range(len(DOINGS))
+(
+    STARTING,
+    WAITING,
+    DESCRIBING,
+    MAKING,
+    PREPARING,
+    RESETTING,
+    STEPPING,
+    REPEATING,
+    ACTING,
+    EVALUATING,
+    CLOSING,
+) = range(len(DOINGS))
 # Places of the numbers in the page.
 DOING, SINCE_S, ENV_CALLS, LEAVES, LEAVES_SINCE_S, START_TIMEOUT_S, STEP_TIMEOUT_S = range(7)
 MOST_CALLS = 2**53

@@ -17,6 +17,7 @@ DOING = {
     "preparing": "in the policy's construction",
     "resetting": "in reset",
     "stepping": "in step",
+    "repeating": "repeating lost steps",
     "acting": "in the policy",
     "evaluating": "in evaluation",
     "closing": "in close",
@@ -46,7 +47,7 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
     if silent_s >= LONG_S:
         seconds = silent_s
         what = f"silent for {silent_s:.0f} s"
-    elif row.doing_s >= LONG_S and row.doing in DOING:
+    elif row.doing == "repeating" or (row.doing_s >= LONG_S and row.doing in DOING):
         seconds = row.doing_s
         what = in_words(row.doing, row.doing_s)
     return seconds, -row.steps_per_s, f"worker {row.worker} on {row.host}: {what}"

@@ -6,7 +6,8 @@ no step resets a copy. What a step returns is stored at once, so copies may retu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol
 
@@ -24,7 +25,7 @@ from millrace.protocol.errors import UsageError, first_line
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import unpack
-from millrace.workers.activity import EVALUATING, MAKING, STEPPING, activity
+from millrace.workers.activity import EVALUATING, MAKING, REPEATING, STEPPING, activity
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Pulse
 from millrace.workers.copies.episode_facts import Facts, facts_of_info
@@ -236,6 +237,16 @@ class LoopedCopies:
         if self._masks is not None:
             leaves = (*leaves, self._read_masks(self._masks, infos, copies))
         return StepResult(leaves, self._loop.reward, self._loop.terminated, self._loop.truncated)
+
+    @contextmanager
+    def repeating(self) -> Iterator[None]:
+        """Within it, steps repeat what other copies have done."""
+        stepping = self._loop.stepping
+        self._loop.stepping = REPEATING
+        try:
+            yield
+        finally:
+            self._loop.stepping = stepping
 
     def end(self, copies: Sequence[int]) -> None:
         """The episodes of these copies are over: the next step resets them."""

@@ -90,7 +90,8 @@ class EnvLoop:
         """by copy: state of its environment's random generator before the last reset that a step made"""
         self._step_functions = [env.step for env in self.envs]
         self._inner = [repeatable(env) for env in self.envs]
-        self._stepping = stepping
+        self.stepping = stepping
+        """what the worker does during a step"""
         self._all = range(len(self.envs))
         # rules NEXT_STEP, SAME_STEP, DISABLED
         self._next_step = autoreset == "NextStep"
@@ -131,7 +132,7 @@ class EnvLoop:
         if copies is not None:
             chosen = copies
             steps = [steps[n] for n in copies]
-        stepping = self._stepping
+        stepping = self.stepping
         reward = self.reward
         terminated = self.terminated
         truncated = self.truncated

@@ -50,7 +50,7 @@ def bring_back(run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, puls
         lane.start([last.start + 1 for last in past.copies], pulse)
         return ""
     repeated = _Repeated(run, lane, copies, msgspec.structs.replace(past, memory=memory), continued, pulse)
-    with environment_failures(lane.number, "while its episode was continued"):
+    with environment_failures(lane.number, "while its episode was continued"), copies.repeating():
         repeated.repeat()
         repeated.load(states)
         lane.set_attributes(attributes, pulse)

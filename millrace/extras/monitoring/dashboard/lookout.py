@@ -43,6 +43,7 @@ LEARNER: dict[str, str] = {
 """What a learner does in each phase, in the words of the picture"""
 WORKER = {
     "stepping": "collecting",
+    "repeating": "resetting",
     "resetting": "resetting",
     "making": "resetting",
     "preparing": "starting",
