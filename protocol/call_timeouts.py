@@ -16,8 +16,8 @@ Doing = Literal[
 ]  # fmt: skip
 """What a worker does, as its supervisor sees it. Code of the user runs in all of these except `starting` and `waiting`.
 
-`making`: an env copy. `repeating`: a step of an episode that another worker has lost. `preparing`: a policy, with all that it
-imports. `acting`: a call of a policy that is the user's code.
+`making`: an env copy. `repeating`: a step of an episode that another worker has lost. `preparing`: a policy, with all that
+it imports. `acting`: a call of a policy that is the user's code.
 """
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 OUR_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
