@@ -212,8 +212,9 @@ class RewardScaler:
         for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
             columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
-            start = self._returns.get(lane)
-            start = np.zeros(batch.columns_per_rollout) if start is None else np.where(batch.fresh[columns], 0.0, start)
+            fresh = batch.fresh[columns]
+            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # of a fresh lane, perhaps of another size
+            start = np.where(fresh, 0.0, known)
             returns, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )

@@ -190,8 +190,9 @@ class ReplayBuffer:
         most = valid.size + valid.shape[1]
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
-        newest = self._newest.get(lane, NO_SLOT)
-        newest = np.where(batch.fresh[columns], NO_SLOT, newest)
+        fresh = batch.fresh[columns]
+        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # of a fresh lane, perhaps of another size
+        newest = np.where(fresh, NO_SLOT, known)
         continues = self._continues([leaf[0] for leaf in obs], newest, most)
         goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
         needed = np.zeros(goes_on.shape, bool)  # [T+1, N] observations to store

@@ -256,6 +256,14 @@ def test_a_fresh_lane_starts_from_zero() -> None:
     np.testing.assert_allclose(scaled, second[0] / slow_std(columns_of(first) + columns_of(second)), rtol=1e-5)
 
 
+def test_a_fresh_lane_may_have_more_copies_than_it_had() -> None:
+    first, second = lives(6, 2), lives(5, 3)
+    scaler = RewardScaler(GAMMA)
+    scaler.count_and_scale(batch(first[0], [0, 0], [True] * 2, first[1], first[2][0]))
+    scaled = scaler.count_and_scale(batch(second[0], [0, 0, 0], [True] * 3, second[1], second[2][0], copies=3))
+    np.testing.assert_allclose(scaled, second[0] / slow_std(columns_of(first) + columns_of(second)), rtol=1e-5)
+
+
 def test_the_reward_of_a_row_that_is_not_valid_changes_nothing() -> None:
     reward, ended, valid = lives(12, 2)
     assert not valid.all()

@@ -277,6 +277,13 @@ def test_a_fresh_lane_cuts_even_where_observations_are_the_same() -> None:
     assert drawn.discount[drawn.leaves[0][:, 0] == first.obs[0][0, 0, 0]] == pytest.approx(GAMMA**4)
 
 
+def test_a_fresh_lane_may_have_more_copies_than_it_had() -> None:
+    kept = replay()
+    for copies in (2, 3):
+        kept.add(Lanes(copies, lanes=1, copies=copies, T=2, ends=0.0).rollout(0))
+    assert len(kept) == 2 * (2 + 3)
+
+
 def test_nothing_goes_on_from_an_end_even_where_observations_are_the_same() -> None:
     """The rollout that reset the copy was dropped, and the next one begins as the truncated episode ended."""
     lanes, kept = Lanes(0, lanes=1, copies=1, T=2, ends=0.0), replay(n_step=4)
