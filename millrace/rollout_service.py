@@ -327,8 +327,10 @@ class RolloutService:
     def save(self, path: str | os.PathLike[str], **arrays: object) -> None:
         """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
 
-        Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes
-        and normalizer continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
+        Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, rounds and
+        normalizer continue, and `restored` has the arrays. Workers repeat the episodes that ran when the last batch was
+        gathered, and go on there. If the environment repeats itself, the next batches are those that this service returns
+        next.
 
         Raises `UsageError` for arrays that are not of numbers, and `RunError` if the file cannot be written.
 

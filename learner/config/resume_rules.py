@@ -20,7 +20,7 @@ class OnResume(Enum):
     """How a resumed run takes another value of a setting. The value of a member is its meaning, for the documentation."""
 
     FREE = "Another value takes effect at once."
-    ADAPTABLE = "Another value takes effect at once. The state of each lane and env copy starts again from the beginning."
+    ADAPTABLE = "Another value takes effect at once. Lanes that then have another number of env copies begin new episodes."
     FIXED = "Another value is refused: the weights or the state of the run would not match the new value."
 
 

@@ -146,10 +146,12 @@ def test_the_rest_is_taken(tmp_path: Path) -> None:
         "max_lag": 2,
     }
     assert check_settings(resolve(resume=run, **free), run) == []
+    lines = check_settings(resolve(resume=run, lanes=2, envs=8), run)
+    assert lines == [f"run {run}: lanes: 2 now, 4 before; every lane begins new episodes"]
     lines = check_settings(resolve(resume=run, lanes=2, envs=4), run)
     assert lines == [
-        f"run {run}: envs: 4 now, 8 before; every lane starts on new env copies",
-        f"run {run}: lanes: 2 now, 4 before; every lane starts on new env copies",
+        f"run {run}: envs: 4 now, 8 before; lanes that the run had go on",
+        f"run {run}: lanes: 2 now, 4 before; lanes that the run had go on",
     ]
 
 
