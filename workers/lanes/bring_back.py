@@ -145,6 +145,7 @@ class _Repeated:
         shown = columns_of([n for n in self.continued if not past.copies[n].is_repeated], self._seats)
         for new, old in zip(self._obs, past.obs, strict=True):
             new[shown] = old[shown]
+        self._acts[columns_of(over, self._seats)] = False
         lane.obs = tuple(self._obs)
         lane.playing[over] = False
         lane.episodes.begin(perf_counter())

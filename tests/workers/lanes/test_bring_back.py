@@ -1,0 +1,198 @@
+"""A lane that is brought back goes on as the one that was lost: the rollouts that follow have the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from millrace.learner.rollouts.lane_history import LaneHistory
+from millrace.learner.rollouts.past_rollouts import packed, unpacked
+from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.envs.action_masks import without_mask
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.messages import LanePast
+from millrace.protocol.rollout import Rollout
+from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.workers.collect.collector import Collector
+from millrace.workers.conversation.held import Assignment
+from tests.support.in_process.collectors import SESSION, TOY, VERSION, bits, collect, no_pulse, random_collector, run_of
+from tests.support.users_code.mask_envs import CHOICES, InObservation
+from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame
+
+HERE = "tests.workers.lanes.test_bring_back:"
+MOST_STEPS = 10_000
+MORE = 3  # rollouts that are compared
+
+Attributes = Callable[[int], bytes]
+"""By round: those of the env copies, packed."""
+
+
+def no_attributes(number: int) -> bytes:
+    return b""
+
+
+# ------------------------------------------------------------------------------------------------ environments
+
+
+class Leveled(gymnasium.Env[Any, Any]):
+    """The attribute `level` is in what an episode begins with, in what a step draws, and in its reward."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-100, 100, (2,), np.float32)
+        self.action_space = spaces.Discrete(3)
+        self.level = 1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._at = self.level * float(self.np_random.random())
+        return self._shown(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._at = (self._at + self.level * float(self.np_random.normal()) + int(action)) % 50
+        return self._shown(), self._at / 7, bool(self.np_random.random() < 0.1), False, {}
+
+    def _shown(self) -> Any:
+        return np.array([self._at, self.level], np.float32)
+
+
+class _Seeded:
+    """The random histories of `seat_envs`, from the random numbers that PettingZoo's environments have."""
+
+    np_random: np.random.Generator
+    _generator: np.random.Generator
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)  # type: ignore[misc]
+        self.np_random = self._generator
+
+    def _observation(self) -> Any:
+        return self._generator.random(1, np.float32)
+
+
+class Game(_Seeded, RandomGame):
+    """Agents take turns."""
+
+
+class Crowd(_Seeded, RandomCrowd):
+    """Agents act at the same time."""
+
+
+class MaskedGame(Game):
+    """Agents take turns, and some actions are not allowed."""
+
+    def observation_space(self, agent: str) -> Any:
+        return spaces.Dict({"action_mask": spaces.MultiBinary(3), "seen": spaces.Box(0, np.inf, (1,), np.float32)})
+
+    def last(self, observe: bool = True) -> Any:
+        seen, *others = super().last(observe)
+        bits = int(1 + 7 * float(self._shown[self.agent_selection][0])) if observe else 7
+        return {"seen": seen, "action_mask": np.array([bits & 1, bits & 2, bits & 4], bool).astype(np.int8)}, *others
+
+
+gymnasium.register("Leveled-v0", f"{HERE}Leveled")
+
+
+def seated_run(kind: type[RandomGame | RandomCrowd], T: int, N: int, **policy: Any) -> RunSpec:
+    env = kind()
+    space = env.observation_space("a")
+    masked = isinstance(space, spaces.Dict)
+    seen = without_mask(space, env.action_space("a")) if masked else space
+    spec = PolicySpec(observation_leaves(seen), action_spec(env.action_space("a")), **policy)
+    turns = kind is not Crowd
+    facts = seat_returns(AGENTS)
+    name = EnvSpec(f"{HERE}{kind.__name__}")
+    return RunSpec(name, spec, T, N, lanes=8, seed=1, seats=AGENTS, takes_turns=turns, facts=facts, masked=masked)
+
+
+def masked_run(T: int, N: int) -> RunSpec:
+    env = InObservation()
+    policy = PolicySpec(
+        observation_leaves(without_mask(env.observation_space, env.action_space)), action_spec(env.action_space)
+    )
+    name = EnvSpec.of("tests.support.users_code.mask_envs:InObservation-v0", {})
+    assert env.action_space.n == CHOICES
+    return RunSpec(name, policy, T, N, lanes=8, seed=1, masked=True)
+
+
+RUNS: dict[str, Callable[[int, int], RunSpec]] = {
+    "discrete": lambda T, N: run_of("CartPole-v1", T, N),
+    "gaussian": lambda T, N: run_of("Pendulum-v1", T, N),
+    "squashed": lambda T, N: run_of("Pendulum-v1", T, N, head="squashed"),
+    "lstm": lambda T, N: run_of("CartPole-v1", T, N, core="lstm", core_size=5),
+    "gru": lambda T, N: run_of(f"{TOY}Recall-v0", T, N, core="gru", core_size=3),
+    "dict": lambda T, N: run_of(f"{TOY}Spaces-v0", T, N, {"observation": "dict", "action": "table"}),
+    "masks": masked_run,
+    "turns": lambda T, N: seated_run(Game, T, N),
+    "turns, lstm": lambda T, N: seated_run(Game, T, N, core="lstm", core_size=3),
+    "together": lambda T, N: seated_run(Crowd, T, N),
+    "together, gru": lambda T, N: seated_run(Crowd, T, N, core="gru", core_size=3),
+}
+
+
+# ------------------------------------------------------------------------------------------------ two lives of a lane
+
+
+def rollout_of(collector: Collector, run: RunSpec, number: int, attributes: Attributes, past: LanePast | None) -> Rollout:
+    """The rollout of lane 0 in this round, on env copies that continue `past` if they are not here."""
+    collector.env_attributes = attributes(number)
+    if past is None:
+        return collect(collector, run, number)[0]
+    return collector.collect([Assignment(100, 0, 1, number, number, past=past)], VERSION, SESSION, no_pulse)[0]
+
+
+def past_of(run: RunSpec, rollouts: list[Rollout], attributes: Attributes, most_steps: int = MOST_STEPS) -> LanePast:
+    """What is handed to a worker after these rollouts, as a checkpoint keeps it."""
+    history = LaneHistory.of_nothing(run.copies, most_steps)
+    for number, rollout in enumerate(rollouts):
+        history.add(rollout, attributes(number))
+    (past,) = unpacked(LanePast, packed([history.past(0)]))
+    return past
+
+
+def all_bits(rollout: Rollout) -> dict[str, object]:
+    """What must be the same in a rollout, and what the next worker is told of its past. Seconds are not."""
+    seconds_off = [rollout.memory[0][:, :-1].tobytes()] if rollout.memory else []
+    return {
+        **bits(rollout),
+        "mask": None if rollout.mask is None else rollout.mask.tobytes(),
+        "resets": None if rollout.resets is None else rollout.resets.tobytes(),
+        "facts": [(episode.facts, episode.opponent) for episode in rollout.episodes],
+        "begun": rollout.begun,
+        "memory": [*seconds_off, *(each.tobytes() for each in rollout.memory[1:])],
+    }
+
+
+def assert_goes_on(run: RunSpec, borders: list[int], attributes: Attributes = no_attributes) -> None:
+    """The lane is lost after so many rollouts, again and again, and it makes no difference."""
+    rounds = borders[-1] + MORE
+    undisturbed = random_collector(run)
+    expected = [rollout_of(undisturbed, run, number, attributes, None) for number in range(rounds)]
+    collector = random_collector(run)
+    found: list[Rollout] = []
+    past: LanePast | None = None
+    for number in range(rounds):
+        if number in borders and number:
+            collector.lanes.close_all()
+            collector = random_collector(run)
+            past = past_of(run, found, attributes)
+        found.append(rollout_of(collector, run, number, attributes, past))
+        assert "repeat itself" not in collector.note, f"round {number}: {collector.note}"
+        assert all_bits(found[-1]) == all_bits(expected[number]), f"round {number}"
+    undisturbed.lanes.close_all()
+    collector.lanes.close_all()
+
+
+@pytest.mark.parametrize("kind", RUNS)
+@given(T=st.integers(1, 14), N=st.integers(1, 3), borders=st.lists(st.integers(1, 5), min_size=1, max_size=2, unique=True))
+@example(T=1, N=2, borders=[1])
+@example(T=9, N=2, borders=[2, 3, 5])
+@settings(max_examples=8, deadline=None)
+def test_a_lane_that_is_brought_back_goes_on_as_it_would_have(kind: str, T: int, N: int, borders: list[int]) -> None:
+    assert_goes_on(RUNS[kind](T, N), sorted(borders))
