@@ -1,6 +1,7 @@
 """A loop over N env copies with A seats each: N · A columns, those of a copy side by side.
 
-Rule: a column shows the mask of the last observation in which its seat acts; all actions are allowed while it has none.
+Rule: a column shows the mask of the episode's last observation in which its seat acts; all actions are allowed while it has
+none.
 """
 
 from __future__ import annotations
@@ -56,13 +57,20 @@ class SeatedCopies(LoopedCopies):
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
         """Step with actions [N · A, *action], or with those of some copies. The result has a row for each column."""
         of_copies = actions.reshape(-1, self._seats, *actions.shape[1:])
-        self._loop.step(of_copies, self._observations, pulse, copies)
-        return self._result(range(self.count) if copies is None else copies)
+        stepped = range(self.count) if copies is None else copies
+        loop = self._loop
+        self._forget_masks(n for n in stepped if loop.terminated[n] or loop.truncated[n])  # they are reset
+        loop.step(of_copies, self._observations, pulse, copies)
+        return self._result(stepped)
 
     def _after_reset(self, copies: Sequence[int], infos: CopyInfos) -> StepResult:
+        self._forget_masks(copies)
+        return self._result(copies)
+
+    def _forget_masks(self, copies: Iterable[int]) -> None:
+        """These copies begin an episode."""
         for n in copies:
             self._allowed[n * self._seats : (n + 1) * self._seats] = [None] * self._seats
-        return self._result(copies)
 
     def _result(self, stepped: Sequence[int]) -> StepResult:
         """What the last step of these copies returned. The others show their last step; copies never reset are left out."""

@@ -131,6 +131,7 @@ RUNS: dict[str, Callable[[int, int], RunSpec]] = {
     "masks": masked_run,
     "turns": lambda T, N: seated_run(Game, T, N),
     "turns, lstm": lambda T, N: seated_run(Game, T, N, core="lstm", core_size=3),
+    "turns, masks": lambda T, N: seated_run(MaskedGame, T, N),
     "together": lambda T, N: seated_run(Crowd, T, N),
     "together, gru": lambda T, N: seated_run(Crowd, T, N, core="gru", core_size=3),
 }
