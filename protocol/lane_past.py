@@ -81,7 +81,7 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     action: Array
     """[K, N · A, *action], as in rollouts: of the rows since the earliest of these episodes began"""
     attributes: tuple[AttributesFrom, ...]
-    """by row, the first one from row 0 on; none if no attributes were set"""
+    """by row; the rows before the first one had none"""
     obs: tuple[Array, ...]
     """[N · A, *leaf] for each leaf, then the mask if there are masks: the observations that follow the last row"""
     memory: tuple[Array, ...]

@@ -112,10 +112,12 @@ class LaneHistory:
             memory=past.memory,
             no_rows=past.action[:0],
         )
-        ends = [*(each.row for each in past.attributes[1:]), len(past.action)]
-        begins = past.attributes or (AttributesFrom(0, np.zeros(0, np.uint8)),)
+        none_yet = AttributesFrom(0, np.zeros(0, np.uint8))
+        begins = [none_yet, *past.attributes]
+        ends = [*(each.row for each in past.attributes), len(past.action)]
         for each, end in zip(begins, ends, strict=True):
-            found.rows.append(_OfRound(each.row, past.action[each.row : end], each.packed.tobytes()))
+            if each.row < end:
+                found.rows.append(_OfRound(each.row, past.action[each.row : end], each.packed.tobytes()))
         return found
 
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -20,6 +20,7 @@ from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.messages import LanePast
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.protocol.wire.plain_values import pack
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from tests.support.in_process.collectors import SESSION, TOY, VERSION, bits, collect, no_pulse, random_collector, run_of
@@ -148,13 +149,22 @@ def rollout_of(collector: Collector, run: RunSpec, number: int, attributes: Attr
     return collector.collect([Assignment(100, 0, 1, number, number, past=past)], VERSION, SESSION, no_pulse)[0]
 
 
-def past_of(run: RunSpec, rollouts: list[Rollout], attributes: Attributes, most_steps: int = MOST_STEPS) -> LanePast:
-    """What is handed to a worker after these rollouts, as a checkpoint keeps it."""
-    history = LaneHistory.of_nothing(run.copies, most_steps)
+def past_of(
+    run: RunSpec, rollouts: Sequence[Rollout], attributes: Attributes = no_attributes, *, resumes: bool = False
+) -> LanePast:
+    """What is handed to a worker after these rollouts. `resumes`: the learner is resumed after each of them."""
+    history = LaneHistory.of_nothing(run.copies, MOST_STEPS)
     for number, rollout in enumerate(rollouts):
         history.add(rollout, attributes(number))
-    (past,) = unpacked(LanePast, packed([history.past(0)]))
-    return past
+        if resumes:
+            history = LaneHistory.of(saved(history.past(0)), MOST_STEPS)
+    return saved(history.past(0))
+
+
+def saved(past: LanePast) -> LanePast:
+    """As a checkpoint keeps it."""
+    (read,) = unpacked(LanePast, packed([past]))
+    return read
 
 
 def all_bits(rollout: Rollout) -> dict[str, object]:
@@ -170,7 +180,9 @@ def all_bits(rollout: Rollout) -> dict[str, object]:
     }
 
 
-def assert_goes_on(run: RunSpec, borders: list[int], attributes: Attributes = no_attributes) -> None:
+def assert_goes_on(
+    run: RunSpec, borders: list[int], attributes: Attributes = no_attributes, *, resumes: bool = False
+) -> None:
     """The lane is lost after so many rollouts, again and again, and it makes no difference."""
     rounds = borders[-1] + MORE
     undisturbed = random_collector(run)
@@ -182,7 +194,7 @@ def assert_goes_on(run: RunSpec, borders: list[int], attributes: Attributes = no
         if number in borders and number:
             collector.lanes.close_all()
             collector = random_collector(run)
-            past = past_of(run, found, attributes)
+            past = past_of(run, found, attributes, resumes=resumes)
         found.append(rollout_of(collector, run, number, attributes, past))
         assert "repeat itself" not in collector.note, f"round {number}: {collector.note}"
         assert all_bits(found[-1]) == all_bits(expected[number]), f"round {number}"
@@ -190,10 +202,51 @@ def assert_goes_on(run: RunSpec, borders: list[int], attributes: Attributes = no
     collector.lanes.close_all()
 
 
+BORDERS = st.lists(st.integers(1, 5), min_size=1, max_size=2, unique=True)
+
+
 @pytest.mark.parametrize("kind", RUNS)
-@given(T=st.integers(1, 14), N=st.integers(1, 3), borders=st.lists(st.integers(1, 5), min_size=1, max_size=2, unique=True))
-@example(T=1, N=2, borders=[1])
-@example(T=9, N=2, borders=[2, 3, 5])
+@given(T=st.integers(1, 14), N=st.integers(1, 3), borders=BORDERS, resumes=st.booleans())
+@example(T=1, N=2, borders=[1], resumes=False)
+@example(T=9, N=2, borders=[2, 3, 5], resumes=True)
 @settings(max_examples=8, deadline=None)
-def test_a_lane_that_is_brought_back_goes_on_as_it_would_have(kind: str, T: int, N: int, borders: list[int]) -> None:
-    assert_goes_on(RUNS[kind](T, N), sorted(borders))
+def test_a_lane_that_is_brought_back_goes_on_as_it_would_have(
+    kind: str, T: int, N: int, borders: list[int], resumes: bool
+) -> None:
+    assert_goes_on(RUNS[kind](T, N), sorted(borders), resumes=resumes)
+
+
+@pytest.mark.parametrize(
+    ("T", "borders"),
+    [(10, [1]), (11, [1]), (1, [9]), (1, [10]), (1, [11]), (1, [12]), (1, [10, 11, 12])],
+    ids=["over", "reset last", "last step", "over alone", "reset alone", "first step", "each"],
+)
+def test_an_episode_may_end_wherever_rollouts_are_cut(T: int, borders: list[int]) -> None:
+    assert_goes_on(run_of(f"{TOY}Identity-v0", T, N=2), borders)  # all its episodes have 10 steps
+
+
+# ------------------------------------------------------------------------------------------------ attributes
+
+
+@given(
+    T=st.integers(1, 9),
+    N=st.integers(1, 3),
+    borders=BORDERS,
+    levels=st.lists(st.sampled_from([None, 1, 2, 5]), min_size=8, max_size=8),
+    resumes=st.booleans(),
+)
+@example(T=3, N=2, borders=[2], levels=[None, 5, 5, 5, 2, 2, 2, 2], resumes=True)  # the first ones come during an episode
+@example(T=3, N=2, borders=[3], levels=[5, 5, 2, 2, 2, 2, 2, 2], resumes=False)
+@settings(max_examples=40, deadline=None)
+def test_each_row_is_repeated_with_the_attributes_that_it_had(
+    T: int, N: int, borders: list[int], levels: list[int | None], resumes: bool
+) -> None:
+    last: list[int | None] = []  # a run sets an attribute again and again, and never takes one back
+    for level in levels:
+        last.append(level if level is not None or not last else last[-1])
+
+    def attributes(number: int) -> bytes:
+        level = last[min(number, len(last) - 1)]
+        return b"" if level is None else pack({"level": level})
+
+    assert_goes_on(run_of(f"{HERE}Leveled-v0", T, N), sorted(borders), attributes, resumes=resumes)
