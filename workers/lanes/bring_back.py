@@ -23,6 +23,7 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
 from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
+from millrace.workers.copies.row_writers import write_numbers
 from millrace.workers.copies.saved_state import SavedCopy, unpacked
 from millrace.workers.lanes.lane import Lane
 
@@ -80,6 +81,7 @@ class _Repeated:
         self._obs = [np.empty_like(leaf) for leaf in past.obs]
         self._returns = np.zeros((lane.count, self._seats))
         self._sizes = np.zeros(lane.count)  # [N] sum of what the rewards are without their signs
+        self._numbers = (np.zeros(lane.columns), np.zeros(lane.columns, bool), np.zeros(lane.columns, bool))
 
     def repeat(self) -> None:
         """Begin the episodes as they began, and repeat their actions. Raises `CopyFailed`."""
@@ -123,7 +125,7 @@ class _Repeated:
             most = self._sizes[n] * np.finfo(np.float64).eps * (len(past.action) - self._first(n) + 1)
             if any((new[columns] != old[columns]).any() for new, old in zip(self._obs, past.obs, strict=True)):
                 self._differs(n, "it shows another observation")
-            elif np.abs(self._returns[n] - returns[n]).max() > most:  # sums of the same numbers in another order
+            elif not np.abs(self._returns[n] - returns[n]).max() <= most < np.inf:  # the same numbers in another order
                 self._differs(n, "its rewards add up to another return")
 
     def start_others(self) -> None:
@@ -207,14 +209,15 @@ class _Repeated:
         """Step these copies, and count what they gave."""
         self._pulse()
         result = self._copies.step(taken[columns_of(copies, self._seats)], self._pulse, copies)
-        self._count(copies, np.asarray(result.reward, np.float64))
-        if result.columns is None:
-            ended = [n for n in copies if result.terminated[n] or result.truncated[n]]
-        else:
+        write_numbers(self._numbers, slice(None), (result.reward, result.terminated, result.truncated))
+        reward, terminated, truncated = self._numbers
+        self._count(copies, reward)
+        over = terminated | truncated
+        if result.columns is not None:
             self._count(copies, result.columns.outside)
-            ended = np.flatnonzero(result.columns.over).tolist()
-        for n in ended:
-            if n in copies:
+            over = result.columns.over
+        for n in copies:
+            if over[n]:
                 self._differs(n, "it ended earlier")
         return result
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
+import random
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -17,13 +22,27 @@ from millrace.learner.rollouts.past_rollouts import packed, unpacked
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import LanePast
 from millrace.protocol.rollout import Rollout
+from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
-from tests.support.in_process.collectors import SESSION, TOY, VERSION, bits, collect, no_pulse, random_collector, run_of
+from millrace.workers.copies.reset_ahead import ResetAhead
+from tests.support.in_process.collectors import (
+    SESSION,
+    TOY,
+    VERSION,
+    bits,
+    collect,
+    loop_over,
+    no_pulse,
+    random_collector,
+    run_around,
+    run_of,
+)
 from tests.support.users_code.mask_envs import CHOICES, InObservation
 from tests.support.users_code.seat_envs import AGENTS, RandomCrowd, RandomGame
 
@@ -31,6 +50,7 @@ HERE = "tests.workers.lanes.test_bring_back:"
 MOST_STEPS = 10_000
 MORE = 3  # rollouts that are compared
 
+Make = Callable[[], gymnasium.Env[Any, Any]]
 Attributes = Callable[[int], bytes]
 """By round: those of the env copies, packed."""
 
@@ -250,3 +270,219 @@ def test_each_row_is_repeated_with_the_attributes_that_it_had(
         return b"" if level is None else pack({"level": level})
 
     assert_goes_on(run_of(f"{HERE}Leveled-v0", T, N), sorted(borders), attributes, resumes=resumes)
+
+
+# ------------------------------------------------------------------------------------------------ no repetition
+
+
+class Walk(gymnasium.Env[Any, Any]):
+    """A random walk that `Lives` counts. Where it draws from, and how it differs the second time, is up to the class."""
+
+    length = 7
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-100, 100, (1,), np.float32)
+        self.action_space = spaces.Discrete(2)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Before the first reset."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        self._at = self.draw()
+        return self._shown(), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        self._at += self.draw() + int(action)
+        return self._shown(), self.reward(), self._steps == self.length, False, {}
+
+    def draw(self) -> float:
+        return float(self.np_random.random())
+
+    def reward(self) -> Any:
+        return self._at
+
+    def _shown(self) -> Any:
+        return np.array([self._at], np.float32)
+
+
+class Clocked(Walk):
+    """It draws from a counter of its process, as from a clock."""
+
+    def draw(self) -> float:
+        return next(CLOCK) / 1000
+
+
+CLOCK = itertools.count()
+
+
+class ClockedReward(Walk):
+    """Only its rewards differ."""
+
+    def reward(self) -> Any:
+        return next(CLOCK) / 1000
+
+
+class Shorter(Walk):
+    """Each one that is made has shorter episodes."""
+
+    def prepare(self) -> None:
+        self.length = 20 - 4 * next(MADE)
+
+
+MADE = itertools.count()
+
+
+class OwnRandom(Walk):
+    """It has a generator of Python's, which it seeds as it should."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        if seed is not None:
+            self._own = random.Random(seed)
+        self._steps = 0
+        self._at = self.draw()
+        return self._shown(), {}
+
+    def draw(self) -> float:
+        return self._own.random()
+
+
+class Unseeded(Walk):
+    """It makes its generator itself, and never seeds it."""
+
+    def prepare(self) -> None:
+        self.np_random = np.random.default_rng()
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return super().reset()
+
+
+class Odd(Walk):
+    """A walk that gives another reward, shows something else or calls a function in its third step, until it starts anew."""
+
+    def __init__(self, reward: Any = ..., shown: float = 0, does: Callable[[], Any] = int) -> None:
+        super().__init__()
+        self._odd = reward, shown, does
+        self._starts = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self._starts += seed is not None
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, *others = super().step(action)
+        if self._starts == 1 and self._steps == 3:
+            odd_reward, shown, does = self._odd
+            does()
+            return observation + np.float32(shown), reward if odd_reward is ... else odd_reward, *others
+        return observation, reward, *others
+
+
+def continued(make: Make, T: int, rounds: int, then: Make | None = None) -> tuple[Collector, LanePast, Rollout, RunSpec]:
+    """A lane with two copies that is lost after so many rollouts: who has it then, and the next rollout.
+
+    `then`: makes the copies of who has it then.
+    """
+    run = msgspec.structs.replace(run_around(make(), T), copies=2)
+    first = random_collector(run, loop_over([make] * 2))
+    rollouts = [rollout_of(first, run, number, no_attributes, None) for number in range(rounds)]
+    past = past_of(run, rollouts)
+    second = random_collector(run, loop_over([then or make] * 2))
+    rollout = rollout_of(second, run, rounds, no_attributes, past)
+    validate(rollout, run)
+    return second, past, rollout, run
+
+
+def started_anew(rollout: Rollout) -> dict[int, int]:
+    """By copy, the number of the start of the new episodes of a rollout."""
+    return {each.copy: each.start for each in rollout.begun if each.start}
+
+
+@pytest.mark.parametrize(
+    ("make", "T", "rounds", "why"),
+    [
+        (Clocked, 3, 1, "it shows another observation"),
+        (Clocked, 3, 4, "it shows another observation"),
+        (ClockedReward, 3, 4, "its rewards add up to another return"),
+        (Shorter, 5, 2, "it ended earlier"),
+        (Unseeded, 3, 1, "it shows another observation"),
+        (lambda: NormalizeReward(Walk()), 3, 4, "its rewards add up to another return"),
+        (lambda: NormalizeObservation(Walk()), 3, 4, "it shows another observation"),
+        (lambda: NormalizeObservation(OwnRandom()), 3, 4, ""),
+        (OwnRandom, 3, 4, ""),
+        (lambda: ResetAhead(gymnasium.make("Pendulum-v1", max_episode_steps=7)), 3, 4, ""),
+    ],
+)
+def test_a_copy_that_does_not_repeat_itself_starts_anew(
+    make: Make, T: int, rounds: int, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("CLOCK", "MADE"):
+        monkeypatch.setitem(globals(), name, itertools.count())
+    collector, past, rollout, run = continued(make, T, rounds)
+    assert past.new_episodes == (0 if why else 2)  # the learner says how many cannot be repeated
+    assert why in collector.note
+    assert bool(why) == ("repeat itself" in collector.note)
+    assert collector.lanes[0].starts == [1, 1]
+    assert started_anew(rollout) == {0: 1, 1: 1}
+    for number in range(rounds + 1, rounds + 4):
+        validate(rollout_of(collector, run, number, no_attributes, None), run)
+
+
+@pytest.mark.parametrize(
+    ("odd", "why"),
+    [
+        ({"reward": np.nan}, "its rewards add up to another return"),
+        ({"reward": np.inf}, "its rewards add up to another return"),
+        ({"reward": -np.inf}, "its rewards add up to another return"),
+        ({"reward": None}, "its rewards add up to another return"),
+        ({"shown": np.nan}, "it shows another observation"),
+        ({"shown": 1e-3}, "it shows another observation"),
+    ],
+)
+def test_a_copy_that_gives_other_numbers_while_it_is_repeated_starts_anew(odd: Any, why: str) -> None:
+    collector, _, rollout, _ = continued(Walk, T=3, rounds=1, then=lambda: Odd(**odd))
+    assert why in collector.note
+    assert started_anew(rollout) == {0: 1, 1: 1}
+
+
+def fails() -> None:
+    raise SystemExit(3)  # worse than any other exception
+
+
+@pytest.mark.parametrize(
+    ("odd", "why"),
+    [
+        ({"does": fails}, "SystemExit"),
+        ({"reward": "one"}, "reward: expected a number, got 'one'"),
+        ({"reward": np.ones(2)}, "reward: expected a number, got an array of shape (2,)"),
+    ],
+)
+def test_what_a_copy_does_wrong_while_it_is_repeated_is_a_failure_of_its_lane(odd: Any, why: str) -> None:
+    with pytest.raises(EnvironmentFailed, match=re.escape(why)) as failed:
+        continued(Walk, T=3, rounds=2, then=lambda: Odd(**odd))
+    assert failed.value.lane == 0
+    assert "while its episode was continued" in str(failed.value)
+
+
+class ArrayRewards(Walk):
+    """Its rewards are arrays of one element."""
+
+    def reward(self) -> Any:
+        return np.array([self._at])
+
+
+def test_rewards_may_be_arrays_of_one_element(monkeypatch: pytest.MonkeyPatch) -> None:
+    lengths = itertools.cycle([4, 7])
+    monkeypatch.setattr(ArrayRewards, "prepare", lambda self: vars(self).update(length=next(lengths)))
+    run = msgspec.structs.replace(run_around(ArrayRewards(), 1), copies=2)
+    next(lengths)
+    opens = loop_over([ArrayRewards] * 2)
+    first = random_collector(run, opens)
+    rollouts = [rollout_of(first, run, number, no_attributes, None) for number in range(6)]
+    second = random_collector(run, opens)  # it resets one copy while the other one is in the middle of an episode
+    rollouts.append(rollout_of(second, run, 6, no_attributes, past_of(run, rollouts)))
+    assert second.note == ""
+    assert all_bits(rollouts[-1]) == all_bits(rollout_of(first, run, 6, no_attributes, None))
