@@ -476,7 +476,7 @@ class ArrayRewards(Walk):
 
 def test_rewards_may_be_arrays_of_one_element(monkeypatch: pytest.MonkeyPatch) -> None:
     lengths = itertools.cycle([4, 7])
-    monkeypatch.setattr(ArrayRewards, "prepare", lambda self: vars(self).update(length=next(lengths)))
+    monkeypatch.setattr(ArrayRewards, "prepare", lambda self: setattr(self, "length", next(lengths)))
     run = msgspec.structs.replace(run_around(ArrayRewards(), 1), copies=2)
     next(lengths)
     opens = loop_over([ArrayRewards] * 2)
