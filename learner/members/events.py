@@ -154,6 +154,8 @@ class LaneContinued:
     """Env steps that are repeated before it goes on."""
     new_episodes: int
     """How many of its env copies begin new episodes instead."""
+    longest: int = 0
+    """Steps of the longest episode that is given up because it has more than `--replay-limit`."""
 
 
 @dataclass(frozen=True)
@@ -231,11 +233,12 @@ def _line(event: LoggedEvent) -> str:
             return f"worker {worker} was told to join again: its session had ended{counted}"
         case EnvironmentNoted(worker, note):
             return f"worker {worker}: {note}"
-        case LaneContinued(worker, lane, repeated, new):
+        case LaneContinued(worker, lane, repeated, new, longest):
             parts = [f"{repeated:,} env steps are repeated first"] if repeated or not new else []
             if new:
                 parts.append(f"{new:,} env {'copies begin new episodes' if new > 1 else 'copy begins a new episode'}")
-            return f"lane {lane} goes on with worker {worker}: {', and '.join(parts)}"
+            why = f"; the longest one has {longest:,} steps, more than --replay-limit allows to repeat" if longest else ""
+            return f"lane {lane} goes on with worker {worker}: {', and '.join(parts)}{why}"
 
 
 def _dealt_again(tickets: int) -> str:

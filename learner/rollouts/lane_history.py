@@ -46,12 +46,14 @@ class LaneHistory:
     obs: tuple[Array, ...] = ()
     """[N · A, *leaf] each, then the mask if there are masks, after the last row"""
     memory: tuple[Array, ...] = ()
+    too_long: dict[int, int] = field(default_factory=dict)
+    """by copy whose running episode has become too long to be repeated: the number of its first row"""
     no_rows: Array = field(default_factory=lambda: np.zeros(0, np.float32))
     """[0, N · A, *action]"""
 
     def copy(self) -> LaneHistory:
         """The same, which the other one does not change."""
-        return replace(self, copies=list(self.copies), rows=self.rows.copy())
+        return replace(self, copies=list(self.copies), rows=self.rows.copy(), too_long=dict(self.too_long))
 
     def add(self, rollout: Rollout, attributes: bytes) -> Bools:
         """The next rollout of the lane has come. Returns [N] which copies had started anew when it began.
@@ -140,10 +142,19 @@ class LaneHistory:
         last = self.copies[n]
         self.copies[n] = LastEpisode(last.start, last.random, self.count, last.over, saved=True)
 
+    @property
+    def longest_given_up(self) -> int:
+        """Steps of the longest episode that has become too long to be repeated; 0 if there is none."""
+        return max((self.count - first for first in self.too_long.values()), default=0)
+
     def _forget_long_ones(self, *, known: bool) -> None:
         """Mark what is not repeated, and keep only the rows of the rest. `known`: whether the worker can go on at all."""
         for n, last in enumerate(self.copies):
+            if last.goes_on:
+                self.too_long.pop(n, None)
             if last.goes_on and (not known or self.count - last.first > self.most_steps):
+                if known and self.most_steps >= 0:
+                    self.too_long[n] = last.first
                 self.copies[n] = LastEpisode(last.start, None, self.count, False)
         first_row = min((_needed_from(last) for last in self.copies if last.goes_on), default=self.count)
         while self.rows and self.rows[0].first + len(self.rows[0].action) <= first_row:

@@ -100,12 +100,10 @@ class StallWatch:
     def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
         """The members whose oldest ticket is older than all their tickets may take together."""
         coordinator = self._coordinator
-        run = coordinator.run
         plan = coordinator.evaluation.plan
-        rollout_s = self._longest_s(run.copies, run.rollout_steps)
         episodes_s = 0.0 if plan is None else self._longest_s(plan.copies, plan.most_steps)
         held = {
-            (peer, number): rollout_s if number in coordinator.rollouts.held else episodes_s
+            (peer, number): self._rollout_s(number) if number in coordinator.rollouts.held else episodes_s
             for peer, member in coordinator.members.items()
             for number in member.tickets
         }
@@ -116,6 +114,17 @@ class StallWatch:
             oldest_s[peer] = min(oldest_s.get(peer, now), self._dealt_s[peer, number])
             allowed_s[peer] = allowed_s.get(peer, 0.0) + limit_s
         return tuple(coordinator.members[peer] for peer in oldest_s if now - oldest_s[peer] > allowed_s[peer])
+
+    def _rollout_s(self, number: int) -> float:
+        """How long the rollout of this ticket may take, with the steps that are repeated before it."""
+        run = self._coordinator.run
+        past = self._coordinator.rollouts.held[number].past
+        rollout_s = self._longest_s(run.copies, run.rollout_steps)
+        if past is not None:
+            rollout_s += run.copies * self._timeouts.limit_s("resetting")  # besides the one of the start
+        if past is not None and past.repeated_steps:
+            rollout_s += past.repeated_steps * self._timeouts.limit_s("repeating")
+        return rollout_s
 
     def _longest_s(self, copies: int, steps: int) -> float:
         limit_s = self._timeouts.limit_s

@@ -181,7 +181,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             for permit in order.permits if isinstance(order, Collect) else ():
                 if (past := permit.past) is not None and past.memory:  # rollouts of it have come
                     worker = self.members[peer].hello.worker
-                    self.events.append(LaneContinued(worker, permit.lane, past.repeated_steps, past.new_episodes))
+                    history = self.rollouts.lanes[permit.lane].history
+                    longest = 0 if history is None else history.longest_given_up
+                    event = LaneContinued(worker, permit.lane, past.repeated_steps, past.new_episodes, longest)
+                    self.events.append(event)
         return dealt
 
     def _needed(self) -> set[int]:

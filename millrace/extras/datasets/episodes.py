@@ -2,8 +2,9 @@
 
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
 (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of them
-arrived, in order, from the same incarnation of their lane, and each continues the one before, so no episode has a hole. (A
-client that owns its loop makes steps between two rollouts. Then the first row of the second one is not valid.)
+arrived, in order, and each continues the one before, so no episode has a hole. (The first rollout of an incarnation does, if
+another worker goes on with the lane. A client that owns its loop makes steps between two rollouts: then the first row of the
+second one is not valid.)
 """
 
 from __future__ import annotations
@@ -98,15 +99,17 @@ class EpisodeAssembler:
         if lane is not None and (incarnation, rollout.sequence) < (lane.incarnation, lane.sequence):
             self.left_out += rollout.env_steps  # the rollout arrived out of order
             return []
-        if lane is None or (incarnation, rollout.sequence) != (lane.incarnation, lane.sequence):
+        begins = rollout.valid[0] & (rollout.sequence == 0)
+        new: list[list[_Fragment] | None] = [[] if one else None for one in begins.tolist()]
+        follows = lane is not None and (incarnation, rollout.sequence) == (lane.incarnation, lane.sequence)
+        if lane is None or not (follows or rollout.sequence == 0):  # a rollout between was dropped
             self.left_out += lane.waiting if lane is not None else 0
-            begins = rollout.valid[0] & (rollout.sequence == 0)
-            lane = _LaneState(incarnation, rollout.sequence, [[] if one else None for one in begins])
-            self._lanes[rollout.lane] = lane
-        else:
+            lane = self._lanes[rollout.lane] = _LaneState(incarnation, rollout.sequence, new)
+        else:  # another worker may go on with the lane, with some of its copies or with all
             waiting = lane.waiting
             continued = lane.continued_by(rollout)
-            lane.running = [one if continued[n] else None for n, one in enumerate(lane.running)]
+            running = [one if continued[n] else new[n] for n, one in enumerate(lane.running)]
+            lane = self._lanes[rollout.lane] = _LaneState(incarnation, rollout.sequence, running)
             self.left_out += waiting - lane.waiting
         ends = [end for n in range(len(lane.running)) for end in self._column(rollout, lane, n)]
         lane.sequence += 1

@@ -26,6 +26,7 @@ from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.policy_player import saved_policy
+from millrace.learner.rollouts.lane_history import LaneHistory
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import RecordedDataset
 from millrace.learner.run_folder.run_folder import RunFolder
@@ -541,6 +542,29 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     with pytest.raises(RunError, match=says):
         recorder.on_end(Progress())
     assert everything(root) == set()
+
+
+def test_an_episode_that_another_worker_goes_on_with_is_recorded_whole() -> None:
+    run = run_of("CartPole-v1", T=7, N=3)
+    history = LaneHistory.of_nothing(3, most_steps=500)
+    to_env_action = make_action_converter(run.policy.action)
+    moved, whole = EpisodeAssembler(to_env_action), EpisodeAssembler(to_env_action)
+    stayed, went = (Collector(run, random_policy(run.policy)) for _ in range(2))
+    found: dict[str, list[RecordedEpisode]] = {"moved": [], "whole": []}
+    for n in range(12):
+        (rollout,) = stayed.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)
+        found["whole"] += whole.add(rollout, 0)
+        incarnation, sequence = (0, n) if n < 5 else (1, n - 5)
+        if incarnation:
+            past = history.past(0) if not sequence else None
+            (rollout,) = went.collect([Assignment(n, 0, 1, sequence, n, past=past)], 0, 1, no_pulse)
+        else:
+            history.add(rollout, b"")
+        found["moved"] += moved.add(rollout, incarnation)
+    assert moved.left_out == 0
+    assert len(found["moved"]) == len(found["whole"]) > 3
+    for one, other in zip(found["moved"], found["whole"], strict=True):
+        np.testing.assert_array_equal(one.obs[0], other.obs[0])
 
 
 def test_a_run_that_ends_before_a_whole_episode_leaves_no_dataset(root: Path, caplog: pytest.LogCaptureFixture) -> None:
