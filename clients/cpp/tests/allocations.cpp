@@ -57,7 +57,7 @@ int main(int, char** words) {
   client.take(corpus[12]);  // Weights
   for (std::uint64_t i = 0; i < 40; ++i) {
     if (i == 20) allocations = 0;
-    head.begin("Collect", 5).natural(77).natural(3).array(1).array(5).natural(i).natural(0).natural(0).natural(i).nil().array(1).array(3).natural(0).natural(0).natural(i).array(1).natural(3);
+    head.begin("Collect", 5).natural(77).natural(3).array(1).array(7).natural(i).natural(0).natural(0).natural(i).natural(i).nil().nil().array(1).array(3).natural(0).natural(0).natural(i).array(1).natural(3);
     client.take({head.bytes});
   }
   std::printf("%ld\n", allocations / 20);

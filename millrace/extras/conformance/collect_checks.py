@@ -31,6 +31,7 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.description import agents_in_words
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
+from millrace.protocol.lane_past import LastEpisode
 from millrace.protocol.messages import (
     Collect,
     Drain,
@@ -41,6 +42,7 @@ from millrace.protocol.messages import (
     Heartbeat,
     Hello,
     LaneIncarnation,
+    LanePast,
     Permit,
     Refuse,
     Rejoin,
@@ -88,10 +90,19 @@ class Collecting:
         return Weights(version, chosen, np.zeros(buffer_size(self.run.policy), np.float32), packed)
 
     def permit(self, lane: int = 0, incarnation: int = 0) -> Permit:
-        """The next ticket, for this lane."""
+        """The next ticket, for this lane. In a higher incarnation, all its copies are to start anew."""
         sequence = self._sequences[lane, incarnation]
         self._sequences[lane, incarnation] += 1
-        return Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence)
+        past = self._all_anew(lane) if incarnation and not sequence else None
+        return Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence, past=past)
+
+    def _all_anew(self, lane: int) -> LanePast | None:
+        """The past of a lane none of whose episodes can be continued; a client that continues no lane gets none."""
+        if self.learner.hello is None or not self.learner.hello.continues:
+            return None
+        copies = (LastEpisode(start=0, random=None, first=0, over=False),) * self.run.copies
+        no_rows = np.zeros((0, self.run.columns), np.float32)
+        return LanePast(lane, copies, no_rows, attributes=(), obs=(), memory=())
 
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
         """Send a Collect, without the weights that it names. `keep`: versions to hold although no ticket names them."""
