@@ -154,7 +154,8 @@ class Collector:
             lane.set_attributes(self.env_attributes, pulse)
             lane.start([0] * run.copies, pulse)
         else:  # rule PAST
-            self.note = bring_back(run, lane, assignment.past, self.env_attributes, pulse) or self.note
+            written = self._runner.acting.begin([np.random.default_rng(0)]).written(0)
+            self.note = bring_back(run, lane, assignment.past, self.env_attributes, pulse, written) or self.note
         self.note = self.note or lane.copies.note
         self.stages["open"] += perf_counter() - began
         return lane

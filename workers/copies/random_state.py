@@ -51,7 +51,7 @@ def pack(state: dict[str, Any] | None) -> bytes | None:
 def set_state(inner: Any | None, packed: bytes) -> bool:
     """Set a packed state. False if the environment has no generator that it fits."""
     generator = _generator(inner)
-    if generator is None or len(packed) != BYTES:
+    if generator is None or len(packed) != BYTES or not packed[16] & 1:  # PCG64 adds an odd number
         return False
     generator.bit_generator.state = {
         "bit_generator": "PCG64",

@@ -33,8 +33,12 @@ NOT_REPEATED = (
 )
 
 
-def bring_back(run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse) -> str:
+def bring_back(
+    run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, written: Sequence[Array] = ()
+) -> str:
     """Continue this past on a new lane, whose copies were not reset yet. At the end they have these `attributes`, packed.
+
+    `written`: with seats, arrays [T, N · A, …] as the policy writes them. The past of another lane is not continued.
 
     Returns what whoever trains should know, in one line; empty if there is nothing. Raises `EnvironmentFailed`.
     """
@@ -43,12 +47,13 @@ def bring_back(run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, puls
     states: list[SavedCopy] = []
     saved = any(last.saved for last in past.copies)
     memory = past.memory[:-1] if saved else past.memory
-    if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, memory, lane, run):
+    if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, memory, lane, run, written):
         continued = [n for n, last in enumerate(past.copies) if last.goes_on]
         states = _states(past.memory[-1], lane) if saved else []
     if not isinstance(copies, LoopedCopies) or not continued:  # the learner knows why
         lane.set_attributes(attributes, pulse)
-        lane.start([last.start + 1 for last in past.copies], pulse)
+        starts = [last.start + 1 for last in past.copies]
+        lane.start(starts if len(starts) == lane.count else [max(starts, default=1)] * lane.count, pulse)
         return ""
     repeated = _Repeated(run, lane, copies, msgspec.structs.replace(past, memory=memory), continued, pulse)
     with environment_failures(lane.number, "while its episode was continued"), copies.repeating():
@@ -241,17 +246,19 @@ def _states(blob: Array, lane: Lane) -> list[SavedCopy]:
     return states if len(states) == lane.count else []
 
 
-def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec) -> bool:
+def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, written: Sequence[Array]) -> bool:
     """Whether the arrays are those of this lane. They come from another worker, through the learner."""
     action = run.policy.action
+    rows = past.action.shape[0] if past.action.ndim else 0
     expected: Iterable[tuple[Array, tuple[int, ...], str]] = [
-        (past.action, (len(past.action), lane.columns, *action.shape), action.stored_dtype),
+        (past.action, (rows, lane.columns, *action.shape), action.stored_dtype),
         *(
             (array, (lane.columns, *leaf.shape), leaf.dtype)
             for array, leaf in zip(past.obs, stored_leaves(run), strict=False)
         ),
     ]
     shapes = all(array.shape == shape and array.dtype == dtype for array, shape, dtype in expected)
-    rows = all(last.first <= len(past.action) for last in past.copies)
+    before = [1 if last.random and last.is_repeated else 0 for last in past.copies]  # rows that reset the copy
+    firsts = all(least <= last.first <= rows for least, last in zip(before, past.copies, strict=True))
     counts = len(past.copies) == lane.count and len(past.obs) == len(stored_leaves(run))
-    return shapes and rows and counts and lane.can_recall(memory)
+    return shapes and firsts and counts and lane.can_recall(memory, written)

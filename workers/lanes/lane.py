@@ -155,11 +155,15 @@ class Lane:
             copies.note = f"{error}, so its episodes are repeated if a worker is lost"
             return []
 
-    def can_recall(self, memory: Sequence[Array]) -> bool:
-        """Whether this is the memory of such a lane."""
+    def can_recall(self, memory: Sequence[Array], written: Sequence[Array]) -> bool:
+        """Whether this is the memory of such a lane. `written`: see `bring_back`."""
         own = self.memory()
-        fits = [each.shape == mine.shape and each.dtype == mine.dtype for each, mine in zip(memory, own, strict=False)]
-        return all(fits) and (len(memory) == len(own) or (self.seats is not None and len(memory) > len(own)))
+        rest = memory[len(own) :]
+        held = written if self.seats is not None and rest else ()
+        expected = [*((each.shape, each.dtype) for each in own), *((each.shape[1:], each.dtype) for each in held)]
+        if [(each.shape, each.dtype) for each in memory] != expected:
+            return False
+        return self.episodes.can_recall(memory[0])
 
     def recall(self, memory: Sequence[Array], copies: Sequence[int]) -> None:
         """Take over, for these copies, what `memory` said of another lane. `can_recall` must hold."""

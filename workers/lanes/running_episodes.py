@@ -58,6 +58,10 @@ class RunningEpisodes:
         memory[:, -1] = [now_s - began_s for began_s in self.began_s]
         return memory
 
+    def can_recall(self, memory: Doubles) -> bool:
+        """Whether these numbers, of this shape, are returns and seconds."""
+        return bool(np.isfinite(memory).all() and (memory[:, -1] >= 0).all())
+
     def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
         """Take over, for these copies, what `memory` said elsewhere."""
         for n in copies:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
-import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from millrace.learner.rollouts.lane_history import LaneHistory
 from millrace.learner.rollouts.past_rollouts import packed, unpacked
@@ -23,6 +23,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.lane_past import LastEpisode
 from millrace.protocol.messages import LanePast
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.rows.rollout_checks import validate
@@ -386,7 +387,7 @@ def continued(make: Make, T: int, rounds: int, then: Make | None = None) -> tupl
 
     `then`: makes the copies of who has it then.
     """
-    run = msgspec.structs.replace(run_around(make(), T), copies=2)
+    run = replace(run_around(make(), T), copies=2)
     first = random_collector(run, loop_over([make] * 2))
     rollouts = [rollout_of(first, run, number, no_attributes, None) for number in range(rounds)]
     past = past_of(run, rollouts)
@@ -428,7 +429,7 @@ def test_a_copy_that_does_not_repeat_itself_starts_anew(
     assert collector.lanes[0].starts == [1, 1]
     assert started_anew(rollout) == {0: 1, 1: 1}
     for number in range(rounds + 1, rounds + 4):
-        validate(rollout_of(collector, run, number, no_attributes, None), run)
+        validate(rollout_of(collector, run, number, no_attributes, past), run)
 
 
 @pytest.mark.parametrize(
@@ -477,7 +478,7 @@ class ArrayRewards(Walk):
 def test_rewards_may_be_arrays_of_one_element(monkeypatch: pytest.MonkeyPatch) -> None:
     lengths = itertools.cycle([4, 7])
     monkeypatch.setattr(ArrayRewards, "prepare", lambda self: setattr(self, "length", next(lengths)))
-    run = msgspec.structs.replace(run_around(ArrayRewards(), 1), copies=2)
+    run = replace(run_around(ArrayRewards(), 1), copies=2)
     next(lengths)
     opens = loop_over([ArrayRewards] * 2)
     first = random_collector(run, opens)
@@ -486,3 +487,61 @@ def test_rewards_may_be_arrays_of_one_element(monkeypatch: pytest.MonkeyPatch) -
     rollouts.append(rollout_of(second, run, 6, no_attributes, past_of(run, rollouts)))
     assert second.note == ""
     assert all_bits(rollouts[-1]) == all_bits(rollout_of(first, run, 6, no_attributes, None))
+
+
+# ------------------------------------------------------------------------------------------------ pasts of nobody
+
+
+def with_column(rows: Any, column: int, value: float) -> Any:
+    found = rows.copy()
+    found[:, column] = value
+    return found
+
+
+ONE_MORE = LastEpisode(4, b"", 0, False)
+WRONG: dict[str, Callable[[LanePast], dict[str, Any]]] = {
+    "no copies": lambda past: {"copies": ()},
+    "a copy more": lambda past: {"copies": (*past.copies, ONE_MORE)},
+    "a copy less": lambda past: {"copies": past.copies[:1]},
+    "begins later": lambda past: {"copies": tuple(replace(last, first=10**6) for last in past.copies)},
+    "random bytes": lambda past: {"copies": tuple(replace(last, random=b"123", first=1) for last in past.copies)},
+    "more random bytes": lambda past: {"copies": tuple(replace(last, random=bytes(64), first=1) for last in past.copies)},
+    "other random bytes": lambda past: {"copies": tuple(replace(last, random=bytes(37), first=1) for last in past.copies)},
+    "no row before": lambda past: {"copies": tuple(replace(last, random=bytes(37)) for last in past.copies)},
+    "over from nothing": lambda past: {"copies": tuple(replace(last, random=b"", over=True) for last in past.copies)},
+    "no rows": lambda past: {"action": past.action[:0]},
+    "a number": lambda past: {"action": np.array(0)},
+    "another action": lambda past: {"action": np.zeros((*past.action.shape, 2), np.float32)},
+    "narrow actions": lambda past: {"action": past.action.astype(np.int32)},
+    "fewer columns": lambda past: {"action": past.action[:, :1]},
+    "no observation": lambda past: {"obs": ()},
+    "an observation more": lambda past: {"obs": (*past.obs, past.obs[0])},
+    "double observation": lambda past: {"obs": (past.obs[0].astype(np.float64), *past.obs[1:])},
+    "a scalar observation": lambda past: {"obs": (np.zeros((), np.float32), *past.obs[1:])},
+    "NaN observation": lambda past: {"obs": (np.full_like(past.obs[0], np.nan), *past.obs[1:])},
+    "no memory": lambda past: {"memory": ()},
+    "less memory": lambda past: {"memory": past.memory[:-1]},
+    "more memory": lambda past: {"memory": (*past.memory, np.zeros(3))},
+    "scalars": lambda past: {"memory": tuple(np.zeros((), each.dtype) for each in past.memory)},
+    "another order": lambda past: {"memory": past.memory[::-1]},
+    "NaN return": lambda past: {"memory": (with_column(past.memory[0], 0, np.nan), *past.memory[1:])},
+    "NaN seconds": lambda past: {"memory": (with_column(past.memory[0], -1, np.nan), *past.memory[1:])},
+    "seconds to come": lambda past: {"memory": (with_column(past.memory[0], -1, -1.0), *past.memory[1:])},
+}
+
+
+@pytest.mark.parametrize("kind", ["lstm", "turns, lstm"])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_past_of_another_lane_is_not_continued(wrong: str, kind: str) -> None:
+    run = RUNS[kind](4, 2)
+    first = random_collector(run)
+    rollouts = [rollout_of(first, run, number, no_attributes, None) for number in range(2)]
+    past = past_of(run, rollouts)
+    assert past.new_episodes == 0
+    newest = max((last.start for last in past.copies), default=0)
+    past = replace(past, **WRONG[wrong](past))
+    collector = random_collector(run)
+    for number in (2, 3):
+        validate(rollout_of(collector, run, number, no_attributes, past), run)
+    assert min(collector.lanes[0].starts) > newest
+    assert len(collector.lanes[0].starts) == run.copies
