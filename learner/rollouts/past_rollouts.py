@@ -60,4 +60,6 @@ def _described(value: object) -> object:
 
 def _array(wanted: type, value: Any) -> Array:
     name, shape, data = value
+    if name not in DTYPES:
+        raise ValueError(f"expected an array of numbers, got {name!r}")
     return np.frombuffer(data, DTYPES[name]).reshape(shape)
