@@ -129,7 +129,7 @@ class LaneHistory:
 
     def _after(self, last: LastEpisode, began: EpisodeBegin | None, resets: Bools, T: int) -> LastEpisode:
         """The newest episode of copy n, after T more rows. `resets` [T+1]: which of them only reset it."""
-        start = last.start if began is None else began.start
+        start = last.start if began is None else max(last.start, began.start)  # no number is used again
         random = None if began is None else began.random
         if resets[T]:
             return LastEpisode(start, random, self.count + T, True)

@@ -68,15 +68,20 @@ class TicketedLane(PlacedLane):
         self.dealt += 1
         return ticket
 
-    def past(self, histories: LaneHistories, waiting: Iterable[tuple[Rollout, bytes]]) -> LanePast | None:
+    def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
         """What a new owner is to continue; None if the lane is to begin.
 
-        `waiting`: the rollouts that have come since the history, in order, with the attributes of their env copies.
+        `waiting`: the rollouts that have come since the history, in order, each after its incarnation, and with the
+        attributes of its env copies.
         """
         history = None if self.history is None else self.history.copy()
-        for rollout, attributes in waiting:
+        newest = self.newest_taken
+        for incarnation, rollout, attributes in waiting:
             history = history or histories.begin()
+            if _misses_one(newest, incarnation, rollout):
+                history.forget()
             history.add(rollout, attributes)
+            newest = incarnation, rollout.sequence
         if attempts := self.failures + self.losses // MOST_ATTEMPTS:
             history = history or histories.begin()
             history.start_anew(attempts)
@@ -92,11 +97,11 @@ class TicketedLane(PlacedLane):
         sequence = rollout.sequence
         continues = self.newest_taken == (incarnation, sequence - 1)
         begins = sequence == 0 and not (from_past and rollout.memory)
-        self.newest_taken = (incarnation, sequence)
         if self.history is None:
             self.history = histories.begin()
-        elif sequence and not continues:  # the one between was rejected
+        if _misses_one(self.newest_taken, incarnation, rollout):
             self.history.forget()
+        self.newest_taken = (incarnation, sequence)
         anew = self.history.add(rollout, attributes)
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
@@ -107,6 +112,11 @@ class TicketedLane(PlacedLane):
         while self.next_sequence in self.out_of_order:
             self.out_of_order.remove(self.next_sequence)
             self.next_sequence += 1
+
+
+def _misses_one(newest: tuple[int, int] | None, incarnation: int, rollout: Rollout) -> bool:
+    """Whether the rollout between this one and the `newest`, as in `TicketedLane.newest_taken`, was rejected."""
+    return rollout.sequence > 0 and newest != (incarnation, rollout.sequence - 1)
 
 
 @dataclass(frozen=True)

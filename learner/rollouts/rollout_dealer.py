@@ -243,8 +243,9 @@ class RolloutDealer:
 
     def _past(self, lane: TicketedLane, first: int) -> LanePast | None:
         """What the lane's new owner is to continue. The first round that it collects is `first`."""
-        come = [self.ready[number][lane.number].rollout for number in range(self.rounds.next, first)]
-        return lane.past(self.histories, [(rollout, self._attributes_of(rollout)) for rollout in come])
+        come = [self.ready[number][lane.number] for number in range(self.rounds.next, first)]
+        waiting = [(each.incarnation, each.rollout, self._attributes_of(each.rollout)) for each in come]
+        return lane.past(self.histories, waiting)
 
     def _drop_after(self, lane: TicketedLane, first: int) -> None:
         """Drop the lane's rollouts of later rounds than this one, which was lost: they did not follow what is to come."""
