@@ -21,8 +21,9 @@ from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.lag_rule import Rounds
-from millrace.learner.rollouts.lane_history import LaneHistory
+from millrace.learner.rollouts.lane_history import LaneHistories, LaneHistory
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.arrays import Array
@@ -41,13 +42,16 @@ from millrace.protocol.messages import (
     WorkerExit,
 )
 from millrace.protocol.rollout import Episode
+from millrace.protocol.rules import Rule
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from millrace.workers.conversation.session import (
+    CloseLanes,
     EvaluationTask,
     Leave,
     RolloutTask,
     SendMessage,
     Session,
+    StartSession,
     WorkerEffect,
     WorkerIdentity,
 )
@@ -96,7 +100,7 @@ def fake_memory(place: int) -> tuple[Array]:
 
 def place_of(memory: Sequence[Array]) -> int:
     """How many rollouts the fake env copies have made."""
-    return int(memory[0][0])
+    return int(memory[0][0]) if memory else 0
 
 
 @cache
@@ -214,6 +218,24 @@ class FakeWorker:
     task: RolloutTask | EvaluationTask | None = None
     frozen: bool = False
     inbox: list[ToWorker] = field(default_factory=list)
+    places: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """of the lanes that are open: the incarnation, and how many rollouts their env copies have made"""
+
+    def open_lanes(self, task: RolloutTask) -> None:
+        """The env copies of these lanes are here in their incarnation, or they are made, and continue its past."""
+        for each in task.assignments:
+            if self.places.get(each.lane, (-1, 0))[0] != each.incarnation:
+                self.places[each.lane] = each.incarnation, 0 if each.past is None else place_of(each.past.memory)
+
+    def collected(self, task: RolloutTask) -> list[Rollout]:
+        """What it has collected. The env copies of each lane have made one rollout more."""
+        found = []
+        for each in task.assignments:
+            incarnation, place = self.places[each.lane]
+            self.places[each.lane] = incarnation, place + 1
+            version = task.weights.version
+            found.append(fake_rollout(task.session, each.lane, each.ticket, version, each.sequence, place + 1))
+        return found
 
 
 class World:
@@ -245,7 +267,7 @@ class World:
         self.used: set[int] = set()
         self.updates = 0
         self.epoch = 0
-        self.checkpoint: tuple[Ledger, int, list[int]] = (Ledger(), 0, [0] * lanes)
+        self.checkpoint = PastRollouts(Ledger(), [0] * lanes)
         self.coordinator = self._learner()
         names = [f"w{number}".encode() for number in range(workers)]
         names += [EVALUATOR + b"%d" % number for number in range(evaluators or 0)]
@@ -309,6 +331,11 @@ class World:
             match effect:
                 case SendMessage(message):
                     self.carry((worker.name, "up"), lambda m=message: self._hears(worker.name, m))  # type: ignore[misc]
+                case StartSession():
+                    worker.places.clear()
+                case CloseLanes(closed):
+                    for lane in closed:
+                        worker.places.pop(lane.lane, None)
                 case Leave():
                     self.workers.pop(worker.name, None)
 
@@ -367,11 +394,15 @@ class World:
             if weights.version in session.missing_versions() and is_of_learner(session.session, first_session):
                 self.say(worker, session.handle(weights, self.now))
         if worker.task is not None and session.is_unwanted(worker.task):
+            for each in worker.task.assignments if isinstance(worker.task, RolloutTask) else ():
+                worker.places.pop(each.lane, None)  # as a collector closes lanes whose rollout is abandoned
             worker.task = None
             self.say(worker, session.work_ended([]))
         if worker.task is None and (task := session.next_work()) is not None:
             assert isinstance(task, RolloutTask | EvaluationTask)
             worker.task = task
+            if isinstance(task, RolloutTask):
+                worker.open_lanes(task)
             self.at(self.random.uniform(0.01, 0.4), lambda: self._finish(worker, task))
         self.say(worker, session.tick(self.now))
 
@@ -385,7 +416,7 @@ class World:
         (own,) = (each for first, each in self.parameters.items() if 0 <= task.session - first < 2**20)
         assert task.weights.parameters is own, "acted under the weights of another learner"
         if isinstance(task, RolloutTask):
-            self.say(worker, worker.session.work_ended(fake_rollouts(task)))
+            self.say(worker, worker.session.work_ended(worker.collected(task)))
         else:
             order = task.order
             assert task.weights.version == order.version, "evaluated under other weights than those of the order"
@@ -397,8 +428,10 @@ class World:
     # ------------------------------------------------------------ learner
 
     def _learner(self) -> TicketCoordinator:
-        ledger, version, incarnations = self.checkpoint
-        ledger = msgspec.structs.replace(ledger)
+        past = self.checkpoint
+        rounds = Rounds(self.max_lag, past.rounds.next, past.rounds.versions)
+        version = rounds.next
+        ledger = past.ledger.copy()
         ledger.lost += ledger.outstanding  # of the learner that died
         ledger.transitions_late += ledger.transitions_waiting
         self.used = {ticket for ticket in self.used if ticket < ledger.issued}
@@ -407,14 +440,21 @@ class World:
         self.plan = None
         coordinator = TicketCoordinator(
             self.run,
-            RolloutDealer(self.run.lanes, Rounds(self.max_lag), ledger=ledger, incarnations=incarnations),
+            RolloutDealer(
+                self.run.lanes,
+                rounds,
+                ledger=ledger,
+                incarnations=past.incarnations,
+                histories=LaneHistories(copies=1, most_steps=1, pasts=past.lanes),
+            ),
             worker_timeout_s=3.0,
             first_session=self.random.getrandbits(48),
         )
         self.coordinator = coordinator
         parameters = self.parameters[coordinator.membership._first_session] = PARAMETERS.copy()
+        for weights in past.acting:
+            coordinator.keep(msgspec.structs.replace(weights, parameters=parameters))
         coordinator.publish(version, parameters, BUFFERS)
-        self.first = version
         self.to_workers(coordinator.begin_update())
         return coordinator
 
@@ -439,7 +479,12 @@ class World:
         for rollout in rollouts:
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
-            assert rollout.version == max(self.first, self.coordinator.version - self.max_lag)
+            assert rollout.version == max(0, self.coordinator.version - self.max_lag)
+            place = place_of(rollout.memory)
+            number = self.coordinator.rollouts.rounds.next  # rounds count from 0, and this one is taken
+            assert place == number or (self.faults.spoiled and place > number), (
+                f"{Rule.PAST}: lane {rollout.lane} has made {place} rollouts in round {number - 1}"
+            )
         self.updating = True
         coordinator = self.coordinator
         parameters = self.parameters[coordinator.membership._first_session]
@@ -454,11 +499,7 @@ class World:
             if self.due and self.plan is None:
                 self._begin_evaluation()
             if self.random.random() < 0.3:
-                self.checkpoint = (
-                    msgspec.structs.replace(coordinator.rollouts.ledger),
-                    self.updates,
-                    coordinator.rollouts.incarnations(),
-                )
+                self.checkpoint = coordinator.past()
             self._learn()
 
         self.at(self.random.uniform(0.0, 0.3), publish)
