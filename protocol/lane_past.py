@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from millrace.protocol.arrays import Array
@@ -86,6 +87,12 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     """[N · A, *leaf] for each leaf, then the mask if there are masks: the observations that follow the last row"""
     memory: tuple[Array, ...]
     """`Rollout.memory` of the last rollout"""
+
+    @classmethod
+    def unknown(cls, lane: int, copies: int) -> LanePast:
+        """Of a lane whose copies were started once, and of which nothing can be continued."""
+        nothing = np.zeros(0, np.float32)
+        return cls(lane, (LastEpisode(0, None, 0, False),) * copies, nothing, attributes=(), obs=(), memory=())
 
     @property
     def repeated_steps(self) -> int:

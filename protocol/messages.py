@@ -129,6 +129,10 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     past: LanePast | None = None
     """with sequence 0: what to continue. None: new episodes begin, as the first ones of the lane do (rule PAST)"""
 
+    def of_new_episodes(self, copies: int) -> Permit:
+        """The ticket, for a lane of so many copies that begin new episodes after their first ones."""
+        return msgspec.structs.replace(self, past=LanePast.unknown(self.lane, copies))
+
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
     """The rollouts of this lane and incarnation that the learner has."""

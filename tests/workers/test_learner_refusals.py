@@ -404,6 +404,7 @@ NO_ENVIRONMENT_CAN: dict[str, str] = {
     "expected {} episodes, got {} and {} marks of cut ones": COUNTS,
     "expected the opponents {}, got {}": "the order names them",
     "begun: expected each of the copies 0 to {} at most once, got {}": COUNTS,
+    "begun: expected starts up to {}, got {}": COUNTS,
     "saved: expected copies 0 to {}, each at most once, got {}": COUNTS,
     "memory: expected at most {} bytes, got {}": SHAPES,
     "numbers: expected {}, got {}": "the ticket names the lane, the version and the sequence",

@@ -31,7 +31,6 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.description import agents_in_words
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
-from millrace.protocol.lane_past import LastEpisode
 from millrace.protocol.messages import (
     Collect,
     Drain,
@@ -42,7 +41,6 @@ from millrace.protocol.messages import (
     Heartbeat,
     Hello,
     LaneIncarnation,
-    LanePast,
     Permit,
     Refuse,
     Rejoin,
@@ -93,16 +91,10 @@ class Collecting:
         """The next ticket, for this lane. In a higher incarnation, all its copies are to start anew."""
         sequence = self._sequences[lane, incarnation]
         self._sequences[lane, incarnation] += 1
-        past = self._all_anew(lane) if incarnation and not sequence else None
-        return Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence, past=past)
-
-    def _all_anew(self, lane: int) -> LanePast | None:
-        """The past of a lane none of whose episodes can be continued; a client that continues no lane gets none."""
-        if self.learner.hello is None or not self.learner.hello.continues:
-            return None
-        copies = (LastEpisode(start=0, random=None, first=0, over=False),) * self.run.copies
-        no_rows = np.zeros((0, self.run.columns), np.float32)
-        return LanePast(lane, copies, no_rows, attributes=(), obs=(), memory=())
+        permit = Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence)
+        if incarnation and not sequence and self.learner.hello is not None and self.learner.hello.continues:
+            return permit.of_new_episodes(self.run.copies)  # a client that continues no lane begins them by itself
+        return permit
 
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
         """Send a Collect, without the weights that it names. `keep`: versions to hold although no ticket names them."""
