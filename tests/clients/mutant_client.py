@@ -283,6 +283,11 @@ class Mutant(WorkerLink):
                 self.incarnation = max(self.incarnation, *(permit.incarnation for permit in message.permits))
                 permits = [replace(permit, incarnation=self.incarnation) for permit in message.permits]
                 return [replace(message, permits=tuple(permits))]
+            case "ignores the past of a lane", Collect():
+                return [replace(message, permits=tuple(replace(permit, past=None) for permit in message.permits))]
+            case "continues with other random numbers", Collect():
+                permits = [replace(each, round=each.round + (each.past is not None)) for each in message.permits]
+                return [replace(message, permits=tuple(permits))]
             case "does not wait for weights", Collect(version=version) if self.versions and version not in self.versions:
                 return [replace(message, version=max(self.versions))]
             case "evaluates without end", Evaluate():

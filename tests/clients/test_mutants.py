@@ -88,6 +88,8 @@ MUTANTS = [
     Mutant("sets no attributes", "collector", "sets attributes", Rule.ATTRIBUTES, "its speed changes by up to"),
     Mutant("one seed for all copies", "collector", "collects two lanes", Rule.INDEPENDENT, "copy 0 of lane 0 in copy 1"),
     Mutant("one random number for all copies", "collector", "collects two lanes", Rule.INDEPENDENT, "copy 0 of lane 0 in"),
+    Mutant("ignores the past of a lane", "collector", "continues the past", Rule.PAST, "another observation"),
+    Mutant("continues with other random numbers", "collector", "continues the past", Rule.PAST, "others"),
     Mutant("evaluates the newest weights", "collector", "under no other version", Rule.GREEDY, "others in"),
     Mutant("ignores older weights", "collector", "under no other version", Rule.EVALUATE_VERSION, "none within"),
     Mutant("goes on with an evaluation that is over", "collector", "ends an evaluation", Rule.EVALUATE_ENDS, "ticket"),

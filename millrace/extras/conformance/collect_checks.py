@@ -31,6 +31,7 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.description import agents_in_words
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
+from millrace.protocol.lane_past import LastEpisode
 from millrace.protocol.messages import (
     Collect,
     Drain,
@@ -41,6 +42,7 @@ from millrace.protocol.messages import (
     Heartbeat,
     Hello,
     LaneIncarnation,
+    LanePast,
     Permit,
     Refuse,
     Rejoin,
@@ -512,7 +514,11 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     """A higher incarnation, then a permit of the lower one."""
     session = yield from collecting(learner)
     before = yield from session.collect()
-    after = yield from session.collect(session.permit(incarnation=2))
+    permit = session.permit(incarnation=2)
+    if learner.hello is not None and learner.hello.continues:  # it is to know that it is not the first one
+        unknown = (LastEpisode(0, None, 0, False),) * session.run.copies
+        permit = replace(permit, past=LanePast(0, unknown, before.action[:0], (), (), ()))
+    after = yield from session.collect(permit)
     if _repeats(before, after):
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
         raise Broken(Rule.INDEPENDENT, "other episodes in incarnation 2", got)
@@ -521,6 +527,56 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     session.deal(old)
     yield from learner.quiet(Rollout, Rule.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
+
+
+def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
+    """The past of lane 0 after these, which are all of it."""
+    last = rollouts[-1]
+    resets = np.concatenate([*(resets_of(each)[:-1] for each in rollouts), resets_of(last)[-1:]])
+    K = len(resets) - 1
+    copies = []
+    for begun in {each.copy: each for rollout in rollouts for each in rollout.begun}.values():
+        of_copy = resets[:, begun.copy]
+        over = bool(of_copy[K])
+        first = K if over else 1 + int(max(np.flatnonzero(of_copy), default=-1))
+        copies.append((begun.copy, LastEpisode(begun.start, begun.random, first, over)))
+    mask = () if last.mask is None else (last.mask,)
+    return LanePast(
+        lane=0,
+        copies=tuple(episode for _, episode in sorted(copies, key=lambda each: each[0])),
+        action=np.concatenate([each.action for each in rollouts]),
+        attributes=(),
+        obs=tuple(leaf[-1] for leaf in (*last.obs, *mask)),
+        memory=last.memory,
+    )
+
+
+def continues_a_lane(learner: Learner) -> Script[None]:
+    """A lane that was with another worker, as it were, goes on in the next incarnation as it would have."""
+    rounds = 3
+    undisturbed = yield from collecting(learner, steps=7)
+    if learner.hello is None or not learner.hello.continues:
+        raise Skipped("the client does not say that it continues lanes")
+    before = []
+    for _ in range(rounds):
+        rollout = yield from undisturbed.collect()
+        before.append(rollout)
+    expected = yield from undisturbed.collect()
+    session = yield from collecting(learner, steps=7)
+    collected = []
+    for earlier in before:
+        rollout = yield from session.collect()
+        if not rollout.memory:
+            raise Broken(Rule.PAST, "memory in each rollout of a client that continues lanes", "none")
+        if not _repeats(earlier, rollout):
+            raise Skipped("the environment does not repeat itself")
+        collected.append(rollout)
+    past = _past_of(collected)
+    if past.new_episodes:
+        raise Skipped("the episodes of the environment cannot be repeated")
+    found = yield from session.collect(replace(session.permit(incarnation=1), round=rounds, past=past))
+    if not _repeats(expected, found):
+        raise Broken(Rule.PAST, "the observations and actions that follow the past of the lane", "others")
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:

@@ -25,7 +25,7 @@ LOG_PROB_TOLERANCE = 1e-3  # absolute: another order of additions gives other la
 
 
 class LaneRows:
-    """The rollouts of one lane and incarnation, in order."""
+    """The rollouts of one lane, in order: of one incarnation, and of those that continue it."""
 
     def __init__(self, run: RunSpec) -> None:
         self._run = run
@@ -57,7 +57,7 @@ class LaneRows:
             for one, other in zip(last.obs, rollout.obs, strict=True):
                 if one[-1].tobytes() != other[0].tobytes():
                     raise Broken(
-                        Rule.CONTINUES,
+                        Rule.CONTINUES if rollout.sequence else Rule.PAST,
                         f"obs[0] of sequence {rollout.sequence} to be obs[T] of sequence {last.sequence}",
                         "another observation",
                     )

@@ -133,6 +133,10 @@ MENDS: Mapping[Rule, str] = {
     ),
     Rule.FIRST_VALID: "carry over which copies ended in the last row of a rollout",
     Rule.CONTINUES: "keep the copies and their last observations between two rollouts of a lane",
+    Rule.PAST: (
+        "seed each copy by the number of its start, begin its episode from `random`, and repeat its actions from row `first`"
+        " on; or do not say `continues`"
+    ),
     Rule.EPISODES: (
         "add up rewards and steps of valid rows, from an episode's first step to its last, also where it began in "
         "an earlier rollout"

@@ -79,6 +79,7 @@ COLLECTING = [
     Check("ignores a late Collect of a rollout that has arrived", collect_checks.forgets_what_arrived),
     Check("collects two lanes, and two tickets of one", collect_checks.collects_two_lanes),
     Check("starts a lane again in a higher incarnation only", collect_checks.starts_a_lane_again),
+    Check("continues the past of a lane, or says that it does not", collect_checks.continues_a_lane),
     Check("closes a lane that is released while a ticket waits", collect_checks.releases_a_lane),
     Check("closes a lane that a HeartbeatReply does not list", collect_checks.closes_unlisted_lanes),
     Check("ignores late copies of a HeartbeatReply", collect_checks.ignores_a_late_reply),

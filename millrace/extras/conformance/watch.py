@@ -412,8 +412,16 @@ class WatchedSession:
         except BadRollout as error:
             rule = Rule.SEATS if self.run.seats else Rule.ROWS
             raise Broken(rule, "a rollout that keeps the row format", str(error)) from None
-        rows = self._rows.setdefault(place, LaneRows(self.run))
+        if place not in self._rows:
+            begins = permit.past is None or permit.past.new_episodes
+            self._rows[place] = LaneRows(self.run) if begins else self._continued(permit)
+        rows = self._rows[place]
         rows.see(message, self.versions[message.version])
+
+    def _continued(self, permit: Permit) -> LaneRows:
+        """The rows of the lane in the newest incarnation before that of this permit, which continues them."""
+        newest = max(incarnation for lane, incarnation in self._rows if lane == permit.lane)
+        return self._rows[permit.lane, newest]
 
 
 def fields_that_differ(one: Answer | Rollout, other: Answer | Rollout) -> list[str]:
