@@ -44,6 +44,14 @@ class LaneRows:
     def _check_begin(self, rollout: Rollout) -> None:
         last = self._last
         ended = np.zeros(self._run.copies, bool) if last is None else resets_of(last)[-1]
+        if last is not None:
+            for one, other in zip(last.obs, rollout.obs, strict=True):
+                if one[-1].tobytes() != other[0].tobytes():
+                    raise Broken(
+                        Rule.CONTINUES if rollout.sequence else Rule.PAST,
+                        f"obs[0] of sequence {rollout.sequence} to be obs[T] of sequence {last.sequence}",
+                        "another observation",
+                    )
         if (wrong := resets_of(rollout)[0] != ended).any():
             n = int(np.argmax(wrong))
             flag = "resets" if self._run.seats else "valid"
@@ -53,14 +61,6 @@ class LaneRows:
                 f"{'the last row of the rollout before ended its episode' if ended[n] else 'no episode had ended'}",
                 f"{ended[n] != bool(self._run.seats)}",
             )
-        if last is not None:
-            for one, other in zip(last.obs, rollout.obs, strict=True):
-                if one[-1].tobytes() != other[0].tobytes():
-                    raise Broken(
-                        Rule.CONTINUES if rollout.sequence else Rule.PAST,
-                        f"obs[0] of sequence {rollout.sequence} to be obs[T] of sequence {last.sequence}",
-                        "another observation",
-                    )
         if rollout.reward[~rollout.valid].any():
             raise Broken(Rule.ROWS, "reward 0 in rows that are not valid", f"{rollout.reward[~rollout.valid].max()}")
 
