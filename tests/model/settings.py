@@ -20,13 +20,6 @@ FOR_EVER_S = math.inf
 SEED = 16  # of the pool: a version meets itself, the one before it, or the one before that
 
 
-class DrawnOpponents(OpponentPool):
-    """Every version is a snapshot. All rounds meet the same, because the model numbers them anew."""
-
-    def of(self, lane: int, round_number: int, version: int) -> int:
-        return super().of(lane, 0, version)
-
-
 @dataclass(frozen=True)
 class Settings:
     """What is explored completely."""
@@ -52,11 +45,11 @@ class Settings:
     def run(self) -> RunSpec:
         return run_spec(self.lanes, heartbeat_s=TICK_S, learner_timeout_s=TIMEOUT_S)
 
-    def pool(self, newest: int) -> DrawnOpponents | None:
+    def pool(self, newest: int) -> OpponentPool | None:
         """The opponents when this is the newest version; -1: there is none."""
         if not self.opponents:
             return None
-        pool = DrawnOpponents(PoolSettings(SEED, self.opponents, save_steps=1, latest=0.0, max_lag=self.max_lag))
+        pool = OpponentPool(PoolSettings(SEED, self.opponents, save_steps=1, latest=0.0, max_lag=self.max_lag))
         for version in range(newest + 1):
             pool.made(version, version)
         return pool

@@ -14,6 +14,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from millrace.learner.members.describe_coordinator import Unknown, accept_any
@@ -23,7 +24,7 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.protocol.arrays import Array
-from millrace.protocol.messages import Rollout, ToLearner, ToWorker, Weights
+from millrace.protocol.messages import Collect, Permit, Rollout, ToLearner, ToWorker, Weights
 from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from millrace.workers.conversation.session import (
     BeginRun,
@@ -94,6 +95,11 @@ class SaidDealer(NamedTuple):
 
     lanes: int
     max_lag: int
+    next_round: int
+    versions: dict[int, int]
+    """that act in open rounds"""
+    continued: tuple[int, ...]
+    """lanes with a past"""
     ledger: Ledger
     incarnations: tuple[int, ...]
     opponents: OpponentPool | None
@@ -144,11 +150,12 @@ class Digests:
             case Leave():
                 return "Leave", value.exit_code, value.reason
             case RolloutTask():
-                return "RolloutTask", value.session, value.weights.version, value.assignments
+                without_pasts = tuple(replace(each, past=None) for each in value.assignments)
+                return "RolloutTask", value.session, value.weights.version, without_pasts
             case EvaluationTask():
                 return "EvaluationTask", value.weights.version, self.of(value.order)
             case AcceptedRollout():
-                return value.rollout.ticket, value.rollout.version, value.incarnation, value.fresh
+                return value.rollout.ticket, value.rollout.version, value.incarnation
             case list() | tuple():
                 return tuple(self.result(each) for each in value)
             case None | bool() | int() | float() | str() | bytes():
@@ -159,12 +166,18 @@ class Digests:
 
 
 def digest_of(message: ToLearner | ToWorker) -> bytes:
-    """Digest of all that the message says, unpacked."""
+    """Digest of all that the message says, unpacked, but for the pasts of lanes: a trace has no rows to make them of."""
+    if isinstance(message, Collect):
+        message = msgspec.structs.replace(message, permits=tuple(map(_without_past, message.permits)))
     found = blake2b(digest_size=8)
     for frame in encode(message):
         found.update(len(frame).to_bytes(8, "little"))
         found.update(frame)
     return found.digest()
+
+
+def _without_past(permit: Permit) -> Permit:
+    return msgspec.structs.replace(permit, past=None)
 
 
 def argument(value: Any) -> Any:
@@ -183,7 +196,11 @@ def argument(value: Any) -> Any:
         case RolloutDealer():
             lanes, rounds = len(value.lanes), value.rounds
             incarnations = tuple(RolloutDealer.incarnations(value))  # a call of `value` itself would be recorded
-            return SaidDealer(lanes, rounds.max_lag, value.ledger.copy(), incarnations, deepcopy(value.opponents))
+            opponents = deepcopy(value.opponents)
+            versions = dict(rounds.versions)
+            continued = tuple(past.lane for past in value.histories.pasts)
+            ledger = value.ledger.copy()
+            return SaidDealer(lanes, rounds.max_lag, rounds.next, versions, continued, ledger, incarnations, opponents)
         case Unknown():
             return replace(value, accept=accept_any)  # all that was asked for was accepted
         case AcceptedRollout():
@@ -216,6 +233,8 @@ def message_of(said: Any, digests: Digests, *, to_learner: bool) -> Any:
 def _rollout(said: SaidRollout) -> Rollout:
     nothing: Array = np.zeros(0, np.float32)
     session, lane, ticket, version, sequence = said.numbers
+    valid = np.ones((max(said.env_steps, 1), 1), bool if said.is_bool else np.int8)
+    valid[said.env_steps :] = 0
     return Rollout(
         session=session,
         lane=lane,
@@ -223,12 +242,12 @@ def _rollout(said: SaidRollout) -> Rollout:
         version=version,
         sequence=sequence,
         obs=(),
-        action=nothing,
+        action=np.zeros(valid.shape, np.int64),
         log_prob=nothing,
         reward=nothing,
-        terminated=nothing,
-        truncated=nothing,
-        valid=np.ones(said.env_steps, bool if said.is_bool else np.int8),
+        terminated=np.zeros(valid.shape, bool),
+        truncated=np.zeros(valid.shape, bool),
+        valid=valid,
         state=nothing,
     )
 

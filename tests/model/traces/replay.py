@@ -14,9 +14,11 @@ import numpy as np
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import BadRollout
+from millrace.protocol.lane_past import LanePast
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.conversation.session import Session
@@ -37,11 +39,15 @@ class ReplayedLearner(learner_part.Learner):
 
     def __init__(self, settings: Any, coordinator: TicketCoordinator) -> None:
         super().__init__(settings, coordinator)
-        self.begun: list[int] = []
-        """of each update, the version that was the newest when it began"""
+        self.begun: dict[int, int] = {}
+        """of each update of this learner, the version that was the newest when it began"""
+        self._first = coordinator.rollouts.rounds.next
+        self._restored = dict(coordinator.rollouts.rounds.versions)
 
     def acts(self, number: int) -> int:
-        return self.begun[max(0, number - self.settings.max_lag)]
+        if number in self._restored:
+            return self._restored[number]
+        return self.begun[max(self._first, number - self.settings.max_lag)]
 
 
 class Rules:
@@ -59,8 +65,7 @@ class Rules:
     def begun(self) -> None:
         """The next update begins, unless it has."""
         learner = self._learner
-        if len(learner.begun) == self._coordinator.rollouts.rounds.next:
-            learner.begun.append(self._coordinator.version)
+        learner.begun.setdefault(self._coordinator.rollouts.rounds.next, self._coordinator.version)
 
     def published(self) -> None:
         """The newest weights were set."""
@@ -71,7 +76,7 @@ class Rules:
         lanes = [arrived.rollout.lane for arrived in taken]
         assert lanes == list(range(self._coordinator.run.lanes)), "an update has not one rollout of each lane"
         self._learner.updating = True
-        version = self._learner.acts(len(self._learner.begun) - 1)
+        version = self._learner.acts(self._coordinator.rollouts.rounds.next - 1)
         for rollout in (arrived.rollout for arrived in taken):
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
@@ -124,7 +129,9 @@ class Replay:
         if isinstance(said, SaidWaiting):
             return self.parts["DescribeCoordinator"].membership
         if isinstance(said, SaidDealer):
-            return RolloutDealer(said.lanes, Rounds(said.max_lag), said.ledger, said.incarnations, said.opponents)
+            rounds = Rounds(said.max_lag, said.next_round, said.versions)
+            histories = LaneHistories(pasts=[LanePast.unknown(lane, 1) for lane in said.continued])
+            return RolloutDealer(said.lanes, rounds, said.ledger, said.incarnations, said.opponents, histories)
         if isinstance(said, SaidRollout) and said.wrong:
             self._wrong_rows[said.digest] = said.wrong
         if isinstance(said, list):
@@ -138,7 +145,7 @@ class Replay:
         if part == "TicketCoordinator":
             self._rules = Rules(made, {each for each in used if each < made.rollouts.ledger.issued})
 
-    def _check_rows(self, rollout: Rollout, run: RunSpec) -> None:
+    def _check_rows(self, rollout: Rollout, run: RunSpec, most_steps: int) -> None:
         """As the learner found them."""
         if why := self._wrong_rows.get(self._digests.of(rollout)):
             raise BadRollout(why)
