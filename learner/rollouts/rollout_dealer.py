@@ -75,7 +75,7 @@ class RolloutDealer:
         """those of env copies, packed, by the version that acts with them; of versions without any there may be none"""
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had, and may have again
         self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
-        self._to_deal = set[int]()  # lanes with rounds that are to be dealt
+        self._to_deal = {lane.number for lane in self.lanes if lane.due}  # lanes with rounds that are to be dealt
 
     # ---------------------------------------------------------------- the learner's side
 
