@@ -105,9 +105,13 @@ class TicketedLane(PlacedLane):
         anew = self.history.add(rollout, attributes)
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
+    def went_on(self) -> None:
+        """A rollout was accepted: failures and losses are counted anew."""
+        self.failures = 0
+        self.losses = 0
+
     def arrived(self, sequence: int) -> None:
         """The rollout with this sequence number has arrived."""
-        self.failures = self.losses = 0
         self.out_of_order.add(sequence)
         while self.next_sequence in self.out_of_order:
             self.out_of_order.remove(self.next_sequence)

@@ -191,7 +191,9 @@ class RolloutDealer:
         self.ledger.transitions_received += rollout.env_steps
         self._end(member, ticket).arrived(rollout.sequence)
         member.has_stepped()
-        accepted = AcceptedRollout(rollout, ticket.incarnation, from_past=ticket.past is not None)
+        self.lanes[ticket.lane].went_on()
+        from_past = ticket.past is not None and member.hello.continues
+        accepted = AcceptedRollout(rollout, ticket.incarnation, from_past=from_past)
         self.ready.setdefault(ticket.round, {})[ticket.lane] = accepted
         return True
 

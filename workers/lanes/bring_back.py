@@ -192,7 +192,7 @@ class _Repeated:
         random = self._past.copies[n].random
         if random and self._copies.set_random_state(n, random):
             return True
-        self._differs(n, "it has no np_random")
+        self._differs(n, "the state of its np_random could not be set")
         return False
 
     def _began(self, copies: list[int], seeds: Sequence[int | None]) -> None:
