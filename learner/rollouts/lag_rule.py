@@ -20,13 +20,15 @@ class Rounds:
         """L"""
         self.next = next_round
         """the round of the next update"""
-        self._versions = {number: versions[number] for number in sorted(versions) if number <= next_round + max_lag}
+        self._saved = {number: versions[number] for number in sorted(versions) if number <= next_round + max_lag}
+        # of the rounds that were open before the run was interrupted, and are not yet open again
+        self._versions: dict[int, int] = {}
         # of each round that may be collected and was not taken
 
     def begin(self, newest: int) -> range:
         """The next update begins, while this version is the newest. Returns the rounds that it opens, once."""
         opened = range(self.next + len(self._versions), self.next + 1 + self.max_lag)
-        self._versions |= dict.fromkeys(opened, newest)
+        self._versions |= {number: self._saved.pop(number, newest) for number in opened}
         return opened
 
     def end(self) -> None:
@@ -40,9 +42,9 @@ class Rounds:
 
     @property
     def versions(self) -> Mapping[int, int]:
-        """The version that acts in each round that is open."""
-        return self._versions
+        """The version that acts in each round that is open, or will be as soon as the next update begins."""
+        return self._saved | self._versions
 
     def acting(self) -> set[int]:
         """The versions that act in rounds that are open."""
-        return set(self._versions.values())
+        return set(self.versions.values())

@@ -82,9 +82,12 @@ class LaneHistory:
         self.copies = [LastEpisode(last.start, None, self.count, False) for last in self.copies]
         self.rows.clear()
 
-    def start_anew(self, attempts: int) -> None:
-        """All copies are to start anew, although so many attempts to go on have failed: none uses a number again."""
-        tried = [last.start + (not last.goes_on) for last in self.copies]  # in the first attempt
+    def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
+        """All copies are to start anew, although so many attempts to go on have failed: none uses a number again.
+
+        `from_past`: whether the first of them began from this history, so that some copies had started anew there.
+        """
+        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # in the first attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
         self.rows.clear()
 

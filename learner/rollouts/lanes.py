@@ -41,6 +41,8 @@ class TicketedLane(PlacedLane):
     """Of the rollouts that were taken; None: none since the run began."""
     failures: int = 0
     """How often its environment has failed since a rollout of it came."""
+    failed_at_once: bool = True
+    """Whether the first of these failures and losses came before any rollout of its incarnation."""
     losses: int = 0
     """How often its worker was lost while it collected, since a rollout of it came."""
 
@@ -84,7 +86,7 @@ class TicketedLane(PlacedLane):
             newest = incarnation, rollout.sequence
         if attempts := self.failures + self.losses // MOST_ATTEMPTS:
             history = history or histories.begin()
-            history.start_anew(attempts)
+            history.start_anew(attempts, from_past=self.failed_at_once)
         return None if history is None else history.past(self.number)
 
     def take(
@@ -104,6 +106,13 @@ class TicketedLane(PlacedLane):
         self.newest_taken = (incarnation, sequence)
         anew = self.history.add(rollout, attributes)
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
+
+    def lost(self, *, failed: bool) -> None:
+        """Its worker was lost while it collected, or because its environment `failed`."""
+        if not self.failures and not self.losses:
+            self.failed_at_once = not self.next_sequence
+        self.losses += not failed
+        self.failures += failed
 
     def went_on(self) -> None:
         """A rollout was accepted: failures and losses are counted anew."""

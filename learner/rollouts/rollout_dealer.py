@@ -60,7 +60,6 @@ class RolloutDealer:
             TicketedLane(
                 n,
                 incarnations[n] if n < len(incarnations) else 0,
-                due=list(rounds.versions),
                 history=self.histories.of(n),
             )
             for n in range(lanes)
@@ -75,7 +74,7 @@ class RolloutDealer:
         """those of env copies, packed, by the version that acts with them; of versions without any there may be none"""
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had, and may have again
         self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
-        self._to_deal = {lane.number for lane in self.lanes if lane.due}  # lanes with rounds that are to be dealt
+        self._to_deal = set[int]()  # lanes with rounds that are to be dealt
 
     # ---------------------------------------------------------------- the learner's side
 
@@ -206,10 +205,9 @@ class RolloutDealer:
         """A member is gone with its tickets. What led to a failure of the environment is not repeated."""
         for number in member.lanes:
             lane = self.lanes[number]
-            if lane.outstanding:
-                lane.losses += 1
-                lane.failures += member.hung
-            lane.failures += number == member.failed_lane
+            failed = number == member.failed_lane or (member.hung and bool(lane.outstanding))
+            if failed or lane.outstanding:
+                lane.lost(failed=failed)
 
     def late(self, rollout: Rollout) -> None:
         """Count a rollout of a session that has ended. Nobody has checked it."""

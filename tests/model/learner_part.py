@@ -51,7 +51,7 @@ SAVED: dict[type, set[str]] = {
     | {"out_of_order", "history"},
     Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent", "past"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
-    Rounds: {"next", "_versions"},
+    Rounds: {"next", "_versions", "_saved"},
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
@@ -72,7 +72,12 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity_s",
     }
     | {"in_env_code_s", "speed", "first_step_s", "ended_steps", "supervisor"},
-    TicketedLane: {"newest_taken", "failures", "losses"},  # it marks rollouts as fresh; no worker is lost three times here
+    TicketedLane: {
+        "newest_taken",
+        "failures",
+        "losses",
+        "failed_at_once",
+    },  # it marks rollouts as fresh; no worker is lost three times here
     Ticket: set(),
     LanePlacement: {"_tie_break"},
     Rounds: {"max_lag"},
@@ -300,7 +305,7 @@ def saved(learner: Learner, now: float) -> Content:
         ticket(coordinator.rollouts.ledger.issued),
         coordinator.rollouts.ledger.used,
         coordinator.version,
-        (rounds.next, tuple(rounds.versions.values())),
+        (rounds.next, tuple(rounds._versions.values()), tuple(rounds._saved.items())),
         tuple(_lane(lane) for lane in lanes),
         tuple(_ticket(each) for each in tickets),
         tuple(
@@ -399,13 +404,13 @@ def without_checkpoints(content: Content) -> Content:
 
 def loaded(content: Content, settings: Settings) -> Learner:
     """A learner at the time 0 with this content."""
-    issued, used, version, (next_round, versions), lanes, tickets, ready, members, *rest = content
+    issued, used, version, (next_round, versions, to_open), lanes, tickets, ready, members, *rest = content
     unplaced, settled, waiting_for, to_deal, (kept, held), *mine = rest
     coordinator = TicketCoordinator(
         settings.run,
         RolloutDealer(
             settings.run.lanes,
-            Rounds(settings.max_lag, next_round),
+            Rounds(settings.max_lag, next_round, dict(to_open)),
             ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used - len(tickets) - len(ready)),
             opponents=settings.pool(version),
             histories=_histories(tuple(lane[-1] for lane in lanes)),

@@ -64,7 +64,7 @@ MUTATIONS = {
     "the newest weights act in every open round": Mutation(
         Rule.ROUND_VERSION,
         ROUNDS,
-        "self._versions |= dict.fromkeys(opened, newest)",
+        "self._versions |= {number: self._saved.pop(number, newest) for number in opened}",
         "self._versions = dict.fromkeys([*self._versions, *opened], newest)",
     ),
     "a round is dealt under the newest weights": Mutation(

@@ -78,6 +78,7 @@ def test_a_run_with_learner_inference_learns(tmp_path: Path) -> None:
 def test_a_resumed_run_equals_one_with_inference_workers(tmp_path: Path) -> None:
     """In both the lanes start again with the same seeds; optimizer, normalization and counters continue."""
     settings: dict[str, Any] = {"seed": 3, "normalize_observations": True, "normalize_rewards": True, **SMALL}
+    settings["lost_lanes"] = "restart"
     policies = []
     for inference in ("workers", "learner"):
         folder = run(tmp_path, "CartPole-v1", steps=1_500, inference=inference, **settings)
