@@ -181,7 +181,7 @@ class Learner:
 
     def _needed(self) -> set[int]:
         """The versions that workers may need: the newest, those that act in open rounds, and those that may meet them."""
-        acting = {self.coordinator.version, *self.coordinator.rollouts.rounds._versions.values()}
+        acting = {self.coordinator.version, *self.coordinator.rollouts.rounds.acting()}
         met = {each for version in acting for each in range(version - self.settings.opponents + 1, version) if each >= 0}
         return {*acting, *met, *_snapshots(self.coordinator)}
 
