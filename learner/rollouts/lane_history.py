@@ -93,15 +93,13 @@ class LaneHistory:
 
     def past(self, lane: int) -> LanePast:
         """What a worker needs to go on."""
-        first_row = min((_needed_from(last) for last in self.copies if last.goes_on), default=self.count)
-        kept = [rows for rows in self.rows if rows.first + len(rows.action) > first_row]
-        action = np.concatenate([self.no_rows, *(rows.action for rows in kept)])
-        start = kept[0].first if kept else self.count
+        action = np.concatenate([self.no_rows, *(rows.action for rows in self.rows)])
+        start = self.rows[0].first if self.rows else self.count
         return LanePast(
             lane=lane,
             copies=tuple(self._shifted(last, start) for last in self.copies),
             action=action,
-            attributes=tuple(_changes(kept, start)),
+            attributes=tuple(_changes(self.rows, start)),
             obs=self.obs,
             memory=self.memory,
         )

@@ -196,8 +196,8 @@ class RolloutDealer:
         self.ready.setdefault(ticket.round, {})[ticket.lane] = accepted
         return True
 
-    def most_steps(self, number: int) -> int:
-        """How many steps an episode can have by the rollout of this ticket, in rollouts."""
+    def rounds_by(self, number: int) -> int:
+        """How many rounds an episode can have lasted by the end of the rollout of this ticket."""
         ticket = self.held.get(number)
         return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
 

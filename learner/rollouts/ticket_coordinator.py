@@ -106,12 +106,16 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             self.rollouts.opponents.made(version, env_steps)
         self.version = version
         weights = Weights(version, parameters, buffers, env_attributes)
-        self.keep(weights)
         self.weights.keep(weights, self._needed())
+        self._note_attributes(weights)
 
     def keep(self, weights: Weights) -> None:
         """Keep weights that act in an open round of a run that goes on."""
         self.weights.kept[weights.version] = weights
+        self._note_attributes(weights)
+
+    def _note_attributes(self, weights: Weights) -> None:
+        """The rollouts under these weights are made with these attributes of the env copies."""
         if weights.env_attributes is not None:
             self.rollouts.attributes[weights.version] = weights.env_attributes.tobytes()
 
@@ -222,7 +226,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         """Accept a rollout, unless it came before. One that cannot be used is counted, and its ticket is lost."""
         try:
-            self._check_rows(rollout, self.run, self.rollouts.most_steps(rollout.ticket) * self.run.rollout_steps)
+            most_steps = self.rollouts.rounds_by(rollout.ticket) * self.run.rollout_steps
+            self._check_rows(rollout, self.run, most_steps)
             accepted = self.rollouts.take_in(member, rollout)
         except BadRollout as error:
             return self._reject(member, rollout, f"rollout of ticket {rollout.ticket}: {error}")

@@ -199,10 +199,10 @@ class LoopedCopies:
         """Start episodes in all copies, or in the first ones, with a seed for each."""
         copies = range(len(seeds))
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
-        leaves = self._leaves()
+        leaves = self._after_reset(copies, infos).leaves
         if self._masks is None:
             self.note = unused_mask((info for _, info in infos), self.action_space)
-        return leaves if self._masks is None else (*leaves, self._read_masks(self._masks, infos, copies))
+        return leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
         """Step each copy, or reset it if its episode has ended. `copies`: only these, which have these actions.

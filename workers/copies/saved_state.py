@@ -56,20 +56,24 @@ def saver(env: gymnasium.Env[Any, Any]) -> Any | None:
 
 def save(env: gymnasium.Env[Any, Any]) -> SavedCopy:
     """The state of an environment that can save it. Raises what its code raises, and `CannotSave`."""
-    state = _saver(env).save_state()
+    outermost = _saver(env)
+    state = outermost.save_state()
     if not isinstance(state, bytes | bytearray | memoryview):
         raise CannotSave(f"save_state returned {type(state).__name__}; expected bytes")
     if len(state) > MAX_SAVED_BYTES:
         raise CannotSave(f"save_state returned {len(state):,} bytes; at most {MAX_SAVED_BYTES:,} are kept")
-    return SavedCopy(bytes(state), pack(state_of(repeatable(env))), tuple(each._elapsed_steps or 0 for each in _limits(env)))
+    return SavedCopy(
+        bytes(state), pack(state_of(repeatable(env))), tuple(each._elapsed_steps or 0 for each in _limits(env, outermost))
+    )
 
 
 def load(env: gymnasium.Env[Any, Any], saved: SavedCopy) -> None:
     """Give an environment, which was reset, this state. Raises what its code raises."""
-    _saver(env).load_state(saved.state)
+    outermost = _saver(env)
+    outermost.load_state(saved.state)
     if saved.random is not None:
         set_state(repeatable(env), saved.random)
-    for limit, steps in zip(_limits(env), saved.elapsed, strict=True):
+    for limit, steps in zip(_limits(env, outermost), saved.elapsed, strict=True):
         limit._elapsed_steps = steps
 
 
@@ -89,11 +93,11 @@ def _saver(env: gymnasium.Env[Any, Any]) -> Any:
     return found
 
 
-def _limits(env: gymnasium.Env[Any, Any]) -> list[Any]:
-    """The `TimeLimit` wrappers outside of what saves, the outermost first."""
+def _limits(env: gymnasium.Env[Any, Any], outermost: Any) -> list[Any]:
+    """The `TimeLimit` wrappers outside of the one that saves, the outermost first."""
     limits = []
     inner: Any = env
-    while inner is not _saver(env):
+    while inner is not outermost:
         if isinstance(inner, TimeLimit):
             limits.append(inner)
         inner = inner.env

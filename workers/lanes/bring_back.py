@@ -78,6 +78,7 @@ class _Repeated:
         """in what a copy differed"""
         self._run = run
         self._lane = lane
+        lane.starts = [last.start for last in past.copies]
         self._copies = copies
         self._past = past
         self._pulse = pulse
@@ -136,9 +137,7 @@ class _Repeated:
     def start_others(self) -> None:
         """Each copy that is not continued starts anew."""
         lane = self._lane
-        past = self._past
         anew = [n for n in range(lane.count) if n not in self.continued]
-        lane.starts = [last.start for last in past.copies]
         for n in anew:
             lane.starts[n] += 1
         lane.new_starts = anew
@@ -179,9 +178,8 @@ class _Repeated:
         """Start these copies, each with the seed of its start."""
         if copies:
             lane = self._lane
-            starts = lane.starts or [last.start for last in self._past.copies]
             assert lane.number is not None
-            self._began(copies, [copy_seed(self._run.seed, lane.number, starts[n], n) for n in copies])
+            self._began(copies, [copy_seed(self._run.seed, lane.number, lane.starts[n], n) for n in copies])
 
     def _reset(self, copies: list[int]) -> None:
         """Begin the next episodes of these copies, from the random numbers that they had then."""
