@@ -44,7 +44,10 @@ class WorkerLink:
         token: Token | None = None,
         limits: Limits | None = None,
     ) -> None:
-        """With a token (only over tcp) the link connects only to the learner of that token. `limits`: if not a worker's."""
+        """With a token (only over tcp) the link connects only to the learner of that token. `limits`: if not a worker's.
+
+        `context`: that of the learner, over inproc; closing the link leaves it open.
+        """
         check_address(address)
         check_worker_name(name)
         self.address = address
@@ -57,7 +60,8 @@ class WorkerLink:
         self.packing = Packing(stack=far, zstd=far and has_zstd())
         """how rollouts may be packed: only if the connection is encrypted or leaves this machine"""
         self._log_limiter = LogRateLimiter()
-        self.context = context or zmq.Context.instance()
+        self._owns_context = context is None
+        self.context: zmq.Context[zmq.Socket[bytes]] = context or zmq.Context()
         self._socket = self.context.socket(zmq.DEALER)
         set_options(self._socket, address, token is not None, limits)
         self._socket.routing_id = routing_id(name, token)
@@ -154,8 +158,13 @@ class WorkerLink:
         self._socket.connect(self.address)
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
-        """Send what is queued, at most `linger_s`, and close."""
+        """Send what is queued, at most `linger_s`, and close.
+
+        A process whose context is still sending when it ends aborts: Python frees the frames that libzmq sends.
+        """
         if self._monitor is not None and not self._socket.closed:
             self._socket.disable_monitor()  # before its reader is closed: libzmq blocks without one
             self._monitor.close(linger=0)
         self._socket.close(linger=int(linger_s * 1000))
+        if self._owns_context:
+            self.context.term()

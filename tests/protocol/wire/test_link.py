@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import socket as plain
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -433,6 +435,26 @@ def test_what_was_said_last_still_goes_out_when_a_link_closes(ends: Ends) -> Non
     worker.send(encode(Goodbye(1, "bye", ())))
     worker.close()
     assert heard(learner) == [(b"w0", Goodbye(1, "bye", ()))]
+
+
+LAST_WORDS = """
+import sys
+from millrace.protocol.messages import Goodbye
+from millrace.protocol.wire.codec import encode
+from millrace.protocol.wire.worker_link import WorkerLink
+
+link = WorkerLink(sys.argv[1], "w0")
+link.send([bytes(200 << 20)])  # Python frees this memory when the process ends
+link.send(encode(Goodbye(1, "bye", ())))
+link.close()
+"""
+
+
+def test_a_process_that_ends_behind_its_link_has_sent_everything(tcp: Ends) -> None:
+    learner = tcp.learner()
+    process = subprocess.run([sys.executable, "-c", LAST_WORDS, learner.address], capture_output=True, check=False)
+    assert process.returncode == 0, process.stderr.decode()
+    assert heard(learner, 2)[1] == (b"w0", Goodbye(1, "bye", ()))
 
 
 # -------------------------------------------------------------------- addresses
