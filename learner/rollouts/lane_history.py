@@ -106,7 +106,7 @@ class LaneHistory:
 
     @classmethod
     def of(cls, past: LanePast, most_steps: int) -> LaneHistory:
-        """The history that a checkpoint has as the past of a lane."""
+        """The history that a checkpoint has as the past of a lane, by the limit of the run that goes on."""
         found = cls(
             list(past.copies),
             most_steps,
@@ -121,6 +121,7 @@ class LaneHistory:
         for each, end in zip(begins, ends, strict=True):
             if each.row < end:
                 found.rows.append(_OfRound(each.row, past.action[each.row : end], each.packed.tobytes()))
+        found._forget_long_ones(known=True)
         return found
 
     @classmethod

@@ -196,6 +196,14 @@ def told(past: LanePast) -> Any:
 # ------------------------------------------------------------------------------------------------ checkpoints
 
 
+@pytest.mark.parametrize(("most_steps", "repeats"), [(6, True), (5, False), (-1, False)])
+def test_the_limit_of_the_run_that_goes_on_decides(most_steps: int, repeats: bool) -> None:
+    past = folded(rollout(["...", "..."], started(0, 0)), rollout(["...", "..."], (), 1)).past(0)
+    found = LaneHistory.of(read(past), most_steps).past(0)
+    assert found.new_episodes == (0 if repeats else 2)
+    assert found.repeated_steps == (12 if repeats else 0)
+
+
 def test_a_run_with_another_number_of_copies_begins_anew_under_numbers_that_were_not_used() -> None:
     past = folded(rollout(["..", ".."], started(3, 5))).past(4)
     history = LaneHistories(copies=3, most_steps=100, pasts=[past]).of(4)
