@@ -89,6 +89,51 @@ class SometimesSlow(CartPoleEnv):
         return super().step(action)  # type: ignore[no-untyped-call]
 
 
+class BreaksWhileRepeated(PendulumEnv):
+    """Pendulum, with slow steps and episodes of 150, whose copies break once, when they continue an episode.
+
+    A copy that is made while the file `trap` exists does in its second step what the file says: `dies`, `raises` or `hangs`.
+    Then the file is gone, so later copies work.
+    """
+
+    def __init__(self, trap: str = "", step_s: float = 0.002) -> None:
+        super().__init__()
+        self._step_s = step_s
+        self._trap = trap if IN_WORKER and os.path.exists(trap) else ""
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> Any:
+        """As Pendulum's."""
+        self._steps = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        """As Pendulum's, but in the second step of a copy with a trap."""
+        if IN_WORKER:
+            time.sleep(self._step_s)
+        self._steps += 1
+        if self._trap and self._steps == 2:
+            self._spring()
+        *row, _, info = super().step(action)  # type: ignore[no-untyped-call]
+        return (*row, self._steps == 150, info)
+
+    def _spring(self) -> None:
+        mine = f"{self._trap}.{os.getpid()}"
+        try:
+            os.rename(self._trap, mine)
+        except FileNotFoundError:
+            return  # another copy was faster
+        with open(mine) as file:
+            what = file.read()
+        match what:
+            case "dies":
+                os.kill(os.getpid(), signal.SIGKILL)
+            case "raises":
+                raise ValueError("the trap was sprung")
+            case "hangs":
+                time.sleep(3600)
+
+
 class UnevenPendulum(PendulumEnv):
     """Pendulum, whose steps take so many seconds; ten times as many in the process that was the first to make a file."""
 
