@@ -68,7 +68,7 @@ class OneValue(XQC):
         """See `Continuous`."""
         actor, critics = self.shapes()
         one = critics._replace(sizes=(*critics.sizes[:-1], 1))
-        return ActorWithCritics(actor, one, lambda outputs: outputs[..., 0], device, self.seed)
+        return ActorWithCritics(self.policy, actor, one, lambda outputs: outputs[..., 0], device, self.seed)
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
         """½ Σ E[w (Q(s, a) − y)²] over both critics."""

@@ -48,7 +48,7 @@ Tools:
 - `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Transitions`, the
   tensors of a sample, and `CriticLoss`, what a loss says of them.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
-- `features` and `normalize`: observations as these networks take them.
+- `features` and `normalize`: observations as these networks take them; `random_shift`: images, moved at random.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
 - `torch_seed` of a `Purpose`: the seed of a random stream that is independent of all others of a run.
 - `check_finite` and `scheduled`: the check before a gradient step, and settings that fall over the run.
@@ -69,6 +69,7 @@ from millrace.learner.algorithms.reinforce import REINFORCE
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
+from millrace.learner.algorithms.replay.random_shift import random_shift
 from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from millrace.learner.algorithms.returns import EpisodeEnds, gae, vtrace
 from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
@@ -153,6 +154,7 @@ __all__ = [
     "log_prob_and_entropy",
     "normalize",
     "policy_log_prob",
+    "random_shift",
     "scheduled",
     "squashed_sample",
     "torch_seed",

@@ -33,6 +33,7 @@ class CrossQ(NormalizedSAC):
         relu = self.policy.activation == "relu"
         actor, critic = layer_sizes(self.policy, self.config.critic_net, 1)
         return ActorWithCritics(
+            self.policy,
             MLPShape(1, actor, relu, Normalized.AFTER, output_gain=0.01),
             MLPShape(2, critic, relu, Normalized.AFTER),
             lambda outputs: outputs[..., 0],

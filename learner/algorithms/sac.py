@@ -29,7 +29,7 @@ class SAC(Continuous):
 
     @staticmethod
     def policy_spec(config: SACConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box."""
         return SAC.bounded_policy_spec(config, observation, action, head="squashed")
 
     def __init__(self, config: SACConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
@@ -98,7 +98,7 @@ class SAC(Continuous):
         critic = self.critic_loss(rows)
         measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)
 
-        loss, log_prob = self.actor_loss(rows.x)
+        loss, log_prob = self.actor_loss(rows.x.detach())
         measured |= self.descend("actor", loss, {"entropy": -log_prob.mean()})
 
         if self.config.ent_coef is None:

@@ -25,7 +25,7 @@ class TD3(Continuous):
 
     @staticmethod
     def policy_spec(config: TD3Config, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A deterministic actor. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        """A deterministic actor. Raises `UsageError` unless the action is a bounded Box."""
         return TD3.bounded_policy_spec(config, observation, action, head="deterministic")
 
     def exploration(self) -> list[float]:
@@ -37,7 +37,7 @@ class TD3(Continuous):
         """The targets [B] of both critics: y = Σ γⁱ r + γᵏ min Q′(s′, a′),  a′ = clip(μ′(s′) + clip(noise), ±1)."""
         largest = self.config.target_noise_clip
         noise = (self.noise(len(rows.x)) * self.config.target_noise).clip(-largest, largest)
-        action = (self.target.params(rows.next_x).tanh() + noise).clip(-1, 1)
+        action = (self.target.actor_params(rows.next_x).tanh() + noise).clip(-1, 1)
         return rows.reward + rows.discount * self.target.values(rows.next_x, action).amin(0)
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
@@ -49,7 +49,7 @@ class TD3(Continuous):
 
     def actor_loss(self, x: Tensor) -> Tensor:
         """−E[Q₀(s, μ(s))], for features [B, D]."""
-        value = self.net.values(x, self.net.params(x).tanh(), constant=True, critics=1)  # [1, B], no gradient for Q
+        value = self.net.values(x, self.net.actor_params(x).tanh(), constant=True, critics=1)  # [1, B], no gradient for Q
         return -value.mean()
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
@@ -58,6 +58,6 @@ class TD3(Continuous):
         measured = self.descend("critic", critic.loss, critic.numbers)
         self.gradient_steps += 1
         if self.gradient_steps % self.config.policy_delay == 0:
-            measured |= self.descend("actor", self.actor_loss(rows.x), {})
+            measured |= self.descend("actor", self.actor_loss(rows.x.detach()), {})
             self.target.flat.lerp_(self.net.flat, self.config.tau)
         return measured, critic.error

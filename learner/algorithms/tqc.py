@@ -30,7 +30,7 @@ class TQC(SAC):
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box."""
         if config.dropped_quantiles >= config.quantiles:
             raise UsageError(
                 f"dropped_quantiles: expected fewer than quantiles, {config.quantiles}, got {config.dropped_quantiles}"
@@ -43,6 +43,7 @@ class TQC(SAC):
         relu = self.policy.activation == "relu"
         actor, critic = layer_sizes(self.policy, config.net, config.quantiles)
         return ActorWithCritics(
+            self.policy,
             MLPShape(1, actor, relu, output_gain=0.01),
             MLPShape(config.critics, critic, relu),
             lambda quantiles: quantiles.mean(-1),

@@ -51,7 +51,7 @@ class XQC(NormalizedSAC):
 
     def networks(self, device: str) -> ActorWithCritics:
         """See `Continuous`."""
-        return ActorWithCritics(*self.shapes(), self.categories.mean, device, self.seed)
+        return ActorWithCritics(self.policy, *self.shapes(), self.categories.mean, device, self.seed)
 
     def scaled(self, reward: Floats) -> Floats:
         """See `GradientDescent`: no discounted return so far is beyond `return_bound` after this."""

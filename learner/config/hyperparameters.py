@@ -268,6 +268,10 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     """
     updates_per_step: Free[Annotated[float, msgspec.Meta(gt=0, le=1e6)]] = 1.0
     """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts are."""
+    random_shift: Free[Annotated[int, msgspec.Meta(ge=0, le=64)]] = 4
+    """Pixels by which images are moved at random, at most, each time a gradient step takes them (DrQ-v2). It doesn't concern
+    observations without images.
+    """
 
 
 class SACConfig(ContinuousConfig, frozen=True):

@@ -67,27 +67,14 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
 
 
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
-    """The fields that are needed to act, and then those of the critic. Linear weights are [out, in]."""
+    """The fields that are needed to act, and then those of the critic. Linear weights are [out, in].
+
+    Of actions in [-1, 1], the encoder stands last among those that act, beside the critics, whose losses alone train it.
+    """
     if spec.own is not None:
         return tuple(Field(array.name, array.shape, 0) for array in spec.own.arrays), ()
-    acting: list[Field] = []
-    width = feature_size(spec)
-    if spec.encoder is not None:
-        acting += [Field(f"encoder.{array.name}", array.shape, 0) for array in spec.encoder.arrays]
-        width = spec.encoder.size
-    for i, leaf in enumerate(spec.observation):
-        if not leaf.is_image or spec.encoder is not None:
-            continue
-        stack, (channels, _, _), flattened = convolutions(leaf)
-        for j, conv in enumerate(stack):
-            weight = (conv.channels, channels, conv.kernel, conv.kernel)
-            acting += [
-                Field(f"image{i}.{j}.weight", weight, math.sqrt(2)),
-                Field(f"image{i}.{j}.bias", (conv.channels,), 0),
-            ]
-            channels = conv.channels
-        acting += _linear(f"image{i}.out", flattened, IMAGE_FEATURES, math.sqrt(2))
-        width += IMAGE_FEATURES
+    encoder, width = encoder_layout(spec)
+    acting = [] if spec.stores_scaled_actions else [*encoder]
     if spec.core is not None:
         from_input, from_state = core_shapes(spec, width)
         acting += [*_linear("core.input", *from_input[::-1], 1.0), *_linear("core.state", *from_state[::-1], 1.0)]
@@ -102,6 +89,7 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
     size = math.prod(action.shape)
     if spec.stores_scaled_actions:
         acting += _linear("actor.out", last, 2 * size if spec.head == "squashed" else size, 0.01)
+        acting += encoder
         critics = [
             field
             for name in CRITICS
@@ -115,6 +103,29 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
         acting.append(Field("actor.log_std", (outputs,), 0))
     critic, last = ([], last) if spec.shared_net else _hidden("critic", width + critic_size(spec), spec.net)
     return tuple(acting), (*critic, *_linear("critic.out", last, 1, 1.0))
+
+
+def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
+    """The fields of what comes before the linear layers, for images or of the user's own; and how many features it gives."""
+    fields: list[Field] = []
+    width = feature_size(spec)
+    if spec.encoder is not None:
+        fields += [Field(f"encoder.{array.name}", array.shape, 0) for array in spec.encoder.arrays]
+        width = spec.encoder.size
+    for i, leaf in enumerate(spec.observation):
+        if not leaf.is_image or spec.encoder is not None:
+            continue
+        stack, (channels, _, _), flattened = convolutions(leaf)
+        for j, conv in enumerate(stack):
+            weight = (conv.channels, channels, conv.kernel, conv.kernel)
+            fields += [
+                Field(f"image{i}.{j}.weight", weight, math.sqrt(2)),
+                Field(f"image{i}.{j}.bias", (conv.channels,), 0),
+            ]
+            channels = conv.channels
+        fields += _linear(f"image{i}.out", flattened, IMAGE_FEATURES, math.sqrt(2))
+        width += IMAGE_FEATURES
+    return fields, width
 
 
 def _trunk(spec: PolicySpec) -> str:

@@ -26,6 +26,7 @@ from millrace.protocol.policy.layout import (
     LOG_STD_BOUNDS,
     Field,
     convolutions,
+    encoder_layout,
     hidden_names,
     named_views,
     parameter_layout,
@@ -194,8 +195,60 @@ def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
     return leaf
 
 
+class Encoder:
+    """What comes before the MLPs: the convolutions of each image, or the user's own module."""
+
+    def __init__(self, spec: PolicySpec, parameters: dict[str, Tensor], device: str | torch.device, *, seed: int) -> None:
+        """`parameters`: leaves of the graph, by name. Those of the user's own module take their places."""
+        self._spec = spec
+        self._parameters = parameters
+        self._module = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
+        self._images = self._convolutions()
+
+    def __call__(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+        """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].
+
+        With the user's own module, the input of the MLPs is the module's output [B, K].
+        """
+        if self._module is not None:
+            out: Tensor = self._module(x, *images)
+            return out
+        parts = [x]
+        parts += [convolutions(image) for convolutions, image in zip(self._images, images, strict=True)]
+        return torch.cat(parts, -1) if images else x
+
+    def use_bfloat16(self) -> None:
+        """Process images in bfloat16 from now on, with copies of the current parameters and without gradients."""
+        with torch.no_grad():
+            self._images = [image.in_bfloat16() for image in self._convolutions()]
+
+    def _adopt(self, module: torch.nn.Module) -> torch.nn.Module:
+        """Move the module's parameters into the flat tensor; they keep their initial values."""
+        for name, parameter in module.named_parameters():
+            view = self._parameters[f"encoder.{name}"]
+            with torch.no_grad():
+                view.copy_(parameter)
+            parameter.data = view.data
+            parameter.grad = view.grad
+            self._parameters[f"encoder.{name}"] = parameter
+        return module
+
+    def _convolutions(self) -> list[Convolutions]:
+        """The convolutions of each image, with views of the parameters."""
+        images = [i for i, leaf in enumerate(self._spec.observation) if leaf.is_image]
+        return [] if self._module else [self._image(i) for i in images]
+
+    def _image(self, i: int) -> Convolutions:
+        leaf = self._spec.observation[i]
+        stack, (channels, _, _), _ = convolutions(leaf)
+        names = [f"image{i}.{j}" for j in range(len(stack))] + [f"image{i}.out"]
+        parameters = [(self._parameters[f"{name}.weight"], self._parameters[f"{name}.bias"]) for name in names]
+        channels_last = leaf.shape != (channels, *leaf.shape[1:])
+        return Convolutions(channels_last, parameters, [conv.stride for conv in stack], leaf.divisor)
+
+
 class FlatNetwork:
-    """Named parameters that are views of one flat tensor, and the layers before the heads: encoder, convolutions, core."""
+    """Named parameters that are views of one flat tensor, and the layers before the heads: encoder and core."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         """Initialize each field orthogonally with its gain, or with zeros if the gain is 0. The values depend on `seed`."""
@@ -204,7 +257,9 @@ class FlatNetwork:
         self.fields = (*acting, *critic)
         self.acting_size = total_size(acting)
         self.acting_fields = len(acting)
-        self.flat = _initial(self.fields, seed).to(device)  # [P] float32: give this to the optimizer
+        generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
+        self.flat = initial_fields(self.fields, generator).to(device)
+        """[P] float32: give this to the optimizer"""
         self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
         self.flat.grad = self.flat_grad
         gradients = named_views(self.flat_grad, self.fields)
@@ -212,21 +267,9 @@ class FlatNetwork:
             name: trainable(values, gradients[name]) for name, values in named_views(self.flat, self.fields).items()
         }  # leaves of the graph: views of `flat`, gradients are views of `flat_grad`
         self._relu = spec.activation == "relu"
-        self._encoder = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
-        self._images = self._convolutions()
+        self.encode = Encoder(spec, self.parameters, device, seed=seed)
         if spec.needs_torch:
             keep_freed_memory()
-
-    def _adopt(self, encoder: torch.nn.Module) -> torch.nn.Module:
-        """Move the encoder's parameters into the flat tensor; they keep their initial values."""
-        for name, parameter in encoder.named_parameters():
-            view = self.parameters[f"encoder.{name}"]
-            with torch.no_grad():
-                view.copy_(parameter)
-            parameter.data = view.data
-            parameter.grad = view.grad
-            self.parameters[f"encoder.{name}"] = parameter
-        return encoder
 
     def layers(self, names: Sequence[str]) -> list[Tensor]:
         """Weight and bias of each layer, one after another, as `MLPNode` takes them."""
@@ -243,36 +286,6 @@ class FlatNetwork:
             return x
         out = self.mlp(x, layers)
         return torch.relu(out) if self._relu else torch.tanh(out)
-
-    def use_bfloat16_convolutions(self) -> None:
-        """Process images in bfloat16 from now on, with copies of the current parameters and without gradients."""
-        with torch.no_grad():
-            self._images = [image.in_bfloat16() for image in self._convolutions()]
-
-    def _convolutions(self) -> list[Convolutions]:
-        """The convolutions of each image, with views of the parameters."""
-        images = [i for i, leaf in enumerate(self.spec.observation) if leaf.is_image]
-        return [] if self._encoder else [self._image(i) for i in images]
-
-    def _image(self, i: int) -> Convolutions:
-        leaf = self.spec.observation[i]
-        stack, (channels, _, _), _ = convolutions(leaf)
-        names = [f"image{i}.{j}" for j in range(len(stack))] + [f"image{i}.out"]
-        parameters = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
-        channels_last = leaf.shape != (channels, *leaf.shape[1:])
-        return Convolutions(channels_last, parameters, [conv.stride for conv in stack], leaf.divisor)
-
-    def inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].
-
-        With an encoder, the input of the MLPs is the encoder's output [B, K].
-        """
-        if self._encoder is not None:
-            out: Tensor = self._encoder(x, *images)
-            return out
-        parts = [x]
-        parts += [convolutions(image) for convolutions, image in zip(self._images, images, strict=True)]
-        return torch.cat(parts, -1) if images else x
 
     def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
         """Inputs [T · C, D] -> the core's outputs [T · C, H] and its last state [C, S]; see `recurrent.py`."""
@@ -312,7 +325,7 @@ class ActorCriticNetwork(FlatNetwork):
         return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
 
     def _common(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None) -> Tensor:
-        h = self.inputs(x[:, : self._acting_features], images)
+        h = self.encode(x[:, : self._acting_features], images)
         if recurrent is not None:
             h, _ = self.core(h, recurrent)
             h = h if recurrent.output_rows is None else h[recurrent.output_rows]
@@ -366,7 +379,7 @@ class ActorCriticNetwork(FlatNetwork):
 
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
         """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
-        h = self.inputs(x, images)
+        h = self.encode(x, images)
         if self.spec.core is not None:
             h, state = self.core(h, RecurrentInput(state, x.new_ones(1, len(x))))
         return self._params(self.hidden(h, self._trunk)), state
@@ -382,7 +395,7 @@ class QNetwork(FlatNetwork):
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Action values [B, n] of features [B, D] float32 and images [B, *leaf] uint8."""
-        h = self.inputs(x, images)
+        h = self.encode(x, images)
         if not self.spec.dueling:
             return self.mlp(h, self._without_dueling)
         h = self.hidden(h, self._hidden)
@@ -398,20 +411,26 @@ class ActorAndCritics(FlatNetwork):
     """An actor of actions in [-1, 1] and two critics, which value an observation with an action. Each has its own MLPNode.
 
     `actor` and `critics` are the two parts of the flat tensor, with their parts of the gradients: one for each optimizer.
+    The encoder, if there is one, is learned with the critics, and the actor takes what it gives (Yarats et al. 2022). So
+    losses are written in the encoder's outputs h [B, H], which are the features where nothing is encoded.
     """
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
-        ends = slice(None, self.acting_size), slice(self.acting_size, None)
-        self.actor, self.critics = (self.flat[end] for end in ends)
-        """[A] and [C] float32, which share memory with `flat`"""
-        self.actor.grad, self.critics.grad = (self.flat_grad[end] for end in ends)
+        end = self.acting_size - total_size(encoder_layout(spec)[0])
+        self.actor = self.flat[:end]
+        """[A] float32, in the memory of `flat`: the actor without the encoder"""
+        self.actor.grad = self.flat_grad[:end]
+        self.critics = self.flat[end:]
+        """[E + C] float32, in the memory of `flat`: the encoder, then the critics"""
+        self.critics.grad = self.flat_grad[end:]
         self._actor = self.layers([*hidden_names(spec), "actor.out"])
-        self._critics = trainable(self.critics, self.critics.grad)
+        self._constant_critics = self.flat[self.acting_size :]
+        self._critics = trainable(self._constant_critics, self.flat_grad[self.acting_size :])
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [A] that workers act with."""
-        return self.actor.cpu().numpy().copy()
+        """A copy of the parameters that workers act with: the actor, then the encoder."""
+        return self.flat[: self.acting_size].cpu().numpy().copy()
 
     def _stacked(self, critics: int, flat: Tensor) -> list[Tensor]:
         """Weight [critics, out, in] and bias [critics, out] of each layer of the critics, as views of `flat` [C]."""
@@ -426,28 +445,32 @@ class ActorAndCritics(FlatNetwork):
         return views
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """The actor's output for features [B, D] float32, before the tangent: [B, D′] (deterministic) or [B, 2 D′].
+        """As `actor_params`, for features [B, D] float32 and images [B, *leaf] uint8: to act."""
+        return self.actor_params(self.encode(x, images))
+
+    def actor_params(self, h: Tensor) -> Tensor:
+        """The actor's output before the tangent: [B, D′] (deterministic) or [B, 2 D′].
 
         Of a squashed Gaussian, the second half is the logarithm of the standard deviations, clipped to [-20, 2].
         """
-        out = self.mlp(self.inputs(x, images), self._actor)
+        out = self.mlp(h, self._actor)
         if self.spec.head == "deterministic":
             return out
         mean, log_std = out.chunk(2, -1)
         return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
 
-    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions [B, D′] of a squashed Gaussian and their log-densities [B], for features [B, D] and noise [B, D′]."""
-        return squashed_sample(self.params(x), noise)
+    def sample(self, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, D′] of a squashed Gaussian and their log-densities [B], for noise [B, D′]."""
+        return squashed_sample(self.actor_params(h), noise)
 
-    def values(self, x: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
-        """The values [critics, B] of both critics, or of the first, for features [B, D] and actions [B, D′] in [-1, 1].
+    def values(self, h: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
+        """The values [critics, B] of both critics, or of the first, for actions [B, D′] in [-1, 1].
 
         `constant`: the critics get no gradient; the actions do. Use it for the loss of the actor.
         """
-        flat = self.critics if constant else self._critics
+        flat = self._constant_critics if constant else self._critics
         layers = partial(self._stacked, critics)
-        out: Tensor = StackedMLP.apply(torch.cat((x, action), -1), self._relu, flat, layers)  # type: ignore[no-untyped-call]
+        out: Tensor = StackedMLP.apply(torch.cat((h, action), -1), self._relu, flat, layers)  # type: ignore[no-untyped-call]
         return out[..., 0]
 
 
@@ -464,9 +487,9 @@ def network_of(
             return ActorAndCritics(spec, device, seed=seed)
 
 
-def _initial(fields: Sequence[Field], seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
-    parts = []
+def initial_fields(fields: Sequence[Field], generator: torch.Generator) -> Tensor:
+    """Parameters [P] to begin with: each field orthogonal with its gain, or zeros if the gain is 0."""
+    parts = [torch.zeros(0, dtype=DTYPE)]
     for field in fields:
         part = torch.zeros(field.shape, dtype=DTYPE)
         if field.gain:

@@ -46,7 +46,7 @@ class TorchPolicy:
         with defaults_of_thread():
             self._net.flat[:count].copy_(torch.tensor(parameters))
             if self._images_dtype == "bfloat16":
-                self._net.use_bfloat16_convolutions()
+                self._net.encode.use_bfloat16()
         self._buffers = named_views(buffers, buffer_layout(self.spec))
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:

@@ -1,4 +1,4 @@
-"""An actor and K critics as `StackedMLPs`: what `ActorAndCritics` is to SAC, for critics of any form.
+"""An actor and K critics as `StackedMLPs`: what `ActorAndCritics` is to SAC, for critics of any form, and its encoder.
 
 Rule: where a gradient is recorded (`torch.is_grad_enabled`), the actor is being trained, so it normalizes by the statistics
 of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics count. So SAC's losses hold
@@ -15,10 +15,9 @@ from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
-from millrace.protocol.policy.features import feature_size
-from millrace.protocol.policy.layout import LOG_STD_BOUNDS
+from millrace.protocol.policy.layout import LOG_STD_BOUNDS, encoder_layout, named_views
 from millrace.protocol.policy.malloc import keep_freed_memory
-from millrace.protocol.policy.networks import trainable
+from millrace.protocol.policy.networks import Encoder, initial_fields, trainable
 from millrace.protocol.policy.torch_distributions import squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import PolicySpec
@@ -28,54 +27,74 @@ class ActorWithCritics:
     """A squashed Gaussian actor, and K critics of features and actions, whose outputs stand for values."""
 
     def __init__(
-        self, actor: MLPShape, critics: MLPShape, values_of: Callable[[Tensor], Tensor], device: str, seed: int
+        self,
+        policy: PolicySpec,
+        actor: MLPShape,
+        critics: MLPShape,
+        values_of: Callable[[Tensor], Tensor],
+        device: str,
+        seed: int,
     ) -> None:
         """`values_of`: outputs of critics [K, B, O] -> values [K, B]. The initial parameters depend on `seed`."""
         keep_freed_memory()  # a pass takes and frees arrays of half a megabyte again and again
         generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
-        parts = [initial(shape, generator) for shape in (actor, critics)]
+        fields, _ = encoder_layout(policy)
+        parts = [initial(actor, generator), initial_fields(fields, generator), initial(critics, generator)]
+        sizes = [len(part) for part in parts]
         self.flat = torch.cat(parts).to(device)
-        """[A + C] float32: all parameters, those of the actor first"""
+        """[A + E + C] float32: all parameters, those of the actor first, then the encoder's"""
         self.flat_grad = torch.zeros_like(self.flat)
-        self.actor, self.critics = torch.split(self.flat, [len(part) for part in parts])
-        """[A] and [C], which share memory with `flat`"""
-        self.actor.grad, self.critics.grad = torch.split(self.flat_grad, [len(part) for part in parts])
+        self.acting_size = sizes[0] + sizes[1]
+        """A + E"""
+        self.actor, self._encoder, constant_critics = torch.split(self.flat, sizes)
+        """[A] in the memory of `flat`"""
+        self.actor.grad, of_encoder, of_constant_critics = torch.split(self.flat_grad, sizes)
+        self.critics = self.flat[sizes[0] :]
+        """[E + C] in the memory of `flat`: the encoder, then the critics"""
+        self.critics.grad = self.flat_grad[sizes[0] :]
+        gradients = named_views(of_encoder, fields)
+        encoder = {name: trainable(view, gradients[name]) for name, view in named_views(self._encoder, fields).items()}
+        self.encode = Encoder(policy, encoder, device, seed=seed)
         statistics = [initial_statistics(shape) for shape in (actor, critics)]
         self.statistics = torch.cat(statistics).to(device)
         """[S] the running statistics, those of the actor first; empty without normalization"""
         of_actor, of_critics = torch.split(self.statistics, [len(part) for part in statistics])
         self.actor_body = StackedMLPs(actor, trainable(self.actor, self.actor.grad), of_actor)
-        self.critic_bodies = StackedMLPs(critics, trainable(self.critics, self.critics.grad), of_critics)
+        self.critic_bodies = StackedMLPs(critics, trainable(constant_critics, of_constant_critics), of_critics)
         self.project()
         self.renormalizes = False
         """whether the passes that train use batch renormalization"""
         self._values_of = values_of
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """The actor's means and log standard deviations [B, 2 D′] for features [B, D], before the tangent."""
+        """As `actor_params`, for features [B, D] and images [B, *leaf] uint8."""
+        return self.actor_params(self.encode(x, images))
+
+    def actor_params(self, h: Tensor) -> Tensor:
+        """The actor's means and log standard deviations [B, 2 D′] for inputs of the MLPs [B, H], before the tangent."""
         if torch.is_grad_enabled():
-            (out,) = self.actor_body.trained(x, renormalizes=self.renormalizes)
+            (out,) = self.actor_body.trained(h, renormalizes=self.renormalizes)
         else:
-            (out,) = self.actor_body.evaluated(x)
+            (out,) = self.actor_body.evaluated(h)
         mean, log_std = out.chunk(2, -1)
         return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
 
-    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions [B, D′] in [-1, 1] and their log-densities [B], for features [B, D] and noise [B, D′]."""
-        return squashed_sample(self.params(x), noise)
+    def sample(self, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, D′] in [-1, 1] and their log-densities [B], for inputs [B, H] and noise [B, D′]."""
+        return squashed_sample(self.actor_params(h), noise)
 
-    def outputs(self, x: Tensor, action: Tensor) -> Tensor:
-        """Outputs of the critics [K, B, O] for features [B, D] and actions [B, D′], to train the critics by."""
-        return self.critic_bodies.trained(torch.cat((x, action), -1), renormalizes=self.renormalizes)
+    def outputs(self, h: Tensor, action: Tensor) -> Tensor:
+        """Outputs of the critics [K, B, O] for inputs [B, H] and actions [B, D′], to train the critics by."""
+        return self.critic_bodies.trained(torch.cat((h, action), -1), renormalizes=self.renormalizes)
 
-    def minibatch_outputs(self, x: Tensor, action: Tensor) -> Tensor:
+    def minibatch_outputs(self, h: Tensor, action: Tensor) -> Tensor:
         """As `outputs`, normalized by the statistics of this minibatch, but nothing is trained or moves: for targets."""
-        return self.critic_bodies.of_minibatch(torch.cat((x, action), -1))
+        return self.critic_bodies.of_minibatch(torch.cat((h, action), -1))
 
-    def values(self, x: Tensor, action: Tensor, *, constant: bool = True) -> Tensor:
-        """The values [K, B] of features [B, D] and actions [B, D′], by critics that get no gradient; the actions do."""
+    def values(self, h: Tensor, action: Tensor, *, constant: bool = True) -> Tensor:
+        """The values [K, B] of inputs [B, H] and actions [B, D′], by critics that get no gradient; the actions do."""
         assert constant, "outputs() is what critics are trained by"
-        return self._values_of(self.critic_bodies.evaluated(torch.cat((x, action), -1)))
+        return self._values_of(self.critic_bodies.evaluated(torch.cat((h, action), -1)))
 
     def project(self) -> None:
         """See `StackedMLPs.project`."""
@@ -83,12 +102,12 @@ class ActorWithCritics:
         self.critic_bodies.project()
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P] that workers act with: those of a plain MLP."""
-        return self.actor_body.folded().cpu().numpy().copy()
+        """A copy of the parameters [P] that workers act with: those of a plain MLP, then the encoder's."""
+        return torch.cat((self.actor_body.folded(), self._encoder)).cpu().numpy()
 
 
 def layer_sizes(policy: PolicySpec, critic_net: tuple[int, ...], outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The sizes of the layers of the policy's actor, and of each critic with these hidden layers and outputs."""
-    features = feature_size(policy)
+    _, features = encoder_layout(policy)
     size = math.prod(policy.action.shape)
     return (features, *policy.net, 2 * size), (features + size, *critic_net, outputs)

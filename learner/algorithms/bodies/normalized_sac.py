@@ -43,7 +43,7 @@ class NormalizedSAC(SAC):
 
     @classmethod
     def policy_spec(cls, config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and no image is observed."""
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box."""
         return cls.bounded_policy_spec(config, observation, action, head="squashed")
 
     def __init__(
@@ -57,10 +57,10 @@ class NormalizedSAC(SAC):
         """See `SAC`."""
         return self.net.actor_body.shape.normalized.value
 
-    @torch.no_grad()
     def joint(self, rows: Transitions) -> Joint:
-        """The observations and actions of these rows, and the next ones with actions ã′ ~ π(s′)."""
-        action, log_prob = self.sample(rows.next_x)
+        """The observations and actions of these rows, and the next ones with actions ã′ ~ π(s′), without a gradient."""
+        with torch.no_grad():
+            action, log_prob = self.sample(rows.next_x)
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
 
     def after_step(self, name: str) -> None:
@@ -81,7 +81,7 @@ class NormalizedSAC(SAC):
         self.move_target()
         self.gradient_steps += 1
         if self.gradient_steps % self.config.policy_delay == 0:
-            measured |= self.actor_step(rows.x)
+            measured |= self.actor_step(rows.x.detach())
         return measured, critic.error
 
     def actor_step(self, x: Tensor) -> UpdateMetrics:
@@ -104,7 +104,6 @@ class NormalizedSAC(SAC):
                 "start_from: expected a run of the same algorithm with a checkpoint, got a policy without the statistics of "
                 "batch normalization"
             )
-        actor = len(self.net.actor)
         statistics = total_size(self.net.actor_body.shape.statistics())
-        super().start_from(start._replace(acting=actor))
+        super().start_from(start._replace(acting=self.net.acting_size))
         self.net.statistics[:statistics].copy_(start.state["statistics"][:statistics])

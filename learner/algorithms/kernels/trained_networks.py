@@ -118,15 +118,15 @@ class SmallActorAndCritics(ActorAndCritics):
 
         self._values = {count: critics(CRITICS[:count]) for count in range(1, len(CRITICS) + 1)}
 
-    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def sample(self, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """See `ActorAndCritics`."""
-        action, log_prob = self._sample(x, noise)
+        action, log_prob = self._sample(h, noise)
         return action, log_prob
 
-    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+    def actor_params(self, h: Tensor) -> Tensor:
         """See `ActorAndCritics`."""
-        return self._output(x)[0] if self.spec.head == "deterministic" else super().params(x, images)
+        return self._output(h)[0] if self.spec.head == "deterministic" else super().actor_params(h)
 
-    def values(self, x: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
+    def values(self, h: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
         """See `ActorAndCritics`."""
-        return self._values[critics](torch.cat((x, action), -1), constant=constant)[0]
+        return self._values[critics](torch.cat((h, action), -1), constant=constant)[0]

@@ -7,7 +7,7 @@ size of the rollouts and the number and speed of the workers. Where these settin
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, ClassVar, Protocol
 
@@ -21,6 +21,7 @@ from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_and_critics
 from millrace.learner.algorithms.replay.off_policy import OffPolicy, Transitions
+from millrace.learner.algorithms.replay.random_shift import random_shift
 from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import ContinuousConfig
 from millrace.protocol.arrays import Floats
@@ -30,24 +31,33 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Networks(Protocol):
-    """An actor and critics, such as `ActorAndCritics`: x are features [B, D], actions [B, D′] are in [-1, 1]."""
+    """An actor and critics, such as `ActorAndCritics`: h [B, H] is the encoder's output, actions [B, D′] are in [-1, 1]."""
 
     flat: Tensor
-    """[A + C] all parameters, those of the actor first"""
+    """[A + E + C] all parameters, those of the actor first, then the encoder's"""
     actor: Tensor
     """[A] in the memory of `flat`, with a gradient"""
     critics: Tensor
-    """[C] in the memory of `flat`, with a gradient"""
+    """[E + C] the encoder and the critics, in the memory of `flat`, with a gradient"""
 
-    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+    @property
+    def encode(self) -> Callable[[Tensor, Sequence[Tensor]], Tensor]:
+        """Makes h of features [B, D] and images [B, *leaf] uint8."""
+        ...
+
+    def actor_params(self, h: Tensor) -> Tensor:
         """The actor's output before the tangent, [B, D′] or [B, 2 D′]."""
         ...
 
-    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """The same for features [B, D] and images [B, *leaf] uint8."""
+        ...
+
+    def sample(self, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions and their log-densities [B], for noise [B, D′]."""
         ...
 
-    def values(self, x: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
+    def values(self, h: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
         """Values [critics, B]. `constant`: the critics get no gradient; the actions do."""
         ...
 
@@ -70,7 +80,7 @@ class Continuous(OffPolicy):
     ) -> PolicySpec:
         """The policy of these spaces. `head`: fields of `PolicySpec`.
 
-        Raises `UsageError`, with a one-line message, unless the action is a Box with finite bounds and no image is observed.
+        Raises `UsageError`, with a one-line message, unless the action is a Box with finite bounds.
         """
         name = cls.__name__.lower()
         if action.kind != "box":
@@ -85,11 +95,6 @@ class Continuous(OffPolicy):
                     f"{name}: expected an action Box with finite bounds, got {low:g} to {high:g}; "
                     "take --algo ppo, or give the Box the bounds between which good actions are"
                 )
-        if images := [leaf for leaf in observation if leaf.is_image]:
-            where = f" at {images[0].path}" if images[0].path else ""
-            raise UsageError(f"{name}: expected no images, got {list(images[0].shape)}{where}; take --algo ppo for them")
-        if config.encoder is not None:
-            raise UsageError(f"{name}: expected no encoder, got {config.encoder}; take --algo ppo for it")
         return replace(OffPolicy.policy_spec(config, observation, action), **head)
 
     def __init__(
@@ -130,9 +135,27 @@ class Continuous(OffPolicy):
         return torch.randn(rows, math.prod(self.policy.action.shape), generator=self._generator).to(self.net.flat)
 
     def transitions(self, sample: Sample) -> Transitions:
-        """See `OffPolicy`; an action is a row of numbers."""
+        """See `OffPolicy`; an action is a row of numbers, and x and next_x are encoded, so that losses need no images.
+
+        Images are shifted at random first. The loss of the critics trains the encoder through `rows.x`; next_x has no
+        gradient (Yarats et al. 2022, DrQ-v2).
+        """
         rows = super().transitions(sample)
-        return rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
+        rows = rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
+        if not self.policy.needs_torch:
+            return rows
+        x = self.net.encode(rows.x, self._shifted(rows.images))
+        with torch.no_grad():
+            next_x = self.net.encode(rows.next_x, self._shifted(rows.next_images))
+        return rows._replace(x=x, images=(), next_x=next_x, next_images=())
+
+    def _shifted(self, images: Sequence[Tensor]) -> list[Tensor]:
+        leaves = [leaf for leaf in self.policy.observation if leaf.is_image]
+        most = self.config.random_shift
+        return [
+            random_shift(image, most, channels_last=leaf.has_channels_last, generator=self._generator)
+            for image, leaf in zip(images, leaves, strict=True)
+        ]
 
     def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
         """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss.

@@ -44,6 +44,9 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
     """
     if not isinstance(algorithm, ActorCritic | Continuous):
         raise UsageError(f"clone_epochs: expected an ActorCritic or a Continuous to clone, got {type(algorithm).__name__}")
+    if isinstance(algorithm, Continuous) and algorithm.policy.needs_torch:
+        name = type(algorithm).__name__.lower()
+        raise UsageError(f"clone_epochs: {name} clones no encoder of images, which its critics train; take --algo ppo")
     config = algorithm.config
     rows = Demonstrations.of(episodes, algorithm.scaled, config.gamma)
     size = len(rows.at)

@@ -176,12 +176,6 @@ def test_workers_act_as_the_network_does(algo: str) -> None:
     [
         (OBSERVATION, action_spec(gymnasium.spaces.Discrete(3)), {}, "expected an action space Box, got discrete"),
         (OBSERVATION, action_spec(gymnasium.spaces.Box(-np.inf, np.inf, (2,))), {}, "finite bounds, got -inf to inf"),
-        (
-            (Leaf("eye", "box", (32, 32, 3), "uint8", divisor=255),),
-            ACTION,
-            {},
-            r"expected no images, got \[32, 32, 3\] at eye",
-        ),
         *(
             (
                 OBSERVATION,
@@ -196,7 +190,6 @@ def test_workers_act_as_the_network_does(algo: str) -> None:
                 (float(np.finfo(np.float16).max), np.float16),
             )
         ),
-        (OBSERVATION, ACTION, {"encoder": "a:b"}, "expected no encoder, got a:b"),
     ],
 )
 def test_other_spaces_are_refused_in_one_line(

@@ -63,6 +63,8 @@ def kinds() -> dict[str, tuple[str, PolicySpec, dict[str, Any]]]:
         spec = GAUSSIAN if name != "dqn" else DISCRETE
         found[name] = (name, spec, REPLAY | steps)
         found[f"{name}, everything"] = (name, spec, REPLAY | MORE_REPLAY | steps | (MORE_DQN if name == "dqn" else {}))
+    for name in CONTINUOUS:
+        found[f"{name}, images"] = (name, msgspec.structs.replace(IMAGE, action=GAUSSIAN.action), REPLAY | STEPS[name])
     found["dqn, images"] = ("dqn", IMAGE, REPLAY | MORE_REPLAY | STEPS["dqn"])
     found["dqn, masks"] = ("dqn", spec_of("discrete"), REPLAY | MORE_REPLAY | STEPS["dqn"])
     return found

@@ -52,11 +52,11 @@ def test_its_parameters_are_views_of_the_flat_ones_and_keep_their_first_values(s
     x = torch.randn(6, 4)
     images = [torch.randint(0, 256, (6, *leaf.shape), dtype=torch.uint8) for leaf in spec.observation[1:]]
     expected = alone(x, *images)
-    assert torch.equal(net.inputs(x, images), expected)
-    net.inputs(x, images).square().sum().backward()  # type: ignore[no-untyped-call]
+    assert torch.equal(net.encode(x, images), expected)
+    net.encode(x, images).square().sum().backward()  # type: ignore[no-untyped-call]
     assert (net.flat_grad != 0).any()
     net.flat.mul_(2)
-    assert not torch.allclose(net.inputs(x, images), expected)
+    assert not torch.allclose(net.encode(x, images), expected)
 
 
 @pytest.mark.parametrize("name", ["ppo", "a2c", "impala", "reinforce"])

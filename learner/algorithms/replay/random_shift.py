@@ -1,0 +1,25 @@
+"""Random shift of images (Kostrikov et al. 2021, DrQ): critics that see few pictures often do not learn them by heart.
+
+Rule: each image of a minibatch is moved by whole pixels, up to a number in each direction, and its border is repeated. All
+channels move together, so a stack of frames keeps what moved between them.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def random_shift(images: Tensor, most: int, *, channels_last: bool, generator: torch.Generator) -> Tensor:
+    """Images [B, H, W, C] or [B, C, H, W] of any dtype, each moved by -most to most pixels in both directions."""
+    if not most:
+        return images
+    batch = len(images)
+    height, width = images.shape[1:3] if channels_last else images.shape[2:4]
+    moves = torch.randint(-most, most + 1, (2, batch, 1), generator=generator).to(images.device)
+    rows = (torch.arange(height, device=images.device) + moves[0]).clamp_(0, height - 1)  # [B, H]
+    columns = (torch.arange(width, device=images.device) + moves[1]).clamp_(0, width - 1)  # [B, W]
+    image = torch.arange(batch, device=images.device)[:, None, None]
+    if channels_last:
+        return images[image, rows[:, :, None], columns[:, None, :]]
+    return images.movedim(1, 3)[image, rows[:, :, None], columns[:, None, :]].movedim(3, 1)
