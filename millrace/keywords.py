@@ -399,6 +399,10 @@ class TrainKeywords(RolloutKeywords, total=False):
     """sac, td3, tqc, crossq, xqc: Replay ratio: gradient steps for each env step after learning_starts. It is exact,
     whatever the rollouts are.
     """
+    random_shift: int
+    """sac, td3, tqc, crossq, xqc: Pixels by which images are moved at random, at most, each time a gradient step takes
+    them (DrQ-v2). It doesn't concern observations without images.
+    """
     target_entropy: float | None
     """sac, tqc, crossq, xqc: The entropy that a learned temperature aims at. none: minus the number of the action's
     elements.

@@ -18,7 +18,7 @@ STACKED = '"gymnasium.wrappers:FrameStackObservation(stack_size=4)"'
 
 def flattened_images(policy: PolicySpec) -> Iterator[str]:
     """A line for each array of the observation that perhaps holds images, and goes straight into a layer of `net`."""
-    if policy.encoder is not None or policy.own is not None or policy.stores_scaled_actions:  # sac and td3 take no images
+    if policy.encoder is not None or policy.own is not None:
         return
     for leaf in policy.observation:
         if leaf.kind == "box" and not leaf.is_image and sum(side >= LEAST_SIDE for side in leaf.shape) >= 2:
