@@ -86,7 +86,8 @@ GROUPS = {
         "algorithms.Sample algorithms.MixedReplay algorithms.ObservationNormalizer algorithms.RewardScaler "
         "algorithms.EpisodeEnds algorithms.gae algorithms.vtrace algorithms.log_prob_and_entropy "
         "algorithms.policy_log_prob algorithms.squashed_sample algorithms.trainable algorithms.features "
-        "algorithms.normalize algorithms.scheduled algorithms.check_finite algorithms.Purpose algorithms.torch_seed "
+        "algorithms.normalize algorithms.random_shift algorithms.scheduled algorithms.check_finite "
+        "algorithms.Purpose algorithms.torch_seed "
         "algorithms.UsageError",
     ),
     "errors": Group(
