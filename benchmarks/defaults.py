@@ -123,7 +123,7 @@ def main() -> None:
     given = parser.parse_args()
     variants = {} if given.no_defaults else {NOW: ""}
     variants |= dict(text.split("=", 1) for text in given.variant)
-    takes = {"dqn": (False,), "sac": (True,), "td3": (True,)}.get(given.algo, (False, True))
+    takes = {"dqn": (False,), "rainbow": (False,), "sac": (True,), "td3": (True,)}.get(given.algo, (False, True))
     cases = [
         case
         for case in CASES

@@ -14,7 +14,7 @@ import msgspec
 
 from millrace.learner.between_updates.stop_rules import BY_THE_POLICY_OF, reason_to_stop
 from millrace.learner.config.config import Config
-from millrace.learner.config.hyperparameters import DQNConfig
+from millrace.learner.config.hyperparameters import QLearningConfig
 from millrace.learner.config.layers import config_of_run
 from millrace.learner.config.resume_rules import Change, OnResume, changes, refusal
 from millrace.learner.env_spaces import EnvSpaces
@@ -124,7 +124,7 @@ def _differences(before: Config, config: Config, changed: Sequence[Change]) -> l
         if on_resume is OnResume.ADAPTABLE
     ]
     match before.algorithm, config.algorithm:
-        case DQNConfig() as had, DQNConfig() as has if has.gradient_steps == had.gradient_steps:
+        case QLearningConfig() as had, QLearningConfig() as has if has.gradient_steps == had.gradient_steps:
             was, now = (one.envs * one.algorithm.rollout_steps for one in (before, config))
             if was != now:
                 lines.append(

@@ -132,7 +132,7 @@ class RolloutKeywords(TypedDict, total=False):
 class TrainKeywords(RolloutKeywords, total=False):
     """Keywords of `millrace.train`."""
 
-    algo: Literal["ppo", "a2c", "dqn", "impala", "reinforce", "sac", "td3", "tqc", "crossq", "xqc"] | str | type
+    algo: Literal["ppo", "a2c", "dqn", "rainbow", "impala", "reinforce", "sac", "td3", "tqc", "crossq", "xqc"] | str | type
     """Learning algorithm: a built-in one, or your own, such as my_module:MyClass. `--algo NAME --help` shows its
     settings.
     """
@@ -227,12 +227,13 @@ class TrainKeywords(RolloutKeywords, total=False):
     which prior_share sets.
     """
     rollout_steps: int
-    """ppo, a2c, dqn, impala, sac, td3, tqc, crossq, xqc: T, the steps of each env copy in a rollout.
+    """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: T, the steps of each env copy in a rollout.
     reinforce: T, the steps of each env copy in a rollout. Must be longer than any episode.
     """
     net: Sequence[int]
     """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers: of the actor and of the critic each, or of the
     Q-network.
+    rainbow: Sizes of the hidden layers of the Q-network.
     sac, td3, tqc: Sizes of the hidden layers: of the actor and of each critic.
     crossq, xqc: Sizes of the hidden layers of the actor.
     """
@@ -245,22 +246,22 @@ class TrainKeywords(RolloutKeywords, total=False):
     normalize_observations: bool
     """ppo: Normalize observations, except images: subtract the running mean, divide by the running standard deviation,
     clip to ±10. docs/how-to/algorithms.md shows why PPO does by default.
-    a2c, dqn, impala, reinforce, sac, td3, tqc, crossq, xqc: Normalize observations, except images: subtract the
-    running mean, divide by the running standard deviation, clip to ±10.
+    a2c, dqn, rainbow, impala, reinforce, sac, td3, tqc, crossq, xqc: Normalize observations, except images: subtract
+    the running mean, divide by the running standard deviation, clip to ±10.
     """
     gamma: float
     """Discount factor."""
     shared_net: bool
     """ppo, a2c, impala, reinforce: Let actor and critic share their hidden layers."""
     learning_rate: float
-    """ppo, a2c, dqn, impala, reinforce, sac, tqc, xqc: Learning rate of the optimizer.
+    """ppo, a2c, dqn, rainbow, impala, reinforce, sac, tqc, xqc: Learning rate of the optimizer.
     td3, crossq: Learning rate of the optimizers.
     """
     learning_rate_schedule: Literal["constant", "linear"]
     """linear: the learning rate falls to zero over the run."""
     optimizer: Literal["rmsprop", "adam", "adamw"]
     """ppo, a2c, impala, reinforce: Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5.
-    dqn: Optimizer. adamw: Adam with a decoupled weight decay of 0.01.
+    dqn, rainbow: Optimizer. adamw: Adam with a decoupled weight decay of 0.01.
     """
     ent_coef: float | None
     """ppo, a2c, impala, reinforce: Weight of the entropy bonus in the loss.
@@ -271,14 +272,14 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo, a2c, impala, reinforce: Weight of the value loss in the loss."""
     max_grad_norm: float | None
     """ppo, a2c, impala, reinforce: Clip the norm of the gradient to this.
-    dqn: Clip the norm of the gradient to this. none: no clipping.
+    dqn, rainbow: Clip the norm of the gradient to this. none: no clipping.
     """
     log_std_init: float
     """ppo, a2c, impala, reinforce: Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: bool
     """ppo, a2c, impala: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
-    dqn, sac, td3, tqc, crossq: Divide rewards by the running standard deviation of the discounted return, when they
-    are drawn from the buffer, and clip them to ±10; with n_step, the sum of n rewards.
+    dqn, rainbow, sac, td3, tqc, crossq: Divide rewards by the running standard deviation of the discounted return,
+    when they are drawn from the buffer, and clip them to ±10; with n_step, the sum of n rewards.
     reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
     Otherwise the loss of the baseline dominates the gradient.
     xqc: Divide rewards by the running standard deviation of the discounted return, and by so much that no discounted
@@ -298,7 +299,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo, a2c, impala: Number of units of the recurrent layer."""
     batch_size: int
     """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more.
-    dqn, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step.
+    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step.
     """
     n_epochs: int
     """ppo: Number of epochs: how often an update uses each row.
@@ -319,66 +320,77 @@ class TrainKeywords(RolloutKeywords, total=False):
     target_kl: float | None
     """ppo: End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
     learning_starts: int | float
-    """dqn: Number of env steps before the first gradient step.
+    """dqn, rainbow: Number of env steps before the first gradient step.
     sac, td3, tqc, crossq, xqc: Number of env steps before the first gradient step. Until then, actions are drawn
     uniformly.
     """
     replay_size: int | float
-    """dqn, sac, td3, tqc, crossq, xqc: Capacity of the replay buffer in transitions; the newest are kept. The final
-    observation of a truncated episode takes the place of one.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Capacity of the replay buffer in transitions; the newest are kept. The
+    final observation of a truncated episode takes the place of one.
     """
     priority_alpha: float
     """dqn, sac, td3, tqc, crossq, xqc: α of prioritized replay: how far its last TD error decides how often a transition
     is drawn from the replay buffer. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
+    rainbow: α of prioritized replay: how far its last TD error decides how often a transition is drawn from the replay
+    buffer. 0: not at all. 1: in proportion.
     """
     priority_beta: float
-    """dqn, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how far importance weights correct the bias. It
-    grows to 1 (fully) over the run.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how far importance weights correct the
+    bias. It grows to 1 (fully) over the run.
     """
     prior_share: float
-    """dqn, sac, td3, tqc, crossq, xqc: Share of each minibatch that is prior data, in a run with --prior (Ball et al.
-    2023 use 0.5).
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Share of each minibatch that is prior data, in a run with --prior (Ball
+    et al. 2023 use 0.5).
     """
     prior_steps: int | float
-    """dqn, sac, td3, tqc, crossq, xqc: Number of gradient steps on prior data alone, before the first rollouts are
-    collected. Needs --prior.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of gradient steps on prior data alone, before the first rollouts
+    are collected. Needs --prior.
     """
     n_step: int
-    """dqn, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps; those of one agent, in its own
-    time, if there are several.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps; those of one agent,
+    in its own time, if there are several.
     """
     tau: float
     """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one,
     such as 0.005, take target_every 1 (polyak averaging).
+    rainbow: Fraction by which an update moves the target network.
     sac, td3, tqc, crossq, xqc: τ of the polyak update: the fraction by which the target network moves in each gradient
     step.
     """
     amsgrad: bool
-    """dqn: Use the AMSGrad variant of the optimizer."""
+    """dqn, rainbow: Use the AMSGrad variant of the optimizer."""
     gradient_steps: int
-    """dqn: Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this
-    sets the replay ratio.
+    """dqn, rainbow: Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps,
+    so this sets the replay ratio.
     """
     double: bool
-    """dqn: Double Q-learning: the network chooses the next action, and the target network values it."""
+    """dqn, rainbow: Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: bool
-    """dqn: Dueling network: an action value is the state's value plus the action's advantage over the mean."""
+    """dqn, rainbow: Dueling network: an action value is the state's value plus the action's advantage over the mean."""
     target_every: int
-    """dqn: Number of gradient steps between two updates of the target network."""
+    """dqn, rainbow: Number of gradient steps between two updates of the target network."""
     epsilon_start: float
-    """dqn: Initial probability ε of a random action."""
+    """dqn, rainbow: Initial probability ε of a random action."""
     epsilon_end: float
-    """dqn: Final probability ε of a random action."""
+    """dqn, rainbow: Final probability ε of a random action."""
     epsilon_schedule: Literal["linear", "exponential"]
-    """dqn: How ε falls from its initial to its final value."""
+    """dqn, rainbow: How ε falls from its initial to its final value."""
     epsilon_steps: int | float
-    """dqn: Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance to the
-    final value is 1/e of the initial distance.
+    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance
+    to the final value is 1/e of the initial distance.
     """
+    max_grad_value: float | None
+    """dqn, rainbow: Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
     loss: Literal["huber", "squared"]
     """dqn: Loss of the TD error. huber: squared up to 1 and linear beyond."""
-    max_grad_value: float | None
-    """dqn: Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
+    quantiles: int
+    """rainbow: Number of quantiles of the return that are learned for each action.
+    tqc: Number of quantiles that each critic learns.
+    """
+    batch_norm: bool
+    """rainbow: Batch normalization of the inputs and in front of each activation of the hidden layers (Bhatt et al.
+    2024).
+    """
     minibatches: int
     """impala: Number of minibatches (gradient steps) in an epoch."""
     vtrace_lambda: float
@@ -419,8 +431,6 @@ class TrainKeywords(RolloutKeywords, total=False):
     """td3: Clip the noise of targets to ± this."""
     critics: int
     """tqc: Number of critics."""
-    quantiles: int
-    """tqc: Number of quantiles that each critic learns."""
     dropped_quantiles: int
     """tqc: Number of quantiles for each critic that targets leave out, the highest, so that values are not overestimated."""
     critic_net: Sequence[int]

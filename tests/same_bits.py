@@ -46,6 +46,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "reinforce": (f"train toy:Identity-v0 --algo reinforce {ON_POLICY}",),
     "impala": (f"train CartPole-v1 --algo impala {ON_POLICY}",),
     "dqn": (f"train CartPole-v1 --algo dqn {REPLAY}",),
+    "rainbow": (f"train CartPole-v1 --algo rainbow --gradient-steps 16 {REPLAY}",),
     "sac": (f"train Pendulum-v1 --algo sac --updates-per-step 0.5 {REPLAY}",),
     "td3": (f"train Pendulum-v1 --algo td3 --updates-per-step 0.5 {NORMALIZED} {REPLAY}",),
     "tqc": (f"train Pendulum-v1 --algo tqc --updates-per-step 0.5 {REPLAY}",),

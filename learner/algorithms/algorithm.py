@@ -39,8 +39,9 @@ class Start(NamedTuple):
     def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
         """The state of a new algorithm, with what is taken in the place of its own; all else starts anew.
 
-        `weights` and `optimizers`: their names in the state. Of `parameters` and `target`, the first P act. Raises
-        `ValueError` if a tensor has another shape or dtype than in the new algorithm.
+        `weights` and `optimizers`: their names in the state. Of `parameters` and `target`, the first P act; if these are all
+        of the new ones, they must be all of the saved ones. Raises `ValueError` if a tensor has another shape or dtype than
+        in the new algorithm.
         """
         state = self.state
         taken = dict[str, Any]()
@@ -51,7 +52,7 @@ class Start(NamedTuple):
         for name in weights if self.critic else {"parameters", "target"}.intersection(weights):
             own = taken[name] = fresh[name].clone()
             saved = state[name if self.critic else "parameters"]
-            if not self.critic:
+            if not self.critic and len(own) > self.acting:
                 own = own[: self.acting]
                 saved = saved[: self.acting]
             if (saved.shape, saved.dtype) != (own.shape, own.dtype):

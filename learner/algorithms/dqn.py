@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,20 +18,19 @@ from torch import Tensor
 from millrace.learner.algorithms import losses
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
-from millrace.learner.algorithms.kernels.trained_networks import q_network
+from millrace.learner.algorithms.kernels.trained_networks import ActionValueNetwork, q_network
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
-from millrace.learner.config.hyperparameters import DQNConfig
+from millrace.learner.config.hyperparameters import DQNConfig, QLearningConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.masks import FORBIDDEN
-from millrace.protocol.policy.networks import QNetwork
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 LOSSES = {"huber": losses.huber_loss, "squared": losses.squared_loss}
 
 
-def exploration_rate(config: DQNConfig, env_steps: int) -> float:
+def exploration_rate(config: QLearningConfig, env_steps: int) -> float:
     """ε after `env_steps` env steps, summed over all env copies."""
     start = config.epsilon_start
     end = config.epsilon_end
@@ -41,23 +41,31 @@ def exploration_rate(config: DQNConfig, env_steps: int) -> float:
 class DQN(OffPolicy):
     """The Q-network, the target network, their optimizer, and the replay buffer with the prior data."""
 
-    Config = DQNConfig
-    net: QNetwork
+    Config: ClassVar[type[QLearningConfig]] = DQNConfig
+    net: ActionValueNetwork
+    target: ActionValueNetwork
 
-    @staticmethod
-    def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+    @classmethod
+    def policy_spec(cls, config: QLearningConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """Action values for any supported observation. Raises `UsageError` unless the action space is Discrete."""
         if action.kind != "discrete":
-            shape = list(action.shape)
-            raise UsageError(f"dqn: expected an action space Discrete(n), got {action.kind}{shape}; take --algo ppo for it")
+            name = cls.__name__.lower()
+            got = f"{action.kind}{list(action.shape)}"
+            raise UsageError(f"{name}: expected an action space Discrete(n), got {got}; take --algo ppo for it")
         return replace(OffPolicy.policy_spec(config, observation, action), head="q", dueling=config.dueling)
 
-    def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
+    def __init__(
+        self, config: QLearningConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
+    ) -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed)
-        self.net, self.target = (q_network(policy, device, seed) for _ in range(2))
+        self.net, self.target = (self.network(device, seed) for _ in range(2))
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         optimizer = make_optimizer(config.optimizer, self.net.flat, amsgrad=config.amsgrad)
         self.optimizers = {"optimizer": optimizer}
+
+    def network(self, device: str, seed: int) -> ActionValueNetwork:
+        """A network of action values. It is called twice, for the network and its target, which begin alike."""
+        return q_network(self.policy, device, seed)
 
     def steps_due(self) -> int:
         """The same number of gradient steps in each update, once learning has started."""
@@ -77,9 +85,7 @@ class DQN(OffPolicy):
         """
         values = self.target.params(rows.next_x, rows.next_images)
         chooses = self.net.params(rows.next_x, rows.next_images) if self.config.double else values
-        if rows.next_mask is not None:
-            chooses = chooses.masked_fill(~rows.next_mask, FORBIDDEN)
-        return rows.reward + rows.discount * values.gather(1, chooses.argmax(1, keepdim=True))[:, 0]
+        return rows.reward + rows.discount * values.gather(1, best_action(chooses, rows.next_mask)[:, None])[:, 0]
 
     def loss(self, rows: Transitions) -> CriticLoss:
         """E[w ℓ(Q(s, a) − y)], where ℓ is the Huber loss or the square."""
@@ -115,4 +121,9 @@ class DQN(OffPolicy):
     def weights(self) -> tuple[Floats, Floats]:
         """Copies of the Q-network's parameters [P] and of the buffers: the observation statistics, then ε."""
         epsilon = np.float32(exploration_rate(self.config, self.env_steps))
-        return self.net.flat.cpu().numpy().copy(), np.append(self.statistics, epsilon)
+        return self.net.acting_parameters(), np.append(self.statistics, epsilon)
+
+
+def best_action(values: Tensor, mask: Tensor | None) -> Tensor:
+    """The actions [B] of the highest values [B, n], of those that the mask [B, n] allows."""
+    return (values if mask is None else values.masked_fill(~mask, FORBIDDEN)).argmax(1)

@@ -27,6 +27,7 @@ ALGORITHMS = {
     "ppo": "millrace.learner.algorithms.ppo:PPO",
     "a2c": "millrace.learner.algorithms.a2c:A2C",
     "dqn": "millrace.learner.algorithms.dqn:DQN",
+    "rainbow": "millrace.learner.algorithms.rainbow:Rainbow",
     "impala": "millrace.learner.algorithms.impala:IMPALA",
     "reinforce": "millrace.learner.algorithms.reinforce:REINFORCE",
     "sac": "millrace.learner.algorithms.sac:SAC",

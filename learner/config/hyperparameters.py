@@ -208,8 +208,8 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """
 
 
-class DQNConfig(OffPolicyConfig, frozen=True):
-    """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
+class QLearningConfig(OffPolicyConfig, frozen=True):
+    """Settings of DQN and Rainbow."""
 
     optimizer: Fixed[Literal["adam", "adamw"]] = "adam"
     """Optimizer. adamw: Adam with a decoupled weight decay of 0.01."""
@@ -239,12 +239,50 @@ class DQNConfig(OffPolicyConfig, frozen=True):
     """Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance to the final
     value is 1/e of the initial distance.
     """
-    loss: Free[Literal["huber", "squared"]] = "huber"
-    """Loss of the TD error. huber: squared up to 1 and linear beyond."""
     max_grad_norm: Free[Positive | None] = None
     """Clip the norm of the gradient to this. none: no clipping."""
     max_grad_value: Free[Positive | None] = None
     """Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
+
+
+class DQNConfig(QLearningConfig, frozen=True):
+    """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
+
+    loss: Free[Literal["huber", "squared"]] = "huber"
+    """Loss of the TD error. huber: squared up to 1 and linear beyond."""
+
+
+class RainbowConfig(QLearningConfig, frozen=True):
+    """Rainbow (Hessel et al. 2018), which learns quantiles of the return (Dabney et al. 2018), without noisy networks."""
+
+    rollout_steps: Free[Count] = 8
+    """T, the steps of each env copy in a rollout."""
+    net: Fixed[tuple[Count, ...]] = (128, 128)
+    """Sizes of the hidden layers of the Q-network."""
+    learning_rate: Free[Positive] = 5e-4
+    """Learning rate of the optimizer."""
+    learning_rate_schedule: Free[Schedule] = "linear"
+    """linear: the learning rate falls to zero over the run."""
+    priority_alpha: Fixed[Fraction] = 0.5
+    """α of prioritized replay: how far its last TD error decides how often a transition is drawn from the replay buffer.
+    0: not at all. 1: in proportion.
+    """
+    n_step: Free[Count] = 3
+    """Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there are several."""
+    quantiles: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 16
+    """Number of quantiles of the return that are learned for each action."""
+    batch_norm: Fixed[bool] = True
+    """Batch normalization of the inputs and in front of each activation of the hidden layers (Bhatt et al. 2024)."""
+    dueling: Fixed[bool] = True
+    """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
+    target_every: Free[Count] = 1
+    """Number of gradient steps between two updates of the target network."""
+    tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
+    """Fraction by which an update moves the target network."""
+    epsilon_end: Free[Fraction] = 0.02
+    """Final probability ε of a random action."""
+    max_grad_norm: Free[Positive | None] = 10.0
+    """Clip the norm of the gradient to this. none: no clipping."""
 
 
 class ContinuousConfig(OffPolicyConfig, frozen=True):
@@ -350,6 +388,7 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
     "ppo": PPOConfig,
     "a2c": A2CConfig,
     "dqn": DQNConfig,
+    "rainbow": RainbowConfig,
     "impala": IMPALAConfig,
     "reinforce": REINFORCEConfig,
     "sac": SACConfig,

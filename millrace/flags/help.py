@@ -78,8 +78,16 @@ def _lines(entry: Entry, width: int) -> list[str]:
     wrapped = [line.replace(NO_BREAK, " ") for line in lines]
     indented = [" " * TEXT_COLUMN + line for line in wrapped]
     if len(heading) > TEXT_COLUMN - 2:
-        return [heading, *indented]
+        return [*_folded(heading, width), *indented]
     return [heading.ljust(TEXT_COLUMN) + "".join(wrapped[:1]), *indented[1:]]
+
+
+def _folded(heading: str, width: int) -> list[str]:
+    """The lines of a heading. One that is too wide, as of many choices, goes on behind a comma."""
+    if len(heading) <= width or "," not in heading[:width]:
+        return [heading]
+    end = heading.rindex(",", 0, width) + 1
+    return [heading[:end], *_folded(f"    {heading[end:]}", width)]
 
 
 def _default(entry: Entry) -> str:

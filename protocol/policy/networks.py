@@ -205,6 +205,16 @@ class Encoder:
         self._module = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
         self._images = self._convolutions()
 
+    @classmethod
+    def of_flat(
+        cls, spec: PolicySpec, values: Tensor, gradient: Tensor, device: str | torch.device, *, seed: int
+    ) -> Encoder:
+        """An encoder whose parameters and gradients are these flat tensors."""
+        fields, _ = encoder_layout(spec)
+        gradients = named_views(gradient, fields)
+        leaves = {name: trainable(view, gradients[name]) for name, view in named_views(values, fields).items()}
+        return cls(spec, leaves, device, seed=seed)
+
     def __call__(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].
 
@@ -400,6 +410,10 @@ class QNetwork(FlatNetwork):
             return self.mlp(h, self._without_dueling)
         h = self.hidden(h, self._hidden)
         return self.action_values(self.mlp(h, self.layers(["q.out"])), self.mlp(h, self.layers(["q.value"])))
+
+    def acting_parameters(self) -> Floats:
+        """A copy of the parameters [P] that workers act with: all of them."""
+        return self.flat.cpu().numpy().copy()
 
     @staticmethod
     def action_values(advantage: Tensor, value: Tensor | None = None) -> Tensor:

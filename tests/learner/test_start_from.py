@@ -13,6 +13,7 @@ import torch
 
 from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.algorithms.rainbow import Rainbow
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
@@ -34,13 +35,14 @@ OFF_POLICY = SMALL | {"batch_size": 16, "replay_size": 1000}
 SETTINGS: dict[str, dict[str, Any]] = {
     "ppo": SMALL, "a2c": SMALL, "reinforce": SMALL,
     "dqn": OFF_POLICY | {"learning_starts": 0, "gradient_steps": 4},
+    "rainbow": OFF_POLICY | {"learning_starts": 0, "gradient_steps": 4, "quantiles": 8},
     "sac": OFF_POLICY | {"learning_starts": 50}, "td3": OFF_POLICY | {"learning_starts": 50},
     "tqc": OFF_POLICY | {"learning_starts": 50, "updates_per_step": 0.1},
     "crossq": OFF_POLICY | {"learning_starts": 50, "updates_per_step": 0.1, "critic_net": (16,)},
     "xqc": OFF_POLICY | {"learning_starts": 50, "updates_per_step": 0.1, "critic_net": (16,), "atoms": 11},
 }  # fmt: skip
-SPACES = {name: DISCRETE if name == "dqn" else GAUSSIAN for name in SETTINGS}
-ALL = pytest.mark.parametrize("algo", ["ppo", "dqn", "sac", "td3", "tqc", "xqc"])
+SPACES = {name: DISCRETE if name in ("dqn", "rainbow") else GAUSSIAN for name in SETTINGS}
+ALL = pytest.mark.parametrize("algo", ["ppo", "dqn", "rainbow", "sac", "td3", "tqc", "xqc"])
 
 
 def made(algo: str, folder: Path, spaces: PolicySpec | None = None, seed: int = 2, **settings: Any) -> tuple[Config, Any]:
@@ -100,12 +102,17 @@ def statistics(algorithm: Any) -> dict[str, Any]:
 
 
 def actor_size(algorithm: Any) -> int:
-    """The number of parameters of the actor. Workers may act with fewer: those of its layers after normalization."""
+    """The number of parameters of the actor. Workers may act with fewer: layers after normalization, means of quantiles."""
+    if isinstance(algorithm, Rainbow):
+        return len(algorithm.net.flat)
     return len(algorithm.net.actor) if hasattr(algorithm.net, "actor") else len(algorithm.weights()[0])
 
 
 def with_those_of_its_actor(algorithm: Any, fresh: torch.Tensor) -> torch.Tensor:
     """Running statistics of batch normalization: the mean and variance of each input of the actor's layers, then others."""
+    if isinstance(algorithm, Rainbow):
+        assert not torch.equal(algorithm.net.statistics, fresh)
+        return algorithm.net.statistics
     actors = sum(2 * size for size in algorithm.net.actor_body.shape.sizes[:-1])
     assert not torch.equal(algorithm.net.statistics[:actors], fresh[:actors])
     return torch.cat([algorithm.net.statistics[:actors], fresh[actors:]])
@@ -197,6 +204,29 @@ def test_the_policy_that_workers_act_with_is_one_of_sac(tmp_path: Path, earlier:
     shutil.rmtree(run / "checkpoints")
     algorithm, _ = started("sac", tmp_path, run)
     assert np.array_equal(algorithm.weights()[0], before.weights()[0])
+
+
+@pytest.mark.parametrize("earlier", ["dqn", "rainbow"])
+def test_action_values_are_not_enough_for_a_network_of_quantiles(tmp_path: Path, earlier: str) -> None:
+    run, _ = earlier_run(earlier, tmp_path, dueling=True)
+    shutil.rmtree(run / "checkpoints")
+    line = refusal("rainbow", tmp_path, run)
+    assert "expected a run of rainbow with a checkpoint, got action values without the quantiles" in line
+
+
+def test_the_policy_that_workers_of_rainbow_act_with_is_one_of_dqn(tmp_path: Path) -> None:
+    run, before = earlier_run("rainbow", tmp_path)
+    shutil.rmtree(run / "checkpoints")
+    algorithm, _ = started("dqn", tmp_path, run, dueling=True)
+    assert np.array_equal(algorithm.weights()[0], before.weights()[0])
+
+
+@pytest.mark.parametrize("algo", ["dqn", "rainbow"])
+def test_a_network_of_another_number_of_quantiles_is_refused(tmp_path: Path, algo: str) -> None:
+    run, _ = earlier_run("rainbow", tmp_path, quantiles=5)
+    line = refusal(algo, tmp_path, run, dueling=True)
+    assert f"expected the state of {algo}, got another (" in line
+    assert ": expected torch.float32 [" in line
 
 
 @pytest.mark.parametrize("algo", variants(["crossq", "xqc"], default=["crossq"]))

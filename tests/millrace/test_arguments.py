@@ -213,7 +213,7 @@ SURROGATE = "CartPole-v1\ud800"
         (
             millrace.train,
             {"env": "CartPole-v1", "algo": 2},
-            "train: algo: expected one of ppo, a2c, dqn, impala, reinforce, sac, td3, tqc, crossq, xqc, "
+            "train: algo: expected one of ppo, a2c, dqn, rainbow, impala, reinforce, sac, td3, tqc, crossq, xqc, "
             "module:Class or a class, got 2",
         ),
         (millrace.train, {"resume": 2}, "train: resume: expected text or a path or None, got 2"),

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
-from millrace.protocol.policy.layout import LOG_STD_BOUNDS, encoder_layout, named_views
+from millrace.protocol.policy.layout import LOG_STD_BOUNDS, encoder_layout
 from millrace.protocol.policy.malloc import keep_freed_memory
 from millrace.protocol.policy.networks import Encoder, initial_fields, trainable
 from millrace.protocol.policy.torch_distributions import squashed_sample
@@ -52,9 +52,7 @@ class ActorWithCritics:
         self.critics = self.flat[sizes[0] :]
         """[E + C] in the memory of `flat`: the encoder, then the critics"""
         self.critics.grad = self.flat_grad[sizes[0] :]
-        gradients = named_views(of_encoder, fields)
-        encoder = {name: trainable(view, gradients[name]) for name, view in named_views(self._encoder, fields).items()}
-        self.encode = Encoder(policy, encoder, device, seed=seed)
+        self.encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
         statistics = [initial_statistics(shape) for shape in (actor, critics)]
         self.statistics = torch.cat(statistics).to(device)
         """[S] the running statistics, those of the actor first; empty without normalization"""

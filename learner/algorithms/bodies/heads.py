@@ -1,4 +1,4 @@
-"""Critics that learn a distribution of returns: by quantiles (TQC), or by probabilities of categories (C51, XQC). Pure.
+"""Critics of a distribution of returns: by quantiles (TQC, Rainbow), or by probabilities of categories (C51, XQC). Pure.
 
 Arrays are [..., B, O]: rows, then outputs. A quantile critic's outputs are the quantiles of the fractions (2 i + 1) / 2 O; a
 categorical critic's are logits of O returns, the atoms, which are equally spaced between two bounds.

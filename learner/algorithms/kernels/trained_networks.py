@@ -7,13 +7,14 @@ rounding, so a loss need not know which one it is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from millrace.learner.algorithms.kernels.distribution_kernels import EvaluatedActions, SquashedSample, distribution_kernel
 from millrace.learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
-from millrace.protocol.arrays import Array
+from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import CRITICS, hidden_names
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput, trainable
@@ -32,6 +33,23 @@ def is_small(spec: PolicySpec, device: str) -> bool:
 def actor_critic_network(spec: PolicySpec, device: str, seed: int) -> ActorCriticNetwork:
     """The network of an actor and a critic."""
     return (SmallActorCritic if is_small(spec, device) else ActorCriticNetwork)(spec, device, seed=seed)
+
+
+class ActionValueNetwork(Protocol):
+    """A network of action values, such as `QNetwork`."""
+
+    flat: Tensor
+    """[P] all parameters"""
+    flat_grad: Tensor
+    """[P] their gradient"""
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """Action values [B, n] of features [B, D] and images [B, *leaf] uint8."""
+        ...
+
+    def acting_parameters(self) -> Floats:
+        """A copy of the parameters that workers act with."""
+        ...
 
 
 def q_network(spec: PolicySpec, device: str, seed: int) -> QNetwork:

@@ -35,7 +35,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "rollout/ep_len_mean": Meaning(STEPS, "Mean length of the same episodes.", "episode length"),
         "rollout/NAME": Meaning("its own", "Mean over the same episodes of a number of `--info-keys`."),
         "rollout/NAME_missing": Meaning(EPISODES, "How many of these episodes did not report the number."),
-        "rollout/exploration_rate": Meaning(NONE, "DQN: probability ε of a random action."),
+        "rollout/exploration_rate": Meaning(NONE, "DQN, Rainbow: probability ε of a random action."),
     },
     "Evaluations": {
         "eval/mean_reward": Meaning(REWARD, "Mean return of the greedy episodes, in raw rewards.", "return of evaluations"),
@@ -118,7 +118,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "train/approx_kl": Meaning("nats", "PPO: from the policy that acted, in the last epoch.", "estimated KL divergence"),
         "train/clip_fraction": Meaning(NONE, "PPO: fraction of rows whose probability ratio was outside 1 ± `clip_range`."),
         "train/clip_range": Meaning(NONE, "PPO: ε of the clipped objective in this update."),
-        "train/loss": Meaning(NONE, "PPO: whole loss of the last gradient step. DQN: mean TD loss of the update."),
+        "train/loss": Meaning(NONE, "PPO: whole loss of the last gradient step. DQN, Rainbow: mean TD loss."),
         "train/rho": Meaning(NONE, "IMPALA: mean importance weight ρ of V-trace, clipped at 1.", "importance weight"),
         "train/rows_used": Meaning("rows", "REINFORCE: rows of whole episodes, from which the update learned."),
         "train/rows_dropped": Meaning("rows", "REINFORCE: rows of unfinished episodes. They were dropped."),

@@ -301,10 +301,13 @@ def test_a_subclass_of_ppo_need_not_log_what_ppo_logs() -> None:
 
 
 CONTINUOUS: dict[str, Any] = {"rollout_steps": 8, "learning_rate": 3e-3, "updates_per_step": 0.1}
+CHOICES: dict[str, Any] = {
+    "rollout_steps": 16, "learning_rate": 3e-3, "learning_starts": 0, "gradient_steps": 8, "epsilon_steps": 2000,
+}  # fmt: skip
 LEARNS_SOON: dict[str, dict[str, Any]] = {
     **{name: {"rollout_steps": 16, "learning_rate": 0.02} for name in ("a2c", "impala", "reinforce")},
     "ppo": {"rollout_steps": 16, "learning_rate": 0.01, "n_epochs": 4, "batch_size": 128},
-    "dqn": {"rollout_steps": 16, "learning_rate": 3e-3, "learning_starts": 0, "gradient_steps": 8, "epsilon_steps": 2000},
+    **dict.fromkeys(("dqn", "rainbow"), CHOICES),
     **dict.fromkeys(("sac", "td3", "tqc"), CONTINUOUS),
     **{name: {**CONTINUOUS, "critic_net": (16,), "learning_starts": 100, "policy_delay": 1} for name in ("crossq", "xqc")},
 }

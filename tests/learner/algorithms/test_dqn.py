@@ -82,7 +82,8 @@ def chain(**settings: Any) -> DQN:
     config = DQNConfig(net=(), gamma=0.5, replay_size=100, **settings)
     spec = DQN.policy_spec(config, (Leaf("", "box", (3,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
     made = DQN(config, spec, total_steps=1000, seed=0)
-    for net, table in ((made.net, Q), (made.target, Q_TARGET)):
+    networks: list[Any] = [made.net, made.target]
+    for net, table in zip(networks, (Q, Q_TARGET), strict=True):
         net.flat.zero_()
         named_views(net.flat.numpy(), net.fields)["q.out.weight"][:] = table
     return made
@@ -155,7 +156,8 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
     drawn = made.replay.sample(64, beta=0.5)
     x, following = torch.from_numpy(drawn.leaves[0]).double(), torch.from_numpy(drawn.next_leaves[0]).double()
     reward, discount, weight = (torch.from_numpy(each).double() for each in (drawn.reward, drawn.discount, drawn.weight))
-    net, target_net = in_float64(made.net), in_float64(made.target)
+    networks: list[Any] = [made.net, made.target]
+    net, target_net = map(in_float64, networks)
 
     def usual() -> list[torch.Tensor]:
         target = (reward + discount * target_net.params(following).amax(1)).detach()

@@ -39,13 +39,15 @@ ON_POLICY: dict[str, tuple[PolicySpec, dict[str, Any]]] = {
 }
 STEPS: dict[str, dict[str, Any]] = {
     "dqn": {"gradient_steps": 3},
+    "rainbow": {"gradient_steps": 3, "quantiles": 4},
     "sac": {"updates_per_step": 0.03},
     "td3": {"updates_per_step": 0.03},
     "tqc": {"updates_per_step": 0.03},
     "crossq": {"updates_per_step": 0.03, "critic_net": (12, 10), "policy_delay": 2, "renormalize_after": 4},
     "xqc": {"updates_per_step": 0.03, "critic_net": (12, 10), "policy_delay": 2, "atoms": 11},
 }
-CONTINUOUS = [name for name in STEPS if name != "dqn"]
+CHOICES = ("dqn", "rainbow")
+CONTINUOUS = [name for name in STEPS if name not in CHOICES]
 
 
 def kinds() -> dict[str, tuple[str, PolicySpec, dict[str, Any]]]:
@@ -60,13 +62,15 @@ def kinds() -> dict[str, tuple[str, PolicySpec, dict[str, Any]]]:
     found["impala, LSTM"] = ("impala", recurrent(GAUSSIAN, "lstm"), EPOCHS["impala"])
     found["ppo, layers that are not small"] = ("ppo", msgspec.structs.replace(shared(GAUSSIAN), net=(257,)), EPOCHS["ppo"])
     for name, steps in STEPS.items():
-        spec = GAUSSIAN if name != "dqn" else DISCRETE
+        spec = DISCRETE if name in CHOICES else GAUSSIAN
         found[name] = (name, spec, REPLAY | steps)
-        found[f"{name}, everything"] = (name, spec, REPLAY | MORE_REPLAY | steps | (MORE_DQN if name == "dqn" else {}))
+        found[f"{name}, everything"] = (name, spec, REPLAY | MORE_REPLAY | steps | (MORE_DQN if name in CHOICES else {}))
+    found["rainbow, not normalized"] = ("rainbow", DISCRETE, REPLAY | STEPS["rainbow"] | {"batch_norm": False})
     for name in CONTINUOUS:
         found[f"{name}, images"] = (name, msgspec.structs.replace(IMAGE, action=GAUSSIAN.action), REPLAY | STEPS[name])
-    found["dqn, images"] = ("dqn", IMAGE, REPLAY | MORE_REPLAY | STEPS["dqn"])
-    found["dqn, masks"] = ("dqn", spec_of("discrete"), REPLAY | MORE_REPLAY | STEPS["dqn"])
+    for name in CHOICES:
+        found[f"{name}, images"] = (name, IMAGE, REPLAY | MORE_REPLAY | STEPS[name])
+        found[f"{name}, masks"] = (name, spec_of("discrete"), REPLAY | MORE_REPLAY | STEPS[name])
     return found
 
 
@@ -83,7 +87,15 @@ def subject_of(name: str, spec: PolicySpec, settings: dict[str, Any], masks: boo
     return subject._replace(batches=tuple(rows))
 
 
-ONE_KIND = ("ppo, discrete", "a2c, Gaussian", "impala, LSTM", "reinforce, masks", "dqn, everything", *CONTINUOUS)
+ONE_KIND = (
+    "ppo, discrete",
+    "a2c, Gaussian",
+    "impala, LSTM",
+    "reinforce, masks",
+    "dqn, everything",
+    "rainbow, masks",
+    *CONTINUOUS,
+)
 
 
 @pytest.mark.parametrize("kind", variants(kinds(), default=ONE_KIND))

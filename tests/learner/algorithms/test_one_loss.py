@@ -26,6 +26,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "impala": {"ent_coef": 0.1},
     "reinforce": {},
     "dqn": {"gradient_steps": 3},
+    "rainbow": {"gradient_steps": 3},
     "sac": {"updates_per_step": 0.1},
     "td3": {"updates_per_step": 0.1},
     "tqc": {"updates_per_step": 0.1},
@@ -36,7 +37,7 @@ OFF_POLICY = {"net": (16,), "learning_starts": 0, "batch_size": 32, "replay_size
 
 
 def made(name: str, **settings: Any) -> Any:
-    off_policy = OFF_POLICY if name in ("dqn", *CONTINUOUS) else {}
+    off_policy = OFF_POLICY if name in ("dqn", "rainbow", *CONTINUOUS) else {}
     config = msgspec.convert({**off_policy, **SETTINGS[name], **settings}, HYPERPARAMETERS[name])
     spec, kind = GAUSSIAN if name in CONTINUOUS else DISCRETE, algorithm_class(name)
     return kind(config, kind.policy_spec(config, spec.observation, spec.action), total_steps=10_000, seed=0)
@@ -65,7 +66,7 @@ def times_zero(found: Any) -> Any:
 @pytest.mark.parametrize(
     ("name", "loss", "part"),
     [
-        *((name, "loss", "net.flat") for name in ("ppo", "a2c", "impala", "reinforce", "dqn")),
+        *((name, "loss", "net.flat") for name in ("ppo", "a2c", "impala", "reinforce", "dqn", "rainbow")),
         ("sac", "critic_loss", "net.critics"),
         ("sac", "actor_loss", "net.actor"),
         ("sac", "temperature_loss", "log_temperature"),

@@ -217,7 +217,8 @@ def test_action_values_are_theirs(activation: str) -> None:
     obs = np.random.default_rng(5).normal(0, 2, (ROWS, 4)).astype(np.float32)
     ours, before = algorithm.net.params(torch.tensor(obs)).detach(), other.q_net(torch.tensor(obs)).detach()
     assert float((ours - before).abs().max()) > 0.1, "two policies that differ look alike"
-    arrays = [parameter.detach() for parameter in algorithm.net.parameters.values()]
+    net: Any = algorithm.net
+    arrays = [parameter.detach() for parameter in net.parameters.values()]
     for parameter, array in zip(other.q_net.parameters(), arrays, strict=True):
         parameter.data.copy_(array)
     np.testing.assert_allclose(other.q_net(torch.tensor(obs)).detach(), ours, rtol=TOLERANCE, atol=TOLERANCE)

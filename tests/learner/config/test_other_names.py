@@ -59,8 +59,12 @@ def test_the_values_that_the_manual_shows_can_be_written() -> None:
         ("n_envs", True, "; millrace calls it --envs"),
         ("n_steps", True, "; millrace calls it --rollout-steps"),
         ("n_steps", False, "; millrace calls it rollout_steps"),
-        ("buffer_size", True, "; millrace calls it --replay-size; it is one of dqn, sac, td3, tqc, crossq, xqc alone"),
-        ("gradient_steps", True, "; it is one of dqn alone"),
+        (
+            "buffer_size",
+            True,
+            "; millrace calls it --replay-size; it is one of dqn, rainbow, sac, td3, tqc, crossq, xqc alone",
+        ),
+        ("gradient_steps", True, "; it is one of dqn, rainbow alone"),
         ("stepz", True, ""),
     ],
 )

@@ -19,7 +19,9 @@ from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "resume.md"
-OTHER_OPTIMIZER = {"ppo": "rmsprop", "a2c": "adam", "impala": "adam", "reinforce": "rmsprop", "dqn": "adamw"}
+OTHER_OPTIMIZER = {
+    "ppo": "rmsprop", "a2c": "adam", "impala": "adam", "reinforce": "rmsprop", "dqn": "adamw", "rainbow": "adamw",
+}  # fmt: skip
 RECORDS: list[type[msgspec.Struct]] = [Config, *HYPERPARAMETERS.values()]
 
 
@@ -49,7 +51,7 @@ def another_value(algo: str, name: str, value: Any) -> Any:
         case _, int():
             return value + 5
         case _, float():
-            return value / 2 + 0.25
+            return value / 2 + 0.3
         case _, tuple():
             return (3, 3)
         case _, dict():

@@ -119,7 +119,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         ),
         (
             ["train", "--preset", "cartpole-dqn", "--algo", "ppo"],
-            "preset cartpole-dqn: unknown setting n_step; it is one of dqn, sac, td3, tqc, crossq, xqc alone",
+            "preset cartpole-dqn: unknown setting n_step; it is one of dqn, rainbow, sac, td3, tqc, crossq, xqc alone",
         ),
         (["train", "--config", "/no.toml"], "config file /no.toml cannot be read: No such file or directory"),
         (["plot"], "plot: which runs? expected run folders, as in: millrace plot runs/*"),

@@ -53,12 +53,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "reinforce": {"algo": "reinforce", **NORMAL, "rollout_steps": 31, "steps": 12 * 31 * ENVS, "eval_every": 200},
     "dqn, uniform": {**DQN, "normalize_observations": True},
     "dqn, prioritized": {**DQN, "priority_alpha": 0.6, "n_step": 3, "amsgrad": True, "dueling": True},
+    "rainbow": {**DQN, "algo": "rainbow", "quantiles": 5, "normalize_observations": True},
     "tqc": {**PUSHES, "algo": "tqc", "quantiles": 5},
     "crossq": {**PUSHES, "algo": "crossq", "critic_net": (8,), "renormalize_after": 40},
     "xqc": {**PUSHES, "algo": "xqc", "critic_net": (8,), "atoms": 21, "priority_alpha": 0.6, "normalize_observations": True},
     "ppo, evaluated beside": {**PPO_SETTINGS, **NORMAL, "eval_workers": 1, "learning_rate": 0.02},
 }
-IN_MAKE_TEST = ("ppo", "ppo, lstm", "dqn, prioritized", "xqc", "ppo, evaluated beside")  # `make soak` runs the others
+IN_MAKE_TEST = ("ppo", "ppo, lstm", "dqn, prioritized", "rainbow", "xqc", "ppo, evaluated beside")  # `make soak`: others
 STOP = 6  # the update after which a run is interrupted
 Watch = Callable[[Progress], None]
 

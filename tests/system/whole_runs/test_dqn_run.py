@@ -1,4 +1,4 @@
-"""Whole runs of DQN on this machine: the same weights and the same replay ratio for any number of workers, and with lag."""
+"""Whole runs of DQN and Rainbow: the same weights and the same replay ratio for any number of workers, and with lag."""
 
 from __future__ import annotations
 
@@ -44,6 +44,7 @@ def ratios(folder: Path) -> list[float]:
     [
         pytest.param({}, marks=pytest.mark.soak),
         {"priority_alpha": 0.6, "n_step": 3, "dueling": True, "normalize_observations": True},
+        {"algo": "rainbow", "net": (16,), "quantiles": 8},
     ],
 )
 def test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:

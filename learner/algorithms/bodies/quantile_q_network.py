@@ -1,0 +1,77 @@
+"""Action values by quantiles of the return (QR-DQN, Dabney et al. 2018), with or without dueling and batch normalization.
+
+Rule: workers act with an ordinary Q-network. The value of an action is the mean of its quantiles, so it is linear in the
+last hidden layer, as they are: the rows of the last layer that belong to one action are averaged. Batch normalization is
+folded into the layers (`stacked_mlps.py`).
+
+For N quantiles and n actions there are N (n + 1) outputs: for each quantile the value of the state, then n advantages.
+Without dueling there are N n outputs, the quantiles themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized, StackedMLPs, initial, initial_statistics
+from millrace.protocol.arrays import Floats
+from millrace.protocol.policy.layout import encoder_layout, named_views
+from millrace.protocol.policy.malloc import keep_freed_memory
+from millrace.protocol.policy.networks import Encoder, QNetwork, initial_fields, trainable
+from millrace.protocol.random_streams import Purpose, torch_seed
+from millrace.protocol.specs import PolicySpec
+
+
+class QuantileQNetwork:
+    """N quantiles of the return of each of n actions."""
+
+    def __init__(self, policy: PolicySpec, quantiles: int, normalized: Normalized, device: str, seed: int) -> None:
+        """`policy`: the one that workers act with. The initial parameters depend on `seed`."""
+        keep_freed_memory()  # the loss takes and frees arrays of half a megabyte again and again
+        actions = policy.action.sizes[0]
+        self._quantiles = quantiles
+        self._sizes = [1, actions] if policy.dueling else [actions]
+        self._outputs = sum(self._sizes)
+        encoder, width = encoder_layout(policy)
+        shape = MLPShape(1, (width, *policy.net, quantiles * self._outputs), policy.activation == "relu", normalized)
+        generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
+        parts = [initial_fields(encoder, generator), initial(shape, generator)]
+        sizes = [len(part) for part in parts]
+        self.flat = torch.cat(parts).to(device)
+        """[P] all parameters, those of the encoder first"""
+        self.flat_grad = torch.zeros_like(self.flat)
+        self.flat.grad = self.flat_grad
+        self._encoder, layers = torch.split(self.flat, sizes)
+        of_encoder, of_layers = torch.split(self.flat_grad, sizes)
+        self._encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
+        self.statistics = initial_statistics(shape).to(device)
+        """[S] the running statistics; empty without normalization"""
+        self.body = StackedMLPs(shape, trainable(layers, of_layers), self.statistics)
+
+    def trained(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+        """The quantiles [B, N, n] of features [B, D] and images [B, *leaf] uint8, to train the network by."""
+        return self._by_action(self.body.trained(self._encode(x, images)))
+
+    def of_minibatch(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+        """As `trained`, normalized by the statistics of this minibatch, but nothing is trained or moves: for targets."""
+        return self._by_action(self.body.of_minibatch(self._encode(x, images)))
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """The action values [B, n] by which workers act: means of the quantiles, normalized by the running statistics."""
+        return self._by_action(self.body.evaluated(self._encode(x, images))).mean(1)
+
+    def _by_action(self, outputs: Tensor) -> Tensor:
+        """Outputs [1, B, N (n + 1)] as quantiles [B, N, n]."""
+        *value, advantage = torch.split(outputs.reshape(-1, self._quantiles, self._outputs), self._sizes, -1)
+        return QNetwork.action_values(advantage, *value)
+
+    def acting_parameters(self) -> Floats:
+        """A copy of the parameters that workers act with: those of a `QNetwork` with these action values."""
+        layers = self.body.folded()
+        *hidden, weight, bias = named_views(layers, self.body.shape.folded().fields()).values()
+        last = [of_outputs.reshape(self._quantiles, self._outputs, -1).mean(0) for of_outputs in (weight, bias)]
+        means = [torch.split(of_outputs, self._sizes) for of_outputs in last]
+        heads = [part for head in zip(*means, strict=True) for part in head]
+        return torch.cat([part.flatten() for part in (self._encoder, *hidden, *heads)]).cpu().numpy()
