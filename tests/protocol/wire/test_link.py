@@ -450,6 +450,7 @@ link.close()
 """
 
 
+@pytest.mark.process
 def test_a_process_that_ends_behind_its_link_has_sent_everything(tcp: Ends) -> None:
     learner = tcp.learner()
     process = subprocess.run([sys.executable, "-c", LAST_WORDS, learner.address], capture_output=True, check=False)
